@@ -1,0 +1,47 @@
+# calibgraph: `make run` shows what it does, `make test` checks it. Both set up .venv themselves.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help install run test test-slow lint type bench clean
+
+help: ## Show this list
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/base: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "calibgraph needs Python 3.11 or newer, $(PYTHON) is %d.%d; try make PYTHON=python3.11" % v[:2])'
+	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --editable .
+	@touch $@
+
+$(VENV)/test: $(VENV)/base
+	$(INSTALL) --editable '.[test,pointcloud]'
+	@touch $@
+
+install: $(VENV)/base ## Install into .venv
+
+run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
+	$(BIN)/calibgraph calibrate data/sample --out out/sample
+	$(BIN)/calibgraph evaluate out/sample data/sample/reference.yaml
+
+test: $(VENV)/test ## Run the tests
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/test ## Run the tests on real data and the statistics (minutes)
+	$(BIN)/python -m pytest -m "realdata or statistics"
+
+lint: type ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: $(VENV)/test ## Check types
+	$(BIN)/mypy
+
+bench: $(VENV)/test ## Measure the solve against other ways
+	$(BIN)/python benchmarks/solve.py
+
+clean: ## Remove everything that was made
+	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

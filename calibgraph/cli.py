@@ -1,0 +1,300 @@
+"""The command line: each command loads, calls one library function, and prints.
+
+Human output goes to stderr, machine output (``--json``) to stdout. Exit codes: 0 done (PASS or
+WARN), 1 the calibration FAILed (its files are written, and say so), 2 bad input (one line).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from calibgraph.calibration import Calibration
+    from calibgraph.config import Config
+    from calibgraph.pipeline import Progress
+
+app = typer.Typer(
+    help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
+    "T_a_b maps coordinates in b to coordinates in a: p_camera = T_camera_lidar * p_lidar. "
+    "Wherever a RIG, ESTIMATE or REFERENCE is asked for, a rig file, a result (file or folder) "
+    "or a KITTI odometry sequence folder serves.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")]
+DatasetArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="DATASET...",
+        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/) or KITTI odometry sequence; "
+        "several of one rig form one problem.",
+    ),
+]
+RigOption = Annotated[
+    Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
+]
+MatcherOption = Annotated[
+    str, typer.Option(metavar="NAME|FILE", help="structure, or a table of correspondences.")
+]
+FramesOption = Annotated[
+    str | None, typer.Option(metavar="A:B:STEP", help="Which frames, e.g. 0:100:10 or 0,5,7.")
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")
+]
+PresetOption = Annotated[
+    str | None, typer.Option(help="Settings of the solve by name: auto (default), kitti, walkley.")
+]
+TermsOption = Annotated[
+    str, typer.Option(help="Terms of the objective: full, reprojection, priors, stage1.")
+]
+OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Options before the command; ``--debug`` is read by :func:`main`."""
+
+
+@app.command()
+def calibrate(
+    dataset: DatasetArgument,
+    rig: RigOption = None,
+    matcher: MatcherOption = "structure",
+    frames: FramesOption = None,
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    terms: TermsOption = "full",
+    out: OutOption = Path("calibration"),
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """From images and clouds to one calibration of all cameras, with pictures before and after."""
+    from calibgraph.dataset import load_dataset
+    from calibgraph.load import load_rig
+    from calibgraph.overlay import write_overlays
+    from calibgraph.pipeline import calibrate
+
+    settings = _settings(config, preset, seed)
+    data = load_dataset(dataset, load_rig(rig) if rig else None)
+    data = data.select(frames) if frames else data
+    with _progress() as progress:
+        result = calibrate(
+            data, matcher=matcher, config=settings, terms=_terms(terms), progress=progress
+        )
+        written = [result.save(out), out / "correspondences.parquet"]
+        shown = data.frames[len(data.frames) // 2]
+        written += write_overlays(shown, result.initial_rig, result.rig, out)
+    _finish(result, written, as_json)
+
+
+@app.command()
+def match(
+    dataset: DatasetArgument,
+    rig: RigOption = None,
+    matcher: MatcherOption = "structure",
+    frames: FramesOption = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
+    ] = Path("correspondences.parquet"),
+    as_json: JsonOption = False,
+) -> None:
+    """Find correspondences and write them as a table, without keeping the calibration."""
+    from calibgraph.dataset import load_dataset
+    from calibgraph.load import load_rig
+    from calibgraph.pipeline import calibrate
+
+    if out.suffix not in (".parquet", ".csv"):
+        raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
+    data = load_dataset(dataset, load_rig(rig) if rig else None)
+    data = data.select(frames) if frames else data
+    with _progress() as progress:
+        result = calibrate(data, matcher=matcher, progress=progress)
+    table = result.correspondences
+    assert table is not None  # calibrate always keeps those of its last round
+    table.save(out)
+    if as_json:
+        _print_json({"out": str(out), "matches": table.counts()})
+    else:
+        counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
+        _console().print(f"{out}: {len(table)} correspondences ({counts})")
+
+
+@app.command()
+def solve(
+    rig: RigArgument,
+    correspondences: Annotated[
+        Path, typer.Argument(metavar="CORRESPONDENCES", help="Table, .parquet or .csv.")
+    ],
+    terms: TermsOption = "full",
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    out: OutOption = Path("calibration"),
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """From a table of correspondences to one calibration of all cameras."""
+    from calibgraph.correspondences import load_correspondences
+    from calibgraph.files import sha256
+    from calibgraph.load import load_rig
+    from calibgraph.two_pass import solve
+
+    settings = _settings(config, preset, seed)
+    table = load_correspondences(correspondences)
+    result = solve(load_rig(rig), table, settings, _terms(terms))
+    result = result.with_inputs({str(correspondences): sha256(correspondences)})
+    _finish(result, [result.save(out)], as_json)
+
+
+@app.command()
+def evaluate(
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="What to judge.")],
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="What to judge it by.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Compare an estimate with a reference: the paper's metrics, per camera and per pair."""
+    from calibgraph.load import load_rig
+    from calibgraph.metrics import evaluate
+
+    errors = evaluate(load_rig(estimate), load_rig(reference))
+    if as_json:
+        _print_json(errors.to_mapping())
+    else:
+        from calibgraph.tables import evaluation_table
+
+        _console().print(evaluation_table(errors))
+
+
+@app.command()
+def perturb(
+    rig: RigArgument,
+    out: Annotated[Path, typer.Option(metavar="RIG", help="Rig file to write.")],
+    rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
+    translation_m: Annotated[
+        float, typer.Option(min=0, help="Length, in a random direction.")
+    ] = 1.5,
+    seed: SeedOption = 0,
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="Per axis, uniform within +- the values.")
+    ] = False,
+) -> None:
+    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
+    from calibgraph.load import load_rig
+    from calibgraph.perturbation import perturb
+
+    given = load_rig(rig)
+    moved = perturb(
+        given, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed, uniform=uniform
+    )
+    moved.save(out)
+    _console().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
+
+
+def main() -> None:
+    """Run the command line; errors in the data become one line on stderr and exit code 2."""
+    from calibgraph.errors import CalibrationError
+
+    try:
+        app()
+    except (CalibrationError, ValueError, OSError) as error:
+        if "--debug" in sys.argv:
+            raise
+        print(f"calibgraph: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _settings(config: Path | None, preset_name: str | None, seed: int) -> Config:
+    from calibgraph.config import load_config, preset
+
+    if config is not None and preset_name is not None:
+        raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
+    settings = load_config(config) if config is not None else preset(preset_name or "auto")
+    return settings.changed(seed=seed) if seed else settings
+
+
+def _terms(name: str) -> Any:
+    from calibgraph.config import TERMS
+
+    if name not in TERMS:
+        raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")
+    return name
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """A progress bar on stderr, that is gone when the work is done."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=_console(), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda what, done, total: bar.update(
+            task, description=what, completed=done, total=total
+        )
+
+
+def _finish(result: Calibration, written: list[Path], as_json: bool) -> None:
+    """Print a result and exit with the code of its verdict."""
+    if as_json:
+        _print_json(_summary(result, written))
+    else:
+        from calibgraph.tables import print_result
+
+        print_result(_console(), result, written)
+    if result.verdict.status == "FAIL":
+        raise typer.Exit(1)
+
+
+def _summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
+    cameras = {}
+    for name, T in result.T_camera_lidar.items():
+        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+        cameras[name] = {
+            "T_camera_lidar": T.tolist(),
+            "verdict": result.camera_verdicts[name].status,
+            "reasons": list(result.camera_verdicts[name].reasons),
+            "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
+            "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
+            "residuals": None if residuals is None else vars(residuals),
+            "counts": result.counts[name],
+        }
+    return {
+        "verdict": result.verdict.status,
+        "reasons": list(result.verdict.reasons),
+        "cameras": cameras,
+        "timings_s": result.timings_s,
+        "files": [str(path) for path in written],
+    }
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(json.dumps(_finite(content), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

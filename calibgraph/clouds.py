@@ -1,0 +1,156 @@
+"""Point clouds from disk: .npy, .bin (KITTI), .pcd and .ply, as x y z intensity."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.files import require_file
+
+CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
+MAX_CLOUD_BYTES = 2 * 2**30
+
+_XYZ, _XYZI = 3, 4
+
+
+def load_cloud(path: Path | str) -> NDArray[np.float32]:
+    """Read a cloud.
+
+    Args:
+        path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), .pcd or .ply.
+
+    Returns:
+        (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
+        none. Rows whose x, y and z are all NaN ("no return" in organised clouds) are left out.
+
+    Raises:
+        FileError: if the file is missing, truncated, empty, of another format, or has values that
+            are not finite.
+    """
+    path = require_file(Path(path))
+    if path.stat().st_size > MAX_CLOUD_BYTES:
+        raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
+    readers = {".npy": _read_npy, ".bin": _read_bin, ".pcd": _read_open3d, ".ply": _read_open3d}
+    if path.suffix not in readers:
+        raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
+    cloud = readers[path.suffix](path)
+    returned = cloud[~np.isnan(cloud[:, :3]).all(axis=1)]
+    if not len(returned):
+        raise FileError(path, "holds no point")
+    finite = np.isfinite(returned[:, :3]).all(axis=1)
+    if not finite.all():
+        row = int(np.flatnonzero(~finite)[0])
+        raise FileError(path, f"point {row} is not finite: {returned[row, :3].tolist()}")
+    return returned
+
+
+def _read_npy(path: Path) -> NDArray[np.float32]:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise FileError(
+            path, f"cannot be read as a .npy array ({error}); is it complete?"
+        ) from None
+    if array.ndim != 2 or array.shape[1] < _XYZ or array.dtype.kind not in "fiu":  # noqa: PLR2004
+        raise FileError(
+            path, f"has shape {array.shape} of {array.dtype}, expected (n, 3) or (n, 4) numbers"
+        )
+    return _with_intensity(array[:, :3], array[:, 3] if array.shape[1] >= _XYZI else None)
+
+
+def _read_bin(path: Path) -> NDArray[np.float32]:
+    size = path.stat().st_size
+    if size % 16:
+        raise FileError(
+            path, f"{size} bytes is not a whole number of float32 x y z intensity; is it complete?"
+        )
+    return np.fromfile(path, dtype="<f4").reshape(-1, 4)
+
+
+def _with_intensity(
+    xyz: NDArray[np.floating], intensity: NDArray[np.floating] | None
+) -> NDArray[np.float32]:
+    cloud = np.full((len(xyz), 4), np.nan, dtype=np.float32)
+    cloud[:, :3] = xyz
+    if intensity is not None:
+        cloud[:, 3] = intensity
+    return cloud
+
+
+def _read_open3d(path: Path) -> NDArray[np.float32]:
+    try:
+        import open3d
+    except ImportError as error:
+        raise CalibrationError(
+            f"{path}: reading {path.suffix} needs open3d: pip install 'calibgraph[pointcloud]', on "
+            f"Debian or Ubuntu also apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 ({error})"
+        ) from error
+    expected = _require_complete(path)
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        cloud = open3d.t.io.read_point_cloud(path)
+    found = len(cloud.point.positions) if "positions" in cloud.point else 0
+    if found != expected:
+        raise FileError(path, f"{found} of {expected} points could be read; is it complete?")
+    names = [name for name in ("intensity", "reflectivity", "i") if name in cloud.point]
+    intensity = cloud.point[names[0]].numpy().ravel() if names else None
+    return _with_intensity(cloud.point.positions.numpy(), intensity)
+
+
+def _require_complete(path: Path) -> int:
+    """Number of points that the header claims, if the file is long enough to hold them.
+
+    Open3D fills what a truncated file lacks with whatever is in memory and does not say so.
+    """
+    data = path.read_bytes()
+    header, body = _split_header(path, data)
+    count, row_bytes, row_words = (_pcd_rows if path.suffix == ".pcd" else _ply_rows)(path, header)
+    if "compressed" in header:
+        sizes = struct.unpack("<II", body[:8]) if len(body) >= 8 else (1, 0)  # noqa: PLR2004
+        complete = len(body) >= 8 + sizes[0] and sizes[1] >= count * row_bytes
+    elif "ascii" in header:
+        rows = [line for line in body.splitlines() if line.strip()][:count]
+        complete = len(rows) == count and all(len(row.split()) == row_words for row in rows)
+    else:
+        complete = len(body) >= count * row_bytes
+    if not complete:
+        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
+    return count
+
+
+def _split_header(path: Path, data: bytes) -> tuple[str, bytes]:
+    pattern = rb"^DATA[^\n]*\n" if path.suffix == ".pcd" else rb"^end_header\r?\n"
+    end = re.search(pattern, data[:65536], re.MULTILINE)
+    if end is None:
+        raise FileError(path, f"has no complete {path.suffix} header; is it complete?")
+    return data[: end.end()].decode("ascii", "replace"), data[end.end() :]
+
+
+def _pcd_rows(path: Path, header: str) -> tuple[int, int, int]:
+    fields = {words[0]: words[1:] for words in map(str.split, header.splitlines()) if words}
+    try:
+        count = int(fields["POINTS"][0])
+        sizes = np.array(fields["SIZE"], dtype=int)
+        repeats = np.array(fields.get("COUNT", ["1"] * len(sizes)), dtype=int)
+        return count, int(sizes @ repeats), int(repeats.sum())
+    except (KeyError, IndexError, ValueError) as error:
+        raise FileError(path, f"has a malformed PCD header ({error})") from error
+
+
+_PLY_BYTES = {
+    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
+    "int": 4, "uint": 4, "float": 4, "int32": 4, "uint32": 4, "float32": 4, "double": 8,
+    "float64": 8,
+}  # fmt: skip
+
+
+def _ply_rows(path: Path, header: str) -> tuple[int, int, int]:
+    vertex = re.search(r"element vertex (\d+)\s*\n((?:(?:property|comment)[^\n]*\n)*)", header)
+    kinds = re.findall(r"property (\w+) \w+", vertex[2]) if vertex else []
+    if vertex is None or not kinds or any(kind not in _PLY_BYTES for kind in kinds):
+        raise FileError(path, "has no plain list of vertices in its PLY header")
+    return int(vertex[1]), sum(_PLY_BYTES[kind] for kind in kinds), len(kinds)

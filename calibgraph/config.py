@@ -1,0 +1,116 @@
+"""Settings of the solve: typed, units in every name, unknown keys refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calibgraph.files import checked_model, describe, read_yaml
+from factors import LossName
+
+Terms = Literal["stage1", "reprojection", "priors", "full"]
+TERMS: tuple[Terms, ...] = get_args(Terms)
+PresetName = Literal["kitti", "walkley", "auto"]
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Config(BaseModel):
+    """Settings, with the paper's symbols. The defaults are the preset ``auto``.
+
+    Attributes:
+        preset: the preset these settings started from.
+        prior_weight: lambda, the per-camera prior's weight.
+        relative_prior_weight: mu, the relative-pose prior's weight.
+        relative_prior_pairs: ``spanning``: each camera with the next in the rig's order; or all.
+        loss: name of the robust loss.
+        loss_scale_px: delta. None: from the residuals' own spread, per camera.
+        gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
+        confidence_min: c_min.
+        confidence_weights: weigh residuals by sqrt(clip(c, 0.1, 1)), else uniformly.
+        grid_columns, grid_rows: cells of the image in which only the best match is kept.
+        matches_max: cap per camera and frame.
+        stage1: where the per-camera estimates T_hat come from: ``pnp``, one pose per frame,
+            aggregated; or ``rig``, the poses in the rig as they are.
+        aggregate: how Stage 1 aggregates over frames.
+        pnp_threshold_px: inlier threshold of the per-frame PnP.
+        seed: of everything random.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: PresetName = "auto"
+    prior_weight: Weight = 1.0
+    relative_prior_weight: Weight = 5.0
+    relative_prior_pairs: Literal["spanning", "all"] = "spanning"
+    loss: LossName = "cauchy"
+    loss_scale_px: Positive | None = None
+    gate_px: Positive | None = None
+    confidence_min: Annotated[float, Field(ge=0, le=1)] = 0.1
+    confidence_weights: bool = False
+    grid_columns: Annotated[int, Field(gt=0)] = 40
+    grid_rows: Annotated[int, Field(gt=0)] = 25
+    matches_max: Annotated[int, Field(gt=0)] = 10_000
+    stage1: Literal["pnp", "rig"] = "pnp"
+    aggregate: Literal["median", "mean", "mode"] = "median"
+    pnp_threshold_px: Positive = 8.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def changed(self, **settings: Any) -> Config:
+        """A checked copy with some settings changed.
+
+        Raises:
+            ValueError: on an unknown setting or a wrong value, in one line.
+        """
+        try:
+            return Config.model_validate({**self.model_dump(), **settings})
+        except ValidationError as error:
+            raise ValueError(describe(error)) from error
+
+
+_PRESETS: dict[str, dict[str, Any]] = {
+    "auto": {},
+    # The paper's "Implementation details": its two datasets.
+    "kitti": {
+        "prior_weight": 1.0,
+        "relative_prior_weight": 5.0,
+        "loss_scale_px": 4.0,
+        "gate_px": 3.0,
+        "confidence_min": 0.1,
+    },
+    "walkley": {
+        "prior_weight": 2.0,
+        "relative_prior_weight": 10.0,
+        "loss_scale_px": 8.0,
+        "gate_px": 16.0,
+        "confidence_min": 0.2,
+        "confidence_weights": True,
+    },
+}
+PRESETS: tuple[PresetName, ...] = get_args(PresetName)
+
+
+def preset(name: str) -> Config:
+    """The settings of a preset.
+
+    Raises:
+        ValueError: if there is no such preset.
+    """
+    if name not in _PRESETS:
+        raise ValueError(f"unknown preset {name!r}; known are {', '.join(PRESETS)}")
+    return Config(preset=name, **_PRESETS[name])  # type: ignore[arg-type]
+
+
+def load_config(path: Path | str) -> Config:
+    """Read settings from YAML; a ``preset`` in the file gives the values the file leaves out.
+
+    Raises:
+        FileError: if the file is missing, has an unknown key or a wrong value.
+    """
+    path = Path(path)
+    content = read_yaml(path)
+    name = content.get("preset", "auto")
+    return checked_model(Config, {**_PRESETS.get(str(name), {}), **content}, path)

@@ -1,0 +1,298 @@
+"""The correspondence table: the waist of the program. Matchers write it, the graph reads it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import require_file, write_atomically
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Array = NDArray[np.float64]
+
+TABLE_FORMAT = "calibgraph-correspondences/1"
+
+_COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
+_INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+_REQUIRED = ("camera", "frame", *_COORDINATES)
+_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *_INFORMATION)
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """2D-3D correspondences of several cameras and frames, as columns of equal length.
+
+    Attributes:
+        cameras: the names that ``camera_index`` counts.
+        camera_index: (n,) which of ``cameras`` saw the pixel.
+        frame: (n,) frame number; the same number in two cameras is the same instant.
+        pixels_px: (n, 2) pixel (column, row) in the image as recorded (distorted).
+        points_lidar_m: (n, 3) point in the LiDAR frame.
+        confidence: (n,) in (0, 1].
+        information_px: (n, 3) or None: i_uu, i_uv, i_vv of the 2x2 information of the pixel
+            [1/px^2], positive semidefinite; it may have rank one (an edge constrains only its
+            normal). None stands for the identity.
+        stamp_ns: (n,) or None: time of the frame.
+        metadata: where the table comes from: the matcher and its settings.
+
+    Raises:
+        CorrespondenceError: on wrong shapes or values, naming the first bad row.
+    """
+
+    cameras: tuple[str, ...]
+    camera_index: NDArray[np.int32]
+    frame: NDArray[np.int64]
+    pixels_px: Array
+    points_lidar_m: Array
+    confidence: NDArray[np.float32]
+    information_px: Array | None = None
+    stamp_ns: NDArray[np.int64] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        for column, width in _WIDTHS.items():
+            array = getattr(self, column)
+            shape = (n,) if width == 1 else (n, width)
+            if array is not None and array.shape != shape:
+                raise CorrespondenceError(
+                    f"{column} has shape {array.shape}, expected {shape} like the column frame"
+                )
+        self._check_values()
+
+    @staticmethod
+    def from_arrays(
+        *,
+        camera: Sequence[str] | NDArray[np.str_] | str,
+        frame: ArrayLike,
+        pixels_px: ArrayLike,
+        points_lidar_m: ArrayLike,
+        confidence: ArrayLike | None = None,
+        information_px: ArrayLike | None = None,
+        stamp_ns: ArrayLike | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> Correspondences:
+        """Build a table from arrays; ``camera`` and ``frame`` may be one value for all rows.
+
+        Raises:
+            CorrespondenceError: on wrong shapes or values.
+        """
+        pixels = np.asarray(pixels_px, dtype=np.float64)
+        n = len(pixels)
+        names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
+        given = np.ones(n) if confidence is None else confidence
+        return Correspondences(
+            cameras=tuple(str(name) for name in names),
+            camera_index=index.astype(np.int32),
+            frame=np.array(np.broadcast_to(np.asarray(frame, dtype=np.int64), n)),
+            pixels_px=pixels,
+            points_lidar_m=np.asarray(points_lidar_m, dtype=np.float64),
+            confidence=np.asarray(given, dtype=np.float32),
+            information_px=_optional(information_px, np.float64),
+            stamp_ns=_optional(stamp_ns, np.int64),
+            metadata=metadata or {},
+        )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
+        """The table with only some rows: a mask, an index array or a slice."""
+        columns = {name: getattr(self, name) for name in _WIDTHS}
+        kept: dict[str, Any] = {k: None if a is None else a[rows] for k, a in columns.items()}
+        return replace(self, **kept)
+
+    def of_camera(self, name: str) -> Correspondences:
+        """The rows of one camera (none, if the camera is not in the table)."""
+        if name not in self.cameras:
+            return self.select(slice(0, 0))
+        return self.select(self.camera_index == self.cameras.index(name))
+
+    def counts(self) -> dict[str, int]:
+        """Rows per camera."""
+        counts = np.bincount(self.camera_index, minlength=len(self.cameras))
+        return dict(zip(self.cameras, counts.tolist(), strict=True))
+
+    def save(self, path: Path | str) -> None:
+        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
+        from pyarrow import csv, parquet
+
+        path, table = Path(path), self.to_arrow()
+        if path.suffix == ".csv":
+            strings = table.set_column(0, "camera", table["camera"].cast("string"))
+            write_atomically(path, lambda part: csv.write_csv(strings, part))
+        else:
+            write_atomically(path, lambda part: parquet.write_table(table, part))
+
+    def to_arrow(self) -> pa.Table:
+        """The table in the file format's columns, its metadata in the schema."""
+        import pyarrow as pa
+
+        columns: dict[str, Any] = {
+            "camera": pa.DictionaryArray.from_arrays(
+                self.camera_index, pa.array(self.cameras, pa.string())
+            ),
+            "frame": self.frame,
+            **dict(zip(_COORDINATES[:2], self.pixels_px.T, strict=True)),
+            **dict(zip(_COORDINATES[2:], self.points_lidar_m.T, strict=True)),
+            "confidence": self.confidence,
+        }
+        if self.stamp_ns is not None:
+            columns["stamp_ns"] = self.stamp_ns
+        if self.information_px is not None:
+            columns |= dict(zip(_INFORMATION, self.information_px.T, strict=True))
+        metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
+        return pa.table(columns).replace_schema_metadata(metadata)
+
+    def _check_values(self) -> None:
+        u, v = self.pixels_px, self.points_lidar_m
+        self._require(np.isfinite(u).all(axis=1), "pixel", u, "be finite")
+        self._require(np.isfinite(v).all(axis=1), "point", v, "be finite")
+        c = self.confidence
+        self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
+        if self.information_px is not None:
+            i = self.information_px
+            determinant = i[:, 0] * i[:, 2] - i[:, 1] ** 2
+            tolerance = 1e-6 * np.maximum(i[:, 0], i[:, 2]) ** 2
+            positive = (i[:, [0, 2]] >= 0).all(axis=1) & (determinant >= -tolerance)
+            good = np.isfinite(i).all(axis=1) & positive & (i[:, 0] + i[:, 2] > 0)
+            self._require(good, "information", i, "be finite, positive semidefinite and not zero")
+
+    def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
+        if good.all():
+            return
+        row = int(np.flatnonzero(~good)[0])
+        camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
+        raise CorrespondenceError(
+            f"row {row} (camera {camera!r}, frame {frame}): {what} must {rule}, found "
+            f"{found[row].tolist()}; drop or mend the row",
+            camera=camera,
+            frame=frame,
+        )
+
+
+_WIDTHS = {
+    "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
+    "information_px": 3, "stamp_ns": 1,
+}  # fmt: skip
+assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
+
+
+def _optional(values: ArrayLike | None, dtype: type) -> Any:
+    return None if values is None else np.asarray(values, dtype=dtype)
+
+
+def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
+    """Put tables under each other; the metadata is that of the first.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if not tables:
+        raise ValueError("no tables to concatenate")
+    names = tuple(sorted({name for table in tables for name in table.cameras}))
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("frame", "pixels_px", "points_lidar_m", "confidence")
+    }
+    numbers = [np.array([names.index(n) for n in t.cameras], np.int32) for t in tables]
+    columns["camera_index"] = np.concatenate(
+        [number[t.camera_index] if len(t) else t.camera_index
+         for number, t in zip(numbers, tables, strict=True)]
+    )  # fmt: skip
+    if any(table.information_px is not None for table in tables):
+        columns["information_px"] = np.concatenate([_information(t) for t in tables])
+    if all(table.stamp_ns is not None for table in tables):
+        columns["stamp_ns"] = np.concatenate([t.stamp_ns for t in tables if t.stamp_ns is not None])
+    return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
+
+
+def _information(table: Correspondences) -> Array:
+    if table.information_px is not None:
+        return table.information_px
+    return np.tile([1.0, 0.0, 1.0], (len(table), 1))
+
+
+def load_correspondences(path: Path | str) -> Correspondences:
+    """Read a table from Parquet, or from CSV with the same columns.
+
+    Raises:
+        FileError: if the file is missing, truncated, or lacks a column.
+        CorrespondenceError: if a value is wrong.
+    """
+    path = require_file(Path(path))
+    table = _read_arrow(path)
+    missing = [name for name in _REQUIRED if name not in table.column_names]
+    unknown = [name for name in table.column_names if name not in _COLUMNS]
+    if missing:
+        raise FileError(path, f"column {missing[0]!r} is missing; found {table.column_names}")
+    if unknown:
+        raise FileError(path, f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
+    partial = [name for name in _INFORMATION if name in table.column_names]
+    if partial and len(partial) < len(_INFORMATION):
+        raise FileError(path, f"has only {partial} of the columns {list(_INFORMATION)}")
+    try:
+        return from_arrow(table)
+    except CorrespondenceError as error:
+        raise FileError(path, str(error)) from error
+    except (ValueError, TypeError) as error:
+        raise FileError(path, f"a column has the wrong type: {error}") from error
+
+
+def from_arrow(table: pa.Table) -> Correspondences:
+    """Build correspondences from an Arrow table that has the file format's columns."""
+    import pyarrow as pa
+
+    for name in table.column_names:
+        if table[name].null_count:
+            raise CorrespondenceError(f"column {name!r} has {table[name].null_count} empty values")
+
+    def column(name: str, dtype: type) -> NDArray[Any]:
+        return np.asarray(table[name].to_numpy()).astype(dtype, casting="same_kind")
+
+    def stack(names: Sequence[str]) -> Array:
+        return np.stack([column(name, np.float64) for name in names], axis=1)
+
+    given = table.column_names
+    encoded = table["camera"].cast(pa.string()).combine_chunks().dictionary_encode()
+    if isinstance(encoded, pa.ChunkedArray):
+        encoded = encoded.combine_chunks()
+    metadata = (table.schema.metadata or {}).get(b"matcher", b"{}")
+    return Correspondences(
+        cameras=tuple(encoded.dictionary.to_pylist()),
+        camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
+        frame=column("frame", np.int64),
+        pixels_px=stack(_COORDINATES[:2]),
+        points_lidar_m=stack(_COORDINATES[2:]),
+        confidence=column("confidence", np.float32)
+        if "confidence" in given
+        else np.ones(len(table), np.float32),
+        information_px=stack(_INFORMATION) if _INFORMATION[0] in given else None,
+        stamp_ns=column("stamp_ns", np.int64) if "stamp_ns" in given else None,
+        metadata=json.loads(metadata),
+    )
+
+
+def _read_arrow(path: Path) -> pa.Table:
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    try:
+        if path.suffix == ".csv":
+            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
+            return csv.read_csv(path, convert_options=strings)
+        return parquet.ParquetFile(path).read()
+    except (pa.ArrowException, OSError) as error:
+        kind = "CSV" if path.suffix == ".csv" else "Parquet"
+        raise FileError(
+            path, f"cannot be read as {kind} ({error}); is it complete? write it again"
+        ) from error

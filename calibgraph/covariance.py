@@ -1,0 +1,97 @@
+"""Cluster-robust covariance: matches of one frame share their errors, frames do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph import to_T_lidar_camera, values_of
+from factors import ProjectionBlock
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 5
+"""With fewer frames their scatter says too little to print a number."""
+
+_STEP = 1e-5  # rad and m: of the central differences of the gradient
+
+
+def cluster_robust_covariance(
+    blocks: Mapping[str, ProjectionBlock],
+    frames: Mapping[str, NDArray[np.int64]],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    T_camera_lidar: Mapping[str, Array],
+) -> Array | None:
+    """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T) H^-1 F / (F - 1)``.
+
+    g_f is the gradient of everything that frame f says, over all cameras jointly. H is the true
+    Hessian of the robust cost (by differences of its exact gradient), the priors' included: the
+    iteratively reweighted one would be too large, and the errors too small.
+
+    Args:
+        blocks: per camera with correspondences, the inliers of the solution.
+        frames: per camera, the sorted frame number of each of them.
+        pose_graph: the priors and relative poses.
+        T_camera_lidar: the solution, all cameras.
+
+    Returns:
+        (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
+        xi = (rotation [rad], translation [m]) in each camera's axes. None with fewer than
+        MIN_FRAMES frames, or where H is singular.
+    """
+    cameras = list(T_camera_lidar)
+    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values()]))
+    if len(numbers) < MIN_FRAMES:
+        return None
+    size = 6 * len(cameras)
+    hessian = _pose_hessian(pose_graph, cameras, T_camera_lidar)
+    gradients = np.zeros((len(numbers), size))
+    for name, block in blocks.items():
+        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        hessian[rows, rows] += _block_hessian(block, T_camera_lidar[name])
+        own, starts = np.unique(frames[name], return_index=True)
+        edges = np.append(starts, len(frames[name]))
+        sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
+        gradients[np.searchsorted(numbers, own), rows] = sums.gradient
+    values, vectors = np.linalg.eigh(hessian)
+    if values[0] <= 1e-12 * values[-1]:
+        return None
+    spread = gradients @ (vectors / values) @ vectors.T
+    covariance: Array = spread.T @ spread * (len(numbers) / (len(numbers) - 1))
+    return covariance
+
+
+def _pose_hessian(
+    graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
+) -> Array:
+    """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
+    values = values_of(cameras, T_camera_lidar)
+    hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    keys = list(values.keys())
+    for index in range(graph.size()):
+        factor = graph.at(index).linearize(values)
+        A = factor.jacobian()[0]
+        rows = np.concatenate([6 * keys.index(key) + np.arange(6) for key in list(factor.keys())])
+        hessian[np.ix_(rows, rows)] += A.T @ A
+    return hessian
+
+
+def _block_hessian(block: ProjectionBlock, T_camera_lidar: Array) -> Array:
+    """(6, 6) derivative of the gradient of half the robust cost, by central differences.
+
+    Where the robust cost is not convex the reweighted Hessian, which always is, stands in.
+    """
+    pose = to_T_lidar_camera(T_camera_lidar)
+    steps = np.eye(6) * _STEP
+    rows = [
+        block.sums(pose.retract(step)).gradient - block.sums(pose.retract(-step)).gradient
+        for step in steps
+    ]
+    hessian = np.array(rows) / (2 * _STEP)
+    hessian = (hessian + hessian.T) / 2
+    if np.linalg.eigvalsh(hessian)[0] > 0:
+        return hessian
+    return block.sums(pose).hessian

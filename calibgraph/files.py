@@ -1,0 +1,169 @@
+"""Reading and writing files safely: atomic writes, hashes, YAML to checked models in one line."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from calibgraph.errors import FileError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+MAX_YAML_BYTES = 16 * 2**20
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step.
+
+    A crash leaves the old file or the new one, never half of one.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+        _sync_folder(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in ``folder`` durable, where the system can."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    write_atomically(path, lambda temporary: _discard(temporary.write_text(text, "utf-8")))
+
+
+def _discard(_: object) -> None:
+    return None
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def require_file(path: Path) -> Path:
+    """Return ``path`` if it is a file.
+
+    Raises:
+        FileError: if it is missing or a folder.
+    """
+    if path.is_dir():
+        raise FileError(path, "is a folder, expected a file")
+    if not path.is_file():
+        raise FileError(path, "no such file; check the path")
+    return path
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping.
+
+    Raises:
+        FileError: if the file is missing, too large, not YAML, or not a mapping.
+    """
+    require_file(path)
+    if path.stat().st_size > MAX_YAML_BYTES:
+        raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
+    try:
+        content = yaml.load(path.read_text("utf-8"), Loader=_Loader)
+    except UnicodeDecodeError as error:
+        raise FileError(path, f"is not a text file ({error.reason}); expected YAML") from error
+    except yaml.YAMLError as error:
+        raise FileError(path, f"is not valid YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise FileError(path, f"holds {_kind(content)}, expected a mapping of keys to values")
+    return content
+
+
+def write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line."""
+    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True)
+    write_text(path, text)
+
+
+def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
+    """Build a pydantic model from file content.
+
+    Raises:
+        FileError: with the first thing that is wrong: where, what was found, what is expected.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise FileError(path, describe(error)) from error
+
+
+def describe(error: ValidationError) -> str:
+    """First problem of a pydantic error, in one line."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {where!r}; remove it or correct its spelling"
+    if first["type"] == "missing":
+        return f"key {where!r} is missing; add it"
+    message = first["msg"].removeprefix("Value error, ")
+    found = "" if first["type"] == "value_error" else f", found {_kind(first['input'])}"
+    return f"{where}: {message}{found}" if where else f"{message}{found}"
+
+
+def _kind(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."  # noqa: PLR2004 - a line's worth
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML that refuses a key given twice: PyYAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                mark = node.start_mark
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=mark)
+        return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    """YAML with numpy values, and sequences of plain numbers on one line."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _represent_sequence(dumper: yaml.SafeDumper, data: Any) -> yaml.Node:
+    items = list(data)
+    flow = all(isinstance(item, (int, float, str, np.number)) for item in items)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
+
+
+_Dumper.add_representer(list, _represent_sequence)
+_Dumper.add_representer(tuple, _represent_sequence)
+_Dumper.add_representer(np.ndarray, lambda dumper, data: _represent_sequence(dumper, data.tolist()))
+_Dumper.add_multi_representer(np.floating, lambda dumper, data: dumper.represent_float(float(data)))
+_Dumper.add_multi_representer(
+    np.signedinteger, lambda dumper, data: dumper.represent_int(int(data))
+)

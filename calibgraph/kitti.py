@@ -1,0 +1,81 @@
+"""KITTI odometry sequence folders: ``calib.txt``, ``velodyne/``, ``image_2/``, ``image_3/``, ..."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.files import require_file
+from calibgraph.rig import Camera, Intrinsics, Rig
+
+CALIBRATION_NAME = "calib.txt"
+CLOUD_FOLDER = "velodyne"
+
+
+def camera_folders(sequence: Path) -> dict[str, Path]:
+    """The image folders of a sequence, by camera name (image_0 .. image_3)."""
+    return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
+
+
+def load_kitti_rig(sequence: Path) -> Rig:
+    """The rig of a KITTI odometry sequence, from its own calibration.
+
+    Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
+    translate(K^-1 P_k[:, 3]) Tr. (Some tools shift by P_k[0, 3] / fx alone: about 5 mm off.)
+
+    Raises:
+        FileError: if ``calib.txt`` is malformed or there is no image.
+    """
+    path = require_file(sequence / CALIBRATION_NAME)
+    matrices = _read_matrices(path)
+    folders = camera_folders(sequence)
+    if not folders:
+        raise FileError(sequence, "has no image folder (image_0 .. image_3)")
+    cameras = {
+        name: _camera(path, matrices, f"P{name[-1]}", folder) for name, folder in folders.items()
+    }
+    return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
+
+
+def _camera(path: Path, matrices: dict[str, NDArray[np.float64]], key: str, folder: Path) -> Camera:
+    for needed in (key, "Tr"):
+        if needed not in matrices:
+            raise FileError(path, f"line {needed!r} is missing")
+    P, K = matrices[key], matrices[key][:, :3]
+    shift = np.eye(4)
+    shift[:3, 3] = np.linalg.solve(K, P[:, 3])
+    lidar_to_rectified = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
+    width, height = _image_size(folder)
+    return Camera(
+        width_px=width,
+        height_px=height,
+        intrinsics_px=Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]),
+        T_camera_lidar=shift @ lidar_to_rectified,
+    )
+
+
+def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
+    matrices = {}
+    for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
+        name, _, values = line.partition(":")
+        if not values.strip():
+            continue
+        try:
+            matrices[name.strip()] = np.array(values.split(), dtype=np.float64).reshape(3, 4)
+        except ValueError as error:
+            raise FileError(path, f"line {number}: expected 12 numbers after {name!r}") from error
+    return matrices
+
+
+def _image_size(folder: Path) -> tuple[int, int]:
+    images = sorted(folder.glob("*.png"))
+    if not images:
+        raise FileError(folder, "holds no .png image")
+    image = cv2.imread(str(images[0]), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise FileError(images[0], "cannot be decoded as an image; is it complete?")
+    return image.shape[1], image.shape[0]

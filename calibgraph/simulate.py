@@ -1,0 +1,106 @@
+"""A small simulator of correspondences: a rig, a scene, and a matcher's errors, from one seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.correspondences import Correspondences, concatenate
+from calibgraph.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatcherErrors:
+    """How a simulated matcher errs.
+
+    Attributes:
+        noise_px: standard deviation per axis, independent per correspondence.
+        frame_noise_px: the same, of an offset shared by a camera's frame.
+        outlier_share: share of correspondences whose pixel is anywhere in the image.
+        informative_confidence: outliers get lower confidences than inliers, else all are alike.
+    """
+
+    noise_px: float = 1.0
+    frame_noise_px: float = 0.0
+    outlier_share: float = 0.0
+    informative_confidence: bool = True
+
+
+def simulate_correspondences(
+    rig: Rig,
+    *,
+    frames: int = 10,
+    matches: int = 500,
+    errors: MatcherErrors | None = None,
+    depth_m: tuple[float, float] = (3.0, 50.0),
+    seed: int = 0,
+) -> Correspondences:
+    """Draw correspondences that a matcher could find, with the rig's poses as the truth.
+
+    Args:
+        rig: its poses are the truth.
+        frames: frames, seen by every camera.
+        matches: correspondences per camera and frame.
+        errors: the matcher's errors.
+        depth_m: range of depths along the camera's axis, drawn uniformly in the logarithm.
+        seed: of every draw.
+    """
+    errors = errors or MatcherErrors()
+    rng = np.random.default_rng(seed)
+    tables = [
+        _frame(rng, name, camera, frame, matches, errors, depth_m)
+        for frame in range(frames)
+        for name, camera in rig.cameras.items()
+    ]
+    return concatenate(tables)
+
+
+def _frame(  # noqa: PLR0913 - private, one call
+    rng: np.random.Generator,
+    name: str,
+    camera: Camera,
+    frame: int,
+    matches: int,
+    errors: MatcherErrors,
+    depth_m: tuple[float, float],
+) -> Correspondences:
+    points_camera = _visible_points(rng, camera, matches, depth_m)
+    pixels, _ = camera.lens.project(points_camera)
+    pixels += errors.noise_px * rng.standard_normal(pixels.shape)
+    pixels += errors.frame_noise_px * rng.standard_normal(2)
+    outlier = rng.random(matches) < errors.outlier_share
+    size = np.array([camera.width_px, camera.height_px])
+    pixels[outlier] = rng.random((np.count_nonzero(outlier), 2)) * size - 0.5
+    low = outlier if errors.informative_confidence else np.zeros(matches, np.bool_)
+    confidence = np.where(low, rng.uniform(0.1, 0.6, matches), rng.uniform(0.4, 1.0, matches))
+    T = camera.T_camera_lidar
+    return Correspondences.from_arrays(
+        camera=name,
+        frame=frame,
+        pixels_px=pixels,
+        points_lidar_m=(points_camera - T[:3, 3]) @ T[:3, :3],
+        confidence=confidence,
+        metadata={"matcher": "simulated", **vars(errors)},
+    )
+
+
+def _visible_points(
+    rng: np.random.Generator, camera: Camera, count: int, depth_m: tuple[float, float]
+) -> Array:
+    """(count, 3) points in the camera frame that project into the image, by rejection."""
+    low, high = np.log(depth_m)
+    kept = np.empty((0, 3))
+    spread = 1.2 * np.array([camera.width_px, camera.height_px]) / 2
+    focal = np.array([camera.intrinsics_px.fx, camera.intrinsics_px.fy])
+    while len(kept) < count:
+        angles = rng.uniform(-1, 1, (2 * count, 2)) * np.minimum(spread / focal, 1.4)
+        distance = np.exp(rng.uniform(low, high, 2 * count))
+        rays = np.column_stack([np.tan(angles), np.ones(2 * count)])
+        points = rays * (distance / np.linalg.norm(rays, axis=1))[:, None]
+        pixels, valid = camera.lens.project(points)
+        kept = np.vstack([kept, points[valid & camera.in_image(pixels)]])
+    return kept[:count]

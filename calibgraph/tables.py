@@ -1,0 +1,83 @@
+"""Results as tables for a terminal. Degrees and centimetres, because people read these."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from calibgraph.calibration import FRAMES_SENTENCE, Calibration
+from calibgraph.metrics import Evaluation, PoseError
+
+_COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
+
+
+def print_result(console: Console, result: Calibration, written: list[Path]) -> None:
+    """Print the verdict with its reasons, a line per camera, and the files that were written."""
+    status = result.verdict.status
+    console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
+    for reason in result.verdict.reasons:
+        console.print(f"  {reason}", highlight=False, markup=False)
+    console.print(result_table(result))
+    console.print("sigma: one standard deviation, the largest of the three axes of the camera")
+    seconds = sum(result.timings_s.values())
+    console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
+    for path in written:
+        console.print(f"  {path}", highlight=False, soft_wrap=True, markup=False)
+
+
+def result_table(result: Calibration) -> Table:
+    """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
+    table = Table(title="Calibration")
+    table.add_column("camera")
+    table.add_column("verdict")
+    headings = ("sigma [deg]", "sigma [cm]", "moved [deg]", "moved [cm]",
+                "median [px]", "inliers", "matches", "frames")  # fmt: skip
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    from calibgraph.metrics import pose_error
+
+    for name, T in result.T_camera_lidar.items():
+        moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
+        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+        status = result.camera_verdicts[name].status
+        table.add_row(
+            name,
+            f"[{_COLOURS[status]}]{status}[/]",
+            "too few frames" if sigmas is None else f"{sigmas[0].max():.3f}",
+            "to say" if sigmas is None else f"{sigmas[1].max():.2f}",
+            f"{moved.rotation_error_deg:.2f}",
+            f"{moved.translation_error_cm:.1f}",
+            "-" if residuals is None else f"{residuals.median_px:.2f}",
+            "-" if residuals is None else f"{residuals.inlier_share:.0%}",
+            str(result.counts[name]["used"]),
+            str(result.counts[name]["frames_used"]),
+        )
+    return table
+
+
+def evaluation_table(errors: Evaluation) -> Table:
+    """One row per camera and per pair of cameras."""
+    table = Table(title="Estimate - reference, in the axes of the camera")
+    table.add_column("camera")
+    headings = ("E_R [deg]", "E_t [cm]", "x [cm]", "y [cm]", "z [cm]",
+                "roll [deg]", "pitch [deg]", "yaw [deg]")  # fmt: skip
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for name, error in errors.cameras.items():
+        table.add_row(name, *_cells(error))
+    if errors.pairs:
+        table.add_section()
+    for name, error in errors.pairs.items():
+        table.add_row(name, *_cells(error))
+    return table
+
+
+def _cells(error: PoseError) -> list[str]:
+    return [
+        f"{error.rotation_error_deg:.3f}",
+        f"{error.translation_error_cm:.2f}",
+        *(f"{value:.2f}" for value in (error.x_cm, error.y_cm, error.z_cm)),
+        *(f"{value:.3f}" for value in (error.roll_deg, error.pitch_deg, error.yaw_deg)),
+    ]

@@ -1,0 +1,305 @@
+"""From correspondences to a calibration: the paper's two passes, fit, gate, refit."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.calibration import Calibration
+from calibgraph.config import TERMS, Config, Terms
+from calibgraph.correspondences import Correspondences
+from calibgraph.covariance import cluster_robust_covariance
+from calibgraph.errors import CorrespondenceError
+from calibgraph.graph import (
+    Optimum,
+    joined,
+    optimize,
+    prior_graph,
+    projection_graph,
+    relative_pose_graph,
+    relative_prior_graph,
+)
+from calibgraph.matches import MIN_MATCHES, Matches, Scale, matches_by_camera
+from calibgraph.preprocess import FILTERS, preprocess
+from calibgraph.rig import Rig
+from calibgraph.stage1 import Stage1, estimate_stage1
+from calibgraph.verdict import Evidence, camera_verdict, rig_verdict
+
+Array = NDArray[np.float64]
+Poses = dict[str, Array]
+
+_MAX_RESCALINGS = 10
+
+
+def solve(
+    rig: Rig, table: Correspondences, config: Config | None = None, terms: Terms = "full"
+) -> Calibration:
+    """Calibrate all cameras of a rig jointly from correspondences.
+
+    Args:
+        rig: cameras with their initial guess, and independently known relative poses.
+        table: correspondences; their points are in the LiDAR frame.
+        config: settings; the preset ``auto`` if None.
+        terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
+            ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are
+            measurements and take part in all but ``stage1``.
+
+    Returns:
+        The calibration, with a verdict that says whether it can be used.
+
+    Raises:
+        CorrespondenceError: if a camera cannot be determined: fewer than 6 usable correspondences
+            and no relative pose that ties it to a camera that has more.
+        ValueError: if ``terms`` is unknown.
+    """
+    if terms not in TERMS:
+        raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
+    config = config or Config()
+    clock = Clock()
+    with clock("preprocess"):
+        kept = preprocess(rig, table, config)
+        _require_determined(rig, kept.counts)
+        matches = matches_by_camera(rig, kept.table, config)
+    with clock("stage1"):
+        stage1 = _stage1(rig, kept.table, config)
+        start = _start(rig, matches, stage1.T_camera_lidar, terms)
+    pose_graph = _pose_graph(rig, stage1.T_camera_lidar, config, terms)
+    with clock("pass1"):
+        poses, scales = _fit(matches, pose_graph, start, config, terms)
+    with clock("pass2"):
+        inliers = {name: m.gated(poses[name], scales[name]) for name, m in matches.items()}
+        final = _minimize(inliers, pose_graph, poses, scales, terms)
+    with clock("checks"):
+        uncertainty = _uncertainty(inliers, pose_graph, final.T_camera_lidar, scales, terms)
+        halves = _halves(inliers, pose_graph, final.T_camera_lidar, scales, terms)
+    residuals = {name: m.summary(final.T_camera_lidar[name], scales[name])
+                 for name, m in matches.items()}  # fmt: skip
+    counts = _counts(kept.counts, matches, inliers, stage1)
+    covariance = _by_name(list(rig.cameras), uncertainty)
+    verdicts = {
+        name: camera_verdict(
+            camera,
+            Evidence(
+                residuals=residuals.get(name),
+                used=counts[name]["used"],
+                frames=counts[name]["frames_used"],
+                covariance=covariance[name],
+                halves=halves.get(name),
+                converged=final.converged,
+                terms=terms,
+            ),
+        )
+        for name, camera in rig.cameras.items()
+    }
+    return Calibration(
+        rig=rig.moved_to(final.T_camera_lidar),
+        initial_rig=rig,
+        covariance=covariance,
+        joint_covariance=uncertainty,
+        verdict=rig_verdict(verdicts),
+        camera_verdicts=verdicts,
+        residuals=residuals,
+        counts=counts,
+        timings_s=clock.seconds,
+        terms=terms,
+        config=config,
+        stage1_T_camera_lidar=stage1.T_camera_lidar,
+    )
+
+
+class Clock:
+    """Wall time of named stages: ``with clock("stage"): ...``."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the time that the body takes to a stage's."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> None:
+    """Every camera has enough correspondences, or relative poses tie it to one that has."""
+    tied = {name for name, count in counts.items() if count["capped"] >= MIN_MATCHES}
+    for _ in rig.cameras:
+        tied |= {p.a for p in rig.relative_poses if p.b in tied}
+        tied |= {p.b for p in rig.relative_poses if p.a in tied}
+    for name, count in counts.items():
+        if name not in tied:
+            left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
+            raise CorrespondenceError(
+                f"camera {name!r} has {count['capped']} usable correspondences, at least "
+                f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
+                f"(left after each filter: {left}); if most are not projectable, check the "
+                "direction and the axes of T_camera_lidar",
+                camera=name,
+            )
+
+
+def _stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
+    if config.stage1 == "rig":
+        named = [name for name in rig.cameras if name in table.cameras]
+        return Stage1({name: rig.cameras[name].T_camera_lidar for name in named}, {}, {})
+    return estimate_stage1(rig, table, config)
+
+
+def _start(
+    rig: Rig, matches: Mapping[str, Matches], T_hat: Mapping[str, Array], terms: Terms
+) -> Poses:
+    """Where the first pass starts.
+
+    Per camera it is the better of Stage 1 and the rig's guess, by the median error of the
+    matches; with the terms ``stage1``, Stage 1 itself. Cameras
+    without matches start where a relative pose puts them.
+    """
+    start = {}
+    for name in matches:
+        if terms == "stage1" and name not in T_hat:
+            raise CorrespondenceError(
+                f"camera {name!r}: PnP failed in every frame, so there is no Stage-1 estimate; "
+                "solve with other terms, or give more matches per frame",
+                camera=name,
+            )
+        candidates = [T_hat[name]] if name in T_hat else []
+        if terms != "stage1":
+            candidates.append(rig.cameras[name].T_camera_lidar)
+        medians = [np.median(matches[name].errors_px(T)[0]) for T in candidates]
+        start[name] = candidates[int(np.argmin(medians))]
+    for _ in rig.cameras:
+        for pair in rig.relative_poses:
+            if pair.b in start:
+                start.setdefault(pair.a, pair.T_a_b @ start[pair.b])
+            if pair.a in start:
+                start.setdefault(pair.b, np.linalg.inv(pair.T_a_b) @ start[pair.a])
+    return {name: start[name] for name in rig.cameras}
+
+
+def _pose_graph(
+    rig: Rig, T_hat: Mapping[str, Array], config: Config, terms: Terms
+) -> gtsam.NonlinearFactorGraph:
+    """Everything that is known of poses apart from correspondences."""
+    cameras = list(rig.cameras)
+    known = relative_pose_graph(cameras, rig.relative_poses)
+    if terms == "reprojection":
+        return known
+    return joined(
+        known,
+        prior_graph(cameras, T_hat, weight=config.prior_weight),
+        relative_prior_graph(
+            cameras, T_hat,
+            weight=config.relative_prior_weight, pairs=config.relative_prior_pairs,
+        ),
+    )  # fmt: skip
+
+
+def _fit(
+    matches: Mapping[str, Matches],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    start: Poses,
+    config: Config,
+    terms: Terms,
+) -> tuple[Poses, dict[str, Scale]]:
+    """Pass 1. With `auto` scales: fit and re-measure the spread until it stands still."""
+    poses = start
+    for _ in range(_MAX_RESCALINGS):
+        scales = {name: m.scale(poses[name], config) for name, m in matches.items()}
+        poses = _minimize(matches, pose_graph, poses, scales, terms).T_camera_lidar
+        settled = all(
+            abs(m.scale(poses[name], config).sigma / scales[name].sigma - 1.0) < 0.01  # noqa: PLR2004
+            for name, m in matches.items()
+        )
+        if settled:
+            break
+    return poses, {name: m.scale(poses[name], config) for name, m in matches.items()}
+
+
+def _minimize(
+    matches: Mapping[str, Matches],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    start: Poses,
+    scales: Mapping[str, Scale],
+    terms: Terms,
+) -> Optimum:
+    """Minimize the objective (paper, Eq. 5) with the scales held."""
+    if terms == "stage1":
+        return Optimum(start, math.nan, 0, True)
+    cameras = list(start)
+    blocks = {name: m.scaled(scales[name]) for name, m in matches.items()}
+    if terms == "priors":
+        return optimize(pose_graph, cameras, start)
+    return optimize(joined(projection_graph(cameras, blocks), pose_graph), cameras, start)
+
+
+def _uncertainty(
+    inliers: Mapping[str, Matches],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    poses: Poses,
+    scales: Mapping[str, Scale],
+    terms: Terms,
+) -> Array | None:
+    """(6 N, 6 N) joint covariance; None where the terms do not use the correspondences."""
+    if terms in ("stage1", "priors"):
+        return None
+    blocks = {name: m.scaled(scales[name]) for name, m in inliers.items()}
+    frames = {name: m.frame for name, m in inliers.items()}
+    return cluster_robust_covariance(blocks, frames, pose_graph, poses)
+
+
+def _by_name(cameras: list[str], joint: Array | None) -> dict[str, Array | None]:
+    """Each camera's (6, 6) block of the joint covariance."""
+    return {
+        name: None if joint is None else joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        for i, name in enumerate(cameras)
+    }
+
+
+def _halves(
+    inliers: Mapping[str, Matches],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    poses: Poses,
+    scales: Mapping[str, Scale],
+    terms: Terms,
+) -> dict[str, tuple[Array, Array]]:
+    """Per camera the solutions from every other frame and from the frames between, if possible."""
+    if terms in ("stage1", "priors"):
+        return {}
+    numbers = np.unique(np.concatenate([m.frame for m in inliers.values()]))
+    solutions = []
+    for half in (numbers[::2], numbers[1::2]):
+        part = {name: m.select(np.isin(m.frame, half)) for name, m in inliers.items()}
+        if any(len(m.frame) < MIN_MATCHES for m in part.values()):
+            return {}
+        solutions.append(_minimize(part, pose_graph, poses, scales, terms).T_camera_lidar)
+    return {name: (solutions[0][name], solutions[1][name]) for name in inliers}
+
+
+def _counts(
+    filters: Mapping[str, Mapping[str, int]],
+    matches: Mapping[str, Matches],
+    inliers: Mapping[str, Matches],
+    stage1: Stage1,
+) -> dict[str, dict[str, int]]:
+    """Per camera: correspondences left after each filter and the gate, and its frames."""
+    counts = {}
+    for name, before in filters.items():
+        given = matches[name].frame if name in matches else np.empty(0, np.int64)
+        used = inliers[name].frame if name in inliers else np.empty(0, np.int64)
+        counts[name] = {
+            **before,
+            "used": len(used),
+            "frames": len(np.unique(given)),
+            "frames_used": len(np.unique(used)),
+            "frames_without_pnp": stage1.failed_frames.get(name, 0),
+        }
+    return counts

@@ -1,0 +1,149 @@
+"""Can this result be used? PASS, WARN or FAIL, with the reasons and the thresholds they met.
+
+The thresholds are in the units of the error that a user would suffer, and the same for every rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.calibration import Residuals, Status, Verdict
+from calibgraph.config import Terms
+from calibgraph.covariance import MIN_FRAMES
+from calibgraph.rig import Camera, angle_deg
+
+Array = NDArray[np.float64]
+
+SPREAD_WARN_DEG, SPREAD_FAIL_DEG = 0.25, 0.5
+"""Residual spread as a viewing angle: half a degree is what a wrong match looks like."""
+
+INLIERS_WARN, INLIERS_FAIL = 0.6, 0.3
+
+HALVES_WARN_DEG, HALVES_FAIL_DEG = 0.2, 0.5
+HALVES_WARN_CM, HALVES_FAIL_CM = 6.0, 15.0
+"""How far the solutions of the even and of the odd frames may differ."""
+
+SIGMA_WARN_DEG, SIGMA_FAIL_DEG = 0.15, 0.5
+SIGMA_WARN_CM, SIGMA_FAIL_CM = 5.0, 15.0
+
+MATCHES_WARN = 50
+
+_ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a solve knows of one camera's result.
+
+    Attributes:
+        residuals: None if it had no correspondences and was solved through relative poses.
+        used: correspondences in the final solve.
+        frames: frames that they come from.
+        covariance: (6, 6) or None.
+        halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
+        converged: whether the last pass stopped by its tolerance.
+        terms: the terms of the objective.
+    """
+
+    residuals: Residuals | None
+    used: int
+    frames: int
+    covariance: Array | None
+    halves: tuple[Array, Array] | None
+    converged: bool
+    terms: Terms
+
+
+def camera_verdict(camera: Camera, evidence: Evidence) -> Verdict:
+    """Judge one camera's result by its evidence."""
+    residuals = evidence.residuals
+    if residuals is None:
+        return Verdict("WARN", ("no correspondences: known only through relative_poses",))
+    spread_deg = np.degrees(residuals.sigma_px / camera.intrinsics_px.fx)
+    checks = [
+        _above("residual spread", spread_deg, SPREAD_WARN_DEG, SPREAD_FAIL_DEG, "deg"),
+        _below("inlier share", residuals.inlier_share, INLIERS_WARN, INLIERS_FAIL),
+        *_sigma_checks(evidence.covariance),
+    ]
+    if evidence.terms in ("stage1", "priors"):
+        unchecked = f"the terms {evidence.terms!r} do not fit the correspondences: no error bar"
+        checks.append(("WARN", unchecked))
+    else:
+        checks += _halves_checks(evidence.halves)
+    if evidence.used < MATCHES_WARN:
+        few = f"only {evidence.used} correspondences used, fewer than {MATCHES_WARN}"
+        checks.append(("WARN", few))
+    if evidence.frames < MIN_FRAMES:
+        few = f"only {evidence.frames} frames: too few (under {MIN_FRAMES}) to give an error bar"
+        checks.append(("WARN", few))
+    if not evidence.converged:
+        checks.append(("FAIL", "the optimizer did not converge"))
+    return worst_of(checks)
+
+
+def worst_of(checks: Iterable[tuple[Status, str]]) -> Verdict:
+    """The worst status, with the reasons for everything that is not PASS."""
+    failed = [check for check in checks if check[0] != "PASS"]
+    statuses: list[Status] = [status for status, _ in failed]
+    status: Status = max(statuses, key=_ORDER.index, default="PASS")
+    return Verdict(status, tuple(reason for _, reason in failed))
+
+
+def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
+    """The worst of the cameras, each reason with its camera's name."""
+    return worst_of(
+        [
+            (verdict.status, f"{name}: {reason}")
+            for name, verdict in cameras.items()
+            for reason in verdict.reasons
+        ]
+    )
+
+
+def _halves_checks(halves: tuple[Array, Array] | None) -> list[tuple[Status, str]]:
+    if halves is None:
+        return [("WARN", "the frames cannot be split into halves to check against each other")]
+    one, two = halves
+    angle = angle_deg(one[:3, :3] @ two[:3, :3].T)
+    distance = 100 * float(np.linalg.norm(_centre(one) - _centre(two)))
+    what = "difference between even and odd frames"
+    return [
+        _above(what, angle, HALVES_WARN_DEG, HALVES_FAIL_DEG, "deg"),
+        _above(what, distance, HALVES_WARN_CM, HALVES_FAIL_CM, "cm"),
+    ]
+
+
+def _sigma_checks(covariance: Array | None) -> list[tuple[Status, str]]:
+    if covariance is None:
+        return []
+    sigmas = np.sqrt(np.diag(covariance))
+    rotation, translation = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
+    return [
+        _above("rotation sigma", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
+        _above("translation sigma", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
+    ]
+
+
+def _centre(T_camera_lidar: Array) -> Array:
+    """(3,) the camera's centre in the LiDAR frame."""
+    centre: Array = -T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3]
+    return centre
+
+
+def _above(what: str, value: float, warn: float, fail: float, unit: str) -> tuple[Status, str]:
+    limit = fail if value > fail else warn
+    text = f"{what} {value:.3g} {unit} is above {limit:g} {unit}"
+    return _grade(value > warn, value > fail), text
+
+
+def _below(what: str, value: float, warn: float, fail: float) -> tuple[Status, str]:
+    limit = fail if value < fail else warn
+    return _grade(value < warn, value < fail), f"{what} {value:.0%} is below {limit:.0%}"
+
+
+def _grade(warn: bool, fail: bool) -> Status:
+    return "FAIL" if fail else "WARN" if warn else "PASS"

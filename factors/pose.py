@@ -1,0 +1,78 @@
+"""Factors between poses only: the paper's two priors, and independently known relative poses.
+
+All act on variables ``X = T_lidar_camera``. GTSAM's cost is half the squared whitened error, so a
+paper weight lambda is a sigma of 1 / sqrt(lambda).
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def pose_sigmas(*, rotation_rad: float, translation_m: float) -> Array:
+    """(6,) standard deviations in GTSAM's tangent order: rotation first, then translation."""
+    return np.array([rotation_rad] * 3 + [translation_m] * 3)
+
+
+def camera_prior_factor(
+    key: int, T_camera_lidar: ArrayLike, *, weight: float
+) -> gtsam.PriorFactorPose3:
+    """The paper's per-camera prior ``lambda |log(T_hat^-1 T)|^2``, T = T_camera_lidar.
+
+    Exactly, not to first order: with X = T^-1 the stock prior's error is
+    ``log(T_hat X) = -Ad(T_hat) log(T_hat^-1 T)``, so its covariance must be Ad(T_hat) Ad(T_hat)^T
+    / lambda.
+
+    Args:
+        key: the pose variable ``T_lidar_camera``.
+        T_camera_lidar: (4, 4) the prior's mean T_hat.
+        weight: lambda > 0.
+    """
+    mean = gtsam.Pose3(np.asarray(T_camera_lidar, dtype=np.float64))
+    adjoint = mean.AdjointMap()
+    noise = gtsam.noiseModel.Gaussian.Covariance(adjoint @ adjoint.T / weight)
+    return gtsam.PriorFactorPose3(key, mean.inverse(), noise)
+
+
+def relative_prior_factor(
+    key_1: int, key_2: int, T_camera2_camera1: ArrayLike, *, weight: float
+) -> gtsam.BetweenFactorPose3:
+    """The paper's relative prior ``mu |log(T_hat_12^-1 T_2 T_1^-1)|^2``.
+
+    Args:
+        key_1: variable of camera 1.
+        key_2: variable of camera 2.
+        T_camera2_camera1: (4, 4) T_hat_12 = T_hat_2 T_hat_1^-1.
+        weight: mu > 0.
+    """
+    measured = gtsam.Pose3(np.asarray(T_camera2_camera1, dtype=np.float64))
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, weight**-0.5)
+    return gtsam.BetweenFactorPose3(key_2, key_1, measured, noise)
+
+
+def relative_pose_factor(
+    key_a: int,
+    key_b: int,
+    T_a_b: ArrayLike,
+    *,
+    rotation_sigma_rad: float,
+    translation_sigma_m: float,
+) -> gtsam.BetweenFactorPose3:
+    """Independent knowledge of a relative pose: stereo calibration, CAD, a Kalibr camchain.
+
+    Args:
+        key_a: variable of camera a.
+        key_b: variable of camera b.
+        T_a_b: (4, 4) maps coordinates in b to coordinates in a.
+        rotation_sigma_rad: standard deviation about each axis of b.
+        translation_sigma_m: standard deviation along each axis of b.
+    """
+    measured = gtsam.Pose3(np.asarray(T_a_b, dtype=np.float64))
+    sigmas = pose_sigmas(rotation_rad=rotation_sigma_rad, translation_m=translation_sigma_m)
+    return gtsam.BetweenFactorPose3(
+        key_a, key_b, measured, gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    )
