@@ -47,7 +47,7 @@ MatcherOption = Annotated[
     str, typer.Option(metavar="NAME|FILE", help="structure, or a table of correspondences.")
 ]
 FramesOption = Annotated[
-    str | None, typer.Option(metavar="A:B:STEP", help="Which frames, e.g. 0:100:10 or 0,5,7.")
+    str | None, typer.Option(metavar="A:B:STEP", help="Which frames, e.g. 0:90:10 or 0,5,7.")
 ]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")

@@ -27,6 +27,7 @@ MIN_DEPTH_M = 0.05
 PINHOLE, RADTAN, FISHEYE = 0, 1, 2
 _PINHOLE_COEFFICIENTS = (0, 4, 5, 8)
 _FISHEYE_COEFFICIENTS = (4,)
+_MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
 _LIMIT = 12  # index of the domain's limit in the packed parameters
 
 
@@ -107,7 +108,10 @@ def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
 
 
 def _radtan_limit(coefficients: Array) -> float:
-    """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does; tangential terms apart."""
+    """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does; tangential terms apart.
+
+    At most that of a ray 85 degrees off the axis: no polynomial was ever fitted beyond.
+    """
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
     denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
@@ -115,7 +119,8 @@ def _radtan_limit(coefficients: Array) -> float:
     slope = numerator * denominator + 2 * s * (
         numerator.deriv() * denominator - numerator * denominator.deriv()
     )
-    return math.sqrt(min(_smallest_positive_root(p.coef) for p in (slope, denominator)))
+    root = math.sqrt(min(_smallest_positive_root(p.coef) for p in (slope, denominator)))
+    return min(root, math.tan(_MAX_RADTAN_ANGLE_RAD)) if np.any(coefficients) else math.inf
 
 
 def _fisheye_limit(coefficients: Array) -> float:
@@ -206,9 +211,12 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     fx, fy = lens[0], lens[1]
     rho2 = x * x + y * y
     rho = math.sqrt(rho2)
-    if rho < 1e-12 * (abs(z) + 1e-300):  # on the axis: the limit of the formulas below
-        w = 1.0 / max(abs(z), MIN_DEPTH_M)
-        return lens[2], lens[3], fx * w, 0.0, 0.0, 0.0, fy * w, 0.0
+    if rho < 1e-12 * (abs(z) + 1e-300):
+        if z >= 0.0:  # on the axis: the limit of the formulas below
+            w = 1.0 / max(z, MIN_DEPTH_M)
+            return lens[2], lens[3], fx * w, 0.0, 0.0, 0.0, fy * w, 0.0
+        x = rho = 1e-9 * -z  # right behind, every direction is as good: take +x
+        y, rho2 = 0.0, rho * rho
     theta = math.atan2(rho, z)
     inside = min(theta, lens[12])
     t2 = inside * inside

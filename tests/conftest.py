@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import Camera, Intrinsics, RelativePose, Rig
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "data" / "sample"
+
+# Camera axes (right, down, forward) in LiDAR axes (forward, left, up).
+FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+RADTAN5 = (-0.11, 0.05, 0.001, -0.002, 0.004)
+RADTAN8 = (0.3, -0.1, 0.0005, 0.001, 0.02, 0.35, -0.05, 0.01)
+KANNALA = (0.02, -0.004, 0.001, -0.0002)
+
+
+def make_camera(
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    yaw_deg: float = 0.0,
+    model: str = "pinhole",
+    distortion: tuple[float, ...] = (),
+) -> Camera:
+    """A camera of KITTI's size at a position in the LiDAR frame, turned left by ``yaw_deg``."""
+    yaw = np.radians(yaw_deg)
+    turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    T = np.eye(4)
+    T[:3, :3] = FORWARD @ turn
+    T[:3, 3] = -T[:3, :3] @ np.array(position_m)
+    return Camera(
+        model=model,
+        width_px=1240,
+        height_px=376,
+        intrinsics_px=Intrinsics(fx=718.0, fy=710.0, cx=607.0, cy=185.0),
+        distortion=distortion,
+        T_camera_lidar=T,
+    )
+
+
+def stereo_relative_pose(rig: Rig, a: str = "left", b: str = "right") -> RelativePose:
+    T = rig.T_camera_lidar
+    return RelativePose(
+        a=a,
+        b=b,
+        T_a_b=T[a] @ np.linalg.inv(T[b]),
+        rotation_sigma_rad=1e-3,
+        translation_sigma_m=2e-3,
+    )
+
+
+@pytest.fixture
+def pair() -> Rig:
+    """Two cameras side by side, without distortion."""
+    return Rig(
+        cameras={
+            "left": make_camera((0.3, 0.1, -0.1)),
+            "right": make_camera((0.3, -0.4, -0.1)),
+        }
+    )
+
+
+@pytest.fixture
+def mixed_rig() -> Rig:
+    """Three cameras with three lenses, one of them looking sideways."""
+    return Rig(
+        cameras={
+            "front": make_camera((0.3, 0.1, -0.1), distortion=RADTAN5),
+            "wide": make_camera((0.2, -0.2, -0.1), distortion=RADTAN8),
+            "side": make_camera((0.0, 0.4, -0.1), yaw_deg=80, model="fisheye", distortion=KANNALA),
+        }
+    )
+
+
+@pytest.fixture(scope="session")
+def realdata() -> Path:
+    """The real sensor data: $CALIBGRAPH_REALDATA, or a folder beside the checkout."""
+    path = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))
+    if not path.is_dir():
+        pytest.skip(f"no real data at {path}; set CALIBGRAPH_REALDATA to run this")
+    return path

@@ -1,0 +1,224 @@
+"""The block factor equals its separate factors: in error, in linearization, in the solution."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import LOSSES, Lens, ProjectionBlock, block_factor, projection_factor, square_root
+from factors.block import BlockSums
+from tests.conftest import FORWARD, KANNALA, RADTAN5, RADTAN8
+
+K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
+LENSES = {
+    "pinhole": Lens.pinhole(**K),
+    "radtan": Lens.pinhole(**K, distortion=RADTAN5),
+    "rational": Lens.pinhole(**K, distortion=RADTAN8),
+    "fisheye": Lens.fisheye(**K, distortion=KANNALA),
+}
+KEY = 7
+TRUTH = gtsam.Pose3(gtsam.Rot3(FORWARD.T), np.array([0.3, 0.1, -0.1]))  # T_lidar_camera
+
+
+def world(lens: Lens, count: int, seed: int = 0, *, outliers: float = 0.2) -> ProjectionBlock:
+    """Correspondences with 1 px noise, outliers, and anisotropic whitening, some of rank one."""
+    rng = np.random.default_rng(seed)
+    rays = np.column_stack([rng.uniform(-0.8, 0.8, count), rng.uniform(-0.2, 0.2, count)])
+    points = np.column_stack([rays, np.ones(count)]) * rng.uniform(3, 40, count)[:, None]
+    pixels = lens.project(points)[0] + rng.standard_normal((count, 2))
+    wrong = rng.random(count) < outliers
+    pixels[wrong] += rng.uniform(-300, 300, (np.count_nonzero(wrong), 2))
+    roots = np.column_stack(
+        [rng.uniform(0.2, 2, count), rng.uniform(-1, 1, count), rng.uniform(0.2, 2, count)]
+    )
+    roots[::5, 2] = 0.0
+    in_lidar = points @ TRUTH.rotation().matrix().T + TRUTH.translation()
+    return ProjectionBlock(lens, in_lidar, pixels, roots)
+
+
+def with_loss(block: ProjectionBlock, loss: str, scale: float = 3.0) -> ProjectionBlock:
+    return ProjectionBlock(
+        block.lens, block.points_lidar_m, block.pixels_px, block.sqrt_information, loss, scale
+    )
+
+
+def separate(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(len(block)):
+        s00, s01, s11 = block.sqrt_information[k]
+        graph.add(
+            projection_factor(
+                KEY,
+                block.lens,
+                block.points_lidar_m[k],
+                block.pixels_px[k],
+                sqrt_information=[[s00, s01], [0.0, s11]],
+                loss=block.loss,
+                scale=block.scale,
+            )
+        )
+    return graph
+
+
+def together(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(block_factor(KEY, block))
+    return graph
+
+
+def at(pose: gtsam.Pose3) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(KEY, pose)
+    return values
+
+
+def poses(seed: int = 5) -> list[gtsam.Pose3]:
+    """At the truth, near it, a little off, and far off (some points then lie behind)."""
+    rng = np.random.default_rng(seed)
+    sizes = [0.0, 1e-7, 0.02, 0.5, 2.0]
+    return [TRUTH.retract(size * rng.standard_normal(6)) for size in sizes]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("name", LENSES)
+def test_error_and_linearization_equal_the_separate_factors(name: str, loss: str) -> None:
+    block = with_loss(world(LENSES[name], 60), loss)
+    many, one = separate(block), together(block)
+    for pose in poses():
+        values = at(pose)
+        np.testing.assert_allclose(one.error(values), many.error(values), rtol=1e-9)
+        expected = many.linearize(values).hessian()
+        found = one.linearize(values).hessian()
+        for a, b in zip(found, expected, strict=True):  # (6, 6) and (6,)
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
+def solution(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Pose3:
+    """LM, then Gauss-Newton until the gradient vanishes: an error known to 1e-16 of itself says
+    where its minimum is only to 1e-8 of the pose's sigma."""
+    near = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    polish = gtsam.GaussNewtonOptimizer(graph, near)
+    for _ in range(40):
+        polish.iterate()
+    return polish.values().atPose3(KEY)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("name", LENSES)
+def test_solution_equals_that_of_the_separate_factors(name: str, loss: str) -> None:
+    # Tukey gives no gradient to what is far off: start it where it can work, as documented.
+    block = with_loss(world(LENSES[name], 150, outliers=0.0 if loss == "l2" else 0.2), loss)
+    start = at(TRUTH.retract(np.full(6, 1e-3 if loss == "tukey" else 0.01)))
+    many, one = (solution(graph, start) for graph in (separate(block), together(block)))
+    np.testing.assert_allclose(one.matrix(), many.matrix(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_gradient_agrees_with_finite_differences_of_the_error(name: str) -> None:
+    block = with_loss(world(LENSES[name], 200), "cauchy")
+    for pose in poses()[:4]:
+        gradient = block.sums(pose).gradient
+        step = 1e-6
+        numeric = [
+            (block.sums(pose.retract(d)).cost - block.sums(pose.retract(-d)).cost) / (4 * step)
+            for d in step * np.eye(6)
+        ]
+        np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
+
+
+def test_projection_factor_equals_gtsams_stock_factor() -> None:
+    calibration = gtsam.Cal3_S2(718.0, 710.0, 0.0, 607.0, 185.0)
+    cauchy = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(4.0), gtsam.noiseModel.Unit.Create(2)
+    )
+    block = world(LENSES["pinhole"], 20)
+    landmark = 99
+    for k in range(20):
+        point, pixel = block.points_lidar_m[k], block.pixels_px[k]
+        values = at(poses()[2])
+        values.insert(landmark, point)
+        stock = gtsam.GenericProjectionFactorCal3_S2(pixel, cauchy, KEY, landmark, calibration)
+        ours = projection_factor(KEY, LENSES["pinhole"], point, pixel, scale=4.0)
+        np.testing.assert_allclose(ours.error(values), stock.error(values), rtol=1e-12)
+        expected, right = stock.linearize(values).jacobian()
+        A, b = ours.linearize(values).jacobian()
+        np.testing.assert_allclose(A, expected[:, :6], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(b, right, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
+    block = with_loss(world(LENSES["pinhole"], count), "cauchy")
+    error, jacobian = block.error_and_jacobian(poses()[2])
+    sums = block.sums(poses()[2])
+    assert np.isfinite(error).all()
+    np.testing.assert_allclose(jacobian.T @ jacobian, sums.hessian, atol=1e-9 * sums.hessian.max())
+    np.testing.assert_allclose(jacobian.T @ error, sums.gradient, atol=1e-9 * 1e4)
+    np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-9)
+
+
+def test_points_on_one_ray_leave_directions_free() -> None:
+    lens = LENSES["pinhole"]
+    points = np.outer(np.linspace(5, 50, 30), [0.1, 0.05, 1.0])
+    in_lidar = points @ TRUTH.rotation().matrix().T + TRUTH.translation()
+    block = ProjectionBlock(lens, in_lidar, lens.project(points)[0] + 0.5)
+    error, jacobian = block.error_and_jacobian(TRUTH)
+    sums = block.sums(TRUTH)
+    assert np.linalg.matrix_rank(jacobian) < 6
+    np.testing.assert_allclose(jacobian.T @ jacobian, sums.hessian, atol=1e-9 * sums.hessian.max())
+    np.testing.assert_allclose(jacobian.T @ error, sums.gradient, rtol=1e-6, atol=1e-6)
+
+
+def test_blocks_add() -> None:
+    block = with_loss(world(LENSES["radtan"], 5000), "cauchy")
+    whole = block.sums(TRUTH)
+    parts = block.frame_sums(TRUTH, [0, 700, 700, 3000, 5000])
+    assert parts.cost[1] == 0.0
+    np.testing.assert_allclose(parts.hessian.sum(axis=0), whole.hessian, rtol=1e-12)
+    np.testing.assert_allclose(parts.gradient.sum(axis=0), whole.gradient, rtol=1e-9)
+    np.testing.assert_allclose(parts.cost.sum(), whole.cost, rtol=1e-12)
+
+
+def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
+    block = with_loss(world(LENSES["radtan"], 300), "cauchy")
+    backwards = TRUTH.compose(gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)))
+    assert not block.residuals(backwards)[1].any()
+    graph = together(block)
+    assert np.isfinite(graph.error(at(backwards)))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, at(backwards)).optimize()
+    assert np.isfinite(found.atPose3(KEY).matrix()).all()
+    assert graph.error(found) <= graph.error(at(backwards))
+
+
+def test_square_root_of_nothing_is_zero() -> None:
+    error, jacobian = square_root(BlockSums(np.zeros((6, 6)), np.zeros(6), np.float64(0.0)))
+    assert not error.any()
+    assert not jacobian.any()
+
+
+def test_sums_do_not_depend_on_the_number_of_threads() -> None:
+    import numba
+
+    block = with_loss(world(LENSES["radtan"], 20_000), "cauchy")
+    whole = block.sums(TRUTH)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        alone = block.sums(TRUTH)
+    finally:
+        numba.set_num_threads(threads)
+    assert whole.cost == alone.cost
+    assert (whole.hessian == alone.hessian).all()
+
+
+def test_bad_blocks_are_refused() -> None:
+    lens = LENSES["pinhole"]
+    with pytest.raises(ValueError, match="shape"):
+        ProjectionBlock(lens, np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"pixels_px\[1\] is not finite"):
+        ProjectionBlock(lens, np.zeros((2, 3)), np.array([[0, 0], [np.nan, 0]]))
+    with pytest.raises(ValueError, match="unknown robust loss"):
+        ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), loss="welsch")
+    with pytest.raises(ValueError, match="scale"):
+        ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), scale=0.0)
