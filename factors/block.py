@@ -12,6 +12,7 @@ that is concave in s with rho(0) = 0.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,12 +21,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
-from factors.lens import Lens, is_projectable, project_one
-from factors.loss import loss_and_weight, loss_id
+from factors.lens import MIN_DEPTH_M, PINHOLE, Lens, is_projectable, project_one
+from factors.loss import CAUCHY, loss_and_weight, loss_id
 
 Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
+_WORTH_SHARING = 300_000  # correspondences (2 ms): below, waking other threads costs more
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,8 @@ class ProjectionBlock:
     def _segment_sums(self, T_lidar_camera: gtsam.Pose3, edges: NDArray[np.int64]) -> Array:
         columns, whitening = self._columns
         T = np.ascontiguousarray(T_lidar_camera.inverse().matrix())
-        sums: Array = _accumulate(
+        run = _accumulate_alone if len(self) < _WORTH_SHARING else _accumulate_shared
+        sums: Array = run(
             self.lens.kind, self.lens.packed, T, columns, whitening,
             loss_id(self.loss), self.scale, edges,
         )  # fmt: skip
@@ -178,44 +181,129 @@ def _unpacked(sums: Array) -> BlockSums:
     return BlockSums(hessian, sums[..., 21:27], sums[..., 27])
 
 
-@njit(cache=True, parallel=True, fastmath={"reassoc", "contract", "nsz", "arcp"})
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_SMALL = 1e-200  # far from the smallest float by more than one factor
+_TILE = 128  # correspondences whose 12 intermediate values stay in the first-level cache
+(_RU, _RV, _UX, _UY, _UZ, _VX, _VY, _VZ, _X, _Y, _Z, _PSI) = range(12)  # rows of a tile
+
+
 def _accumulate(kind, lens, T, columns, whitening, loss, scale, edges):  # type: ignore[no-untyped-def]
-    """(segments, 28) sums over the runs ``edges[i]:edges[i + 1]`` of the correspondences."""
-    out = np.empty((len(edges) - 1, 28))
+    """(segments, 28) sums over the runs ``edges[i]:edges[i + 1]`` of the correspondences.
+
+    Each run is cut into tiles, and a tile goes through four loops that vectorize.
+    """
+    out = np.zeros((len(edges) - 1, 28))
     for segment in prange(len(edges) - 1):
-        out[segment] = _segment(
-            kind, lens, T, columns, whitening, loss, scale, edges[segment], edges[segment + 1]
-        )
+        tile = np.empty((12, _TILE))
+        for start in range(edges[segment], edges[segment + 1], _TILE):
+            n = min(_TILE, edges[segment + 1] - start)
+            if kind == PINHOLE:
+                _project_pinhole(lens, T, columns, start, n, tile)
+            else:
+                _project(kind, lens, T, columns, start, n, tile)
+            if whitening.shape[1] > 0:
+                _whiten(whitening, start, n, tile)
+            out[segment, 27] += _weigh(loss, scale, n, tile)
+            _sum_tile(n, tile, out, segment)
     return out
 
 
-@njit(cache=True, fastmath={"reassoc", "contract", "nsz", "arcp"})
-def _segment(kind, lens, T, columns, whitening, loss, scale, start, stop):  # type: ignore[no-untyped-def]
-    """28 sums over one run: kept in scalars, which stay in registers."""
-    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
-    h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
-    b0 = b1 = b2 = b3 = b4 = b5 = cost = 0.0
-    weighted = whitening.shape[1] > 0
-    for k in range(start, stop):
-        px, py, pz = columns[0, k], columns[1, k], columns[2, k]
+_accumulate_alone = njit(cache=True)(_accumulate)
+_accumulate_shared = njit(cache=True, parallel=True)(_accumulate)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """``_project`` for a pinhole without distortion: no branch, so that it vectorizes."""
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    for i in range(n):
+        px, py, pz = columns[0, start + i], columns[1, start + i], columns[2, start + i]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        w = 1.0 / max(z, MIN_DEPTH_M)
+        wz = w if z > MIN_DEPTH_M else 0.0
+        u, v = fx * x * w, fy * y * w
+        tile[_RU, i] = u + cx - columns[3, start + i]
+        tile[_RV, i] = v + cy - columns[4, start + i]
+        tile[_UX, i], tile[_UY, i], tile[_UZ, i] = fx * w, 0.0, -u * wz
+        tile[_VX, i], tile[_VY, i], tile[_VZ, i] = 0.0, fy * w, -v * wz
+        tile[_X, i], tile[_Y, i], tile[_Z, i] = x, y, z
+
+
+@njit(cache=True, fastmath=_FAST)
+def _project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """Residuals, their derivatives by the point, and the point in the camera frame."""
+    for i in range(n):
+        px, py, pz = columns[0, start + i], columns[1, start + i], columns[2, start + i]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
-        ru = u - columns[3, k]
-        rv = v - columns[4, k]
-        if weighted:
-            s00, s01, s11 = whitening[0, k], whitening[1, k], whitening[2, k]
-            ru, rv = s00 * ru + s01 * rv, s11 * rv
-            ux, uy, uz = s00 * ux + s01 * vx, s00 * uy + s01 * vy, s00 * uz + s01 * vz
-            vx, vy, vz = s11 * vx, s11 * vy, s11 * vz
-        rho, psi = loss_and_weight(loss, scale, ru * ru + rv * rv)
+        tile[_RU, i] = u - columns[3, start + i]
+        tile[_RV, i] = v - columns[4, start + i]
+        tile[_UX, i], tile[_UY, i], tile[_UZ, i] = ux, uy, uz
+        tile[_VX, i], tile[_VY, i], tile[_VZ, i] = vx, vy, vz
+        tile[_X, i], tile[_Y, i], tile[_Z, i] = x, y, z
+
+
+@njit(cache=True, fastmath=_FAST)
+def _whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
+    """Multiply residuals and derivatives by the upper triangular whitening matrices."""
+    for i in range(n):
+        s00, s01, s11 = whitening[0, start + i], whitening[1, start + i], whitening[2, start + i]
+        tile[_RU, i] = s00 * tile[_RU, i] + s01 * tile[_RV, i]
+        tile[_UX, i] = s00 * tile[_UX, i] + s01 * tile[_VX, i]
+        tile[_UY, i] = s00 * tile[_UY, i] + s01 * tile[_VY, i]
+        tile[_UZ, i] = s00 * tile[_UZ, i] + s01 * tile[_VZ, i]
+        tile[_RV, i] *= s11
+        tile[_VX, i] *= s11
+        tile[_VY, i] *= s11
+        tile[_VZ, i] *= s11
+
+
+@njit(cache=True, fastmath=_FAST)
+def _weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
+    """Fill in the weights psi; return the sum of rho."""
+    if loss != CAUCHY:
+        cost = 0.0
+        for i in range(n):
+            rho, tile[_PSI, i] = loss_and_weight(
+                loss, scale, tile[_RU, i] * tile[_RU, i] + tile[_RV, i] * tile[_RV, i]
+            )
+            cost += rho
+        return cost
+    k = 1.0 / (scale * scale)
+    for i in range(n):
+        ratio = 1.0 + k * (tile[_RU, i] * tile[_RU, i] + tile[_RV, i] * tile[_RV, i])
+        tile[_PSI, i] = 1.0 / ratio
+    # The sum of logarithms is the logarithm of the product, taken before it leaves the range of
+    # a float: a division and a multiplication each instead of a logarithm.
+    logarithms, product = 0.0, 1.0
+    for i in range(n):
+        product *= tile[_PSI, i]
+        if product < _SMALL:
+            logarithms += math.log(product)
+            product = 1.0
+    return -(logarithms + math.log(product)) / k
+
+
+@njit(cache=True, fastmath=_FAST)
+def _sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
+    """Add J^T psi J and J^T psi r of a tile to the 27 sums of a segment."""
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
+    h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for i in range(n):
         # q = X^-1 p:  dq / d(rotation, translation) = ([q]x, -I);  g^T [q]x = (g x q)^T.
-        u0, u1, u2 = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
-        v0, v1, v2 = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
-        u3, u4, u5, v3, v4, v5 = -ux, -uy, -uz, -vx, -vy, -vz
+        x, y, z, psi = tile[_X, i], tile[_Y, i], tile[_Z, i], tile[_PSI, i]
+        u3, u4, u5 = -tile[_UX, i], -tile[_UY, i], -tile[_UZ, i]
+        v3, v4, v5 = -tile[_VX, i], -tile[_VY, i], -tile[_VZ, i]
+        u0, u1, u2 = u5 * y - u4 * z, u3 * z - u5 * x, u4 * x - u3 * y
+        v0, v1, v2 = v5 * y - v4 * z, v3 * z - v5 * x, v4 * x - v3 * y
         a0, a1, a2, a3, a4, a5 = psi * u0, psi * u1, psi * u2, psi * u3, psi * u4, psi * u5
         c0, c1, c2, c3, c4, c5 = psi * v0, psi * v1, psi * v2, psi * v3, psi * v4, psi * v5
+        ru, rv = tile[_RU, i], tile[_RV, i]
         h00 += a0 * u0 + c0 * v0
         h01 += a0 * u1 + c0 * v1
         h02 += a0 * u2 + c0 * v2
@@ -243,19 +331,20 @@ def _segment(kind, lens, T, columns, whitening, loss, scale, start, stop):  # ty
         b3 += a3 * ru + c3 * rv
         b4 += a4 * ru + c4 * rv
         b5 += a5 * ru + c5 * rv
-        cost += rho
-    return np.array([
+    sums = (
         h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25, h33, h34, h35,
-        h44, h45, h55, b0, b1, b2, b3, b4, b5, cost,
-    ])  # fmt: skip
+        h44, h45, h55, b0, b1, b2, b3, b4, b5,
+    )  # fmt: skip
+    for k in range(27):
+        out[segment, k] += sums[k]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _residuals(kind, lens, T, columns):  # type: ignore[no-untyped-def]
     n = columns.shape[1]
     residuals = np.empty((n, 2))
     valid = np.empty(n, dtype=np.bool_)
-    for k in prange(n):
+    for k in range(n):
         px, py, pz = columns[0, k], columns[1, k], columns[2, k]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -251,12 +251,12 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
     pixels = np.empty((n, 2))
     valid = np.empty(n, dtype=np.bool_)
-    for k in prange(n):
+    for k in range(n):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         projection = project_one(kind, lens, x, y, z)
         pixels[k, 0] = projection[0]

@@ -157,9 +157,7 @@ def test_preprocessing_counts_at_every_filter(pair: Rig) -> None:
     counts = kept.counts["left"]
     assert counts["given"] == 1200
     assert counts["projectable"] == 1150
-    assert counts["confident"] == np.count_nonzero(
-        behind.of_camera("left").confidence[50:] >= 0.5
-    )
+    assert counts["confident"] == np.count_nonzero(behind.of_camera("left").confidence[50:] >= 0.5)
     assert counts["best_in_cell"] < counts["confident"]
     assert counts["capped"] == 300
     per_frame = np.bincount(kept.table.of_camera("left").frame)

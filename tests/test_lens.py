@@ -24,9 +24,9 @@ LENSES["fisheye"] = Lens.fisheye(**K, distortion=KANNALA)
 def random_points(seed: int, count: int, spread: float) -> np.ndarray:
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.5, 60, count)
-    return np.column_stack([rng.uniform(-spread, spread, (count, 2)), np.ones(count)]) * depth[
-        :, None
-    ]
+    return (
+        np.column_stack([rng.uniform(-spread, spread, (count, 2)), np.ones(count)]) * depth[:, None]
+    )
 
 
 @pytest.mark.parametrize("count", RADTAN)

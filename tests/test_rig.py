@@ -125,9 +125,7 @@ def test_rounded_digits_are_made_a_rotation_again() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_perturb_displaces_by_exactly_what_it_says(pair: Rig, seed: int) -> None:
     moved = perturb(pair, rotation_deg=20, translation_m=1.5, seed=seed)
-    deltas = [
-        moved.T_camera_lidar[n] @ np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()
-    ]
+    deltas = [moved.T_camera_lidar[n] @ np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()]
     for delta in deltas:
         assert angle_deg(delta[:3, :3]) == pytest.approx(20, abs=1e-9)
         assert np.linalg.norm(delta[:3, 3]) == pytest.approx(1.5, abs=1e-12)
