@@ -66,7 +66,7 @@ class Dataset:
         """
         try:
             kept = [self.frames[i] for i in _indices(frames, len(self.frames))]
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, TypeError) as error:
             raise ValueError(
                 f"frames {frames!r}: expected start:stop:step or numbers below "
                 f"{len(self.frames)}, like 0:100:10 or 0,5,7"
@@ -206,9 +206,12 @@ def _frames(folder: Path, rig: Rig) -> list[Frame]:
 def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]) -> None:
     lonely = sorted(clouds ^ images)
     if lonely:
-        has, lacks = ("cloud", "image") if lonely[0] in clouds else ("image", "cloud")
+        image = f"of camera {camera!r}"
+        what = f"a cloud but no image {image}"
+        if lonely[0] not in clouds:
+            what = f"an image {image} but no cloud"
         raise DatasetError(
-            f"{folder}: frame {lonely[0]!r} has a {has} but no {lacks} of camera {camera!r} "
+            f"{folder}: frame {lonely[0]!r} has {what} "
             f"({len(lonely)} such frames); give both the same name, or remove the lonely file",
             camera=camera,
             frame=lonely[0],

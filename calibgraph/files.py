@@ -118,8 +118,8 @@ def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
 
 
 def describe(error: ValidationError) -> str:
-    """First problem of a pydantic error, in one line."""
-    first = error.errors()[0]
+    """First problem of a pydantic error, in one line; a misspelt key before what it then lacks."""
+    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"unknown key {where!r}; remove it or correct its spelling"

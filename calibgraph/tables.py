@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
 from calibgraph.calibration import FRAMES_SENTENCE, Calibration
-from calibgraph.metrics import Evaluation, PoseError
+from calibgraph.metrics import Evaluation, PoseError, pose_error
 
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
@@ -29,15 +30,13 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
 
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
-    table = Table(title="Calibration")
-    table.add_column("camera")
-    table.add_column("verdict")
-    headings = ("sigma [deg]", "sigma [cm]", "moved [deg]", "moved [cm]",
-                "median [px]", "inliers", "matches", "frames")  # fmt: skip
+    table = Table(title="Calibration", box=SIMPLE)
+    table.add_column("camera", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    headings = ("sigma deg", "sigma cm", "moved deg", "moved cm",
+                "median px", "inliers", "matches", "frames")  # fmt: skip
     for heading in headings:
         table.add_column(heading, justify="right")
-    from calibgraph.metrics import pose_error
-
     for name, T in result.T_camera_lidar.items():
         moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
         sigmas, residuals = result.sigmas(name), result.residuals.get(name)
@@ -45,8 +44,8 @@ def result_table(result: Calibration) -> Table:
         table.add_row(
             name,
             f"[{_COLOURS[status]}]{status}[/]",
-            "too few frames" if sigmas is None else f"{sigmas[0].max():.3f}",
-            "to say" if sigmas is None else f"{sigmas[1].max():.2f}",
+            "-" if sigmas is None else f"{sigmas[0].max():.3f}",
+            "-" if sigmas is None else f"{sigmas[1].max():.2f}",
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",
             "-" if residuals is None else f"{residuals.median_px:.2f}",
@@ -59,10 +58,9 @@ def result_table(result: Calibration) -> Table:
 
 def evaluation_table(errors: Evaluation) -> Table:
     """One row per camera and per pair of cameras."""
-    table = Table(title="Estimate - reference, in the axes of the camera")
-    table.add_column("camera")
-    headings = ("E_R [deg]", "E_t [cm]", "x [cm]", "y [cm]", "z [cm]",
-                "roll [deg]", "pitch [deg]", "yaw [deg]")  # fmt: skip
+    table = Table(title="Estimate - reference, in the axes of the camera", box=SIMPLE)
+    table.add_column("camera", no_wrap=True)
+    headings = ("E_R deg", "E_t cm", "x cm", "y cm", "z cm", "roll deg", "pitch deg", "yaw deg")
     for heading in headings:
         table.add_column(heading, justify="right")
     for name, error in errors.cameras.items():
