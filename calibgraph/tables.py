@@ -21,7 +21,10 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     for reason in result.verdict.reasons:
         console.print(f"  {reason}", highlight=False, markup=False)
     console.print(result_table(result))
-    console.print("sigma: one standard deviation, the largest of the three axes of the camera")
+    console.print(
+        "sigma: standard deviation of the scatter between frames, largest axis; what all frames "
+        "share (the matcher's bias, wrong intrinsics) is not in it"
+    )
     seconds = sum(result.timings_s.values())
     console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
@@ -30,9 +33,7 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
 
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
-    table = Table(title="Calibration", box=SIMPLE)
-    table.add_column("camera", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
+    table = _table("Calibration", "camera", "verdict")
     headings = ("sigma deg", "sigma cm", "moved deg", "moved cm",
                 "median px", "inliers", "matches", "frames")  # fmt: skip
     for heading in headings:
@@ -56,13 +57,27 @@ def result_table(result: Calibration) -> Table:
     return table
 
 
+def _table(title: str, *names: str) -> Table:
+    """An empty table, narrow enough that numbers are whole on 80 columns."""
+    table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
+    for name in names:
+        table.add_column(name, no_wrap=True)
+    return table
+
+
+def _add_numbers(table: Table, *headings: str) -> None:
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+
+
 def evaluation_table(errors: Evaluation) -> Table:
     """One row per camera and per pair of cameras."""
-    table = Table(title="Estimate - reference, in the axes of the camera", box=SIMPLE)
-    table.add_column("camera", no_wrap=True)
-    headings = ("E_R deg", "E_t cm", "x cm", "y cm", "z cm", "roll deg", "pitch deg", "yaw deg")
-    for heading in headings:
-        table.add_column(heading, justify="right")
+    table = _table("Estimate - reference, in the axes of the camera", "camera")
+    _add_numbers(
+        table,
+        "E_R\ndeg", "E_t\ncm", "x\ncm", "y\ncm", "z\ncm",
+        "roll\ndeg", "pitch\ndeg", "yaw\ndeg",
+    )  # fmt: skip
     for name, error in errors.cameras.items():
         table.add_row(name, *_cells(error))
     if errors.pairs:

@@ -141,8 +141,9 @@ def _require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> No
             raise CorrespondenceError(
                 f"camera {name!r} has {count['capped']} usable correspondences, at least "
                 f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
-                f"(left after each filter: {left}); if most are not projectable, check the "
-                "direction and the axes of T_camera_lidar",
+                f"(left after each filter: {left}); if none were given, or most are not "
+                "projectable, the cloud is not where T_camera_lidar looks: check its direction "
+                "(p_camera = T_camera_lidar * p_lidar), its axes and its units",
                 camera=name,
             )
 

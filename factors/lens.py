@@ -84,11 +84,11 @@ class Lens:
         pixels, valid = _project_many(self.kind, self.packed, points)
         return pixels, valid
 
-    def project_with_jacobian(self, point_camera_m: ArrayLike) -> tuple[Array, Array]:
-        """Project one point: its (2,) pixel and the (2, 3) derivative of it by the point."""
-        x, y, z = np.asarray(point_camera_m, dtype=np.float64)
-        u, v, ux, uy, uz, vx, vy, vz = project_one(self.kind, self.packed, x, y, z)
-        return np.array([u, v]), np.array([[ux, uy, uz], [vx, vy, vz]])
+    def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
+        """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
+        points = np.ascontiguousarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
+        pixels, jacobians = _project_many_with_jacobian(self.kind, self.packed, points)
+        return pixels, jacobians
 
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], counts: tuple[int, ...]) -> Array:
@@ -251,7 +251,7 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
     pixels = np.empty((n, 2))
@@ -263,3 +263,16 @@ def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
         pixels[k, 1] = projection[1]
         valid[k] = is_projectable(kind, lens, x, y, z)
     return pixels, valid
+
+
+@njit(cache=True, nogil=True)
+def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-def]
+    n = len(points)
+    pixels = np.empty((n, 2))
+    jacobians = np.empty((n, 2, 3))
+    for k in range(n):
+        projection = project_one(kind, lens, points[k, 0], points[k, 1], points[k, 2])
+        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+        jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
+        jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
+    return pixels, jacobians

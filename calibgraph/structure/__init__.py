@@ -1,0 +1,19 @@
+"""The weight-free matcher `structure`: local correlation of clouds and images, pose consensus.
+
+Per round, from the present estimate of the poses:
+
+1. ``windows``: small neighbourhoods of LiDAR points, as the camera would see them, and what varies
+   in them: inverse range and intensity.
+2. ``scores``: how well the image under each window, at every shift of a grid, agrees with it; the
+   windows of one direction and depth are one group.
+3. ``consensus``: the pose at which the groups' shifts agree best.
+4. ``peaks``: every group's own best shift next to it, with the directions that it constrains: one
+   correspondence each.
+
+Shifts and resolutions are angles, so that one schedule of rounds serves every focal length. Nothing
+depends on the order of the points in a file, or on rings.
+"""
+
+from calibgraph.structure.matcher import StructureMatcher
+
+__all__ = ["StructureMatcher"]

@@ -1,0 +1,88 @@
+"""The pose at which the shifts of all groups agree best."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from calibgraph.structure.level import Level
+from calibgraph.structure.scores import Scores
+
+Array = NDArray[np.float64]
+
+# The cross-entropy search: samples a step (four times that in the first), the best that shape the
+# next step's distribution, steps, and independent starts of which the best wins.
+SAMPLES, ELITES, STEPS, STARTS = 400, 40, 14, 3
+WIDENING = 1.2  # of the elites' covariance, against closing in too early
+PRIOR = 6.0  # penalty, in chance spreads of the score, of a twist sqrt(2 / 6) of the box from 0
+
+
+def chance_spread(scores: Scores) -> float:
+    """Standard deviation of the summed score over unrelated shifts."""
+    return float(np.sqrt(scores.grids.var(axis=(1, 2), dtype=np.float64).sum()))
+
+
+def find_consensus(scores: Scores, level: Level, *, seed: int) -> tuple[Array, float]:
+    """Maximise the summed score over twists, less a weak prior on their size.
+
+    Args:
+        scores: the groups of one camera.
+        level: half-widths of the search.
+        seed: of the search's samples.
+
+    Returns:
+        (6,) twist (rotation [rad], translation [m]); its summed score in chance spreads.
+    """
+    rng = np.random.default_rng(seed)
+    box = np.repeat([level.rotation_rad, level.translation_m], 3)
+    found = [_search_once(scores, box, rng) for _ in range(STARTS)]
+    twist, _ = max(found, key=lambda pair: pair[1])
+    contrast = float(summed_score(scores, twist[None])[0]) / (chance_spread(scores) + 1e-12)
+    return twist, contrast
+
+
+def summed_score(scores: Scores, twists: Array) -> Array:
+    """(n,) sum over groups of the score at the shift that each twist (n, 6) implies."""
+    out = np.zeros(len(twists))
+    _sum_scores(scores.grids, scores.flow, np.ascontiguousarray(twists), out)
+    return out
+
+
+def _search_once(scores: Scores, box: Array, rng: np.random.Generator) -> tuple[Array, float]:
+    """One cross-entropy search: the twist and its penalised score."""
+    weight = 0.5 * PRIOR * chance_spread(scores)
+
+    def penalised(twists: Array) -> Array:
+        return np.asarray(summed_score(scores, twists) - weight * ((twists / box) ** 2).sum(axis=1))
+
+    mean: Array = np.zeros(6)
+    root: Array = np.diag(box * 0.6)
+    for step in range(STEPS):
+        count = SAMPLES * (4 if step == 0 else 1)
+        twists = np.clip(mean + rng.standard_normal((count, 6)) @ root.T, -box, box)
+        elite = twists[np.argsort(-penalised(twists))[:ELITES]]
+        mean = elite.mean(axis=0)
+        spread = WIDENING * np.cov(elite.T) + np.diag((1e-4 * box) ** 2)
+        root = np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
+    return mean, float(penalised(mean[None])[0])
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _sum_scores(grids, flow, twists, out):  # type: ignore[no-untyped-def]
+    """Sum bilinearly interpolated scores; shifts outside the grid count 0."""
+    reach = (grids.shape[1] - 1) // 2
+    for i in range(twists.shape[0]):
+        total = 0.0
+        for g in range(grids.shape[0]):
+            u = v = float(reach)
+            for k in range(6):
+                u += flow[g, 0, k] * twists[i, k]
+                v += flow[g, 1, k] * twists[i, k]
+            if u < 0 or v < 0 or u >= 2 * reach or v >= 2 * reach:
+                continue
+            a, b = int(u), int(v)
+            x, y = u - a, v - b
+            total += (1 - y) * ((1 - x) * grids[g, b, a] + x * grids[g, b, a + 1])
+            total += y * ((1 - x) * grids[g, b + 1, a] + x * grids[g, b + 1, a + 1])
+        out[i] = total
