@@ -19,6 +19,7 @@ import typer
 if TYPE_CHECKING:
     from calibgraph.calibration import Calibration
     from calibgraph.config import Config
+    from calibgraph.dataset import Dataset
     from calibgraph.pipeline import Progress
 
 app = typer.Typer(
@@ -84,17 +85,16 @@ def calibrate(
     as_json: JsonOption = False,
 ) -> None:
     """From images and clouds to one calibration of all cameras, with pictures before and after."""
-    from calibgraph.dataset import load_dataset
-    from calibgraph.load import load_rig
     from calibgraph.overlay import write_overlays
-    from calibgraph.pipeline import calibrate
+    from calibgraph.pipeline import calibrate, matcher_named
 
-    settings = _settings(config, preset, seed)
-    data = load_dataset(dataset, load_rig(rig) if rig else None)
-    data = data.select(frames) if frames else data
+    with _arguments():
+        settings, chosen = _settings(config, preset, seed), matcher_named(matcher, seed=seed)
+        checked_terms = _terms(terms)
+    data = _dataset(dataset, rig, frames)
     with _progress() as progress:
         result = calibrate(
-            data, matcher=matcher, config=settings, terms=_terms(terms), progress=progress
+            data, matcher=chosen, config=settings, terms=checked_terms, progress=progress
         )
         written = [result.save(out), out / "correspondences.parquet"]
         shown = data.frames[len(data.frames) // 2]
@@ -111,19 +111,19 @@ def match(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
     ] = Path("correspondences.parquet"),
+    seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Find correspondences and write them as a table, without keeping the calibration."""
-    from calibgraph.dataset import load_dataset
-    from calibgraph.load import load_rig
-    from calibgraph.pipeline import calibrate
+    from calibgraph.pipeline import calibrate, matcher_named
 
-    if out.suffix not in (".parquet", ".csv"):
-        raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
-    data = load_dataset(dataset, load_rig(rig) if rig else None)
-    data = data.select(frames) if frames else data
+    with _arguments():
+        if out.suffix not in (".parquet", ".csv"):
+            raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
+        chosen = matcher_named(matcher, seed=seed)
+    data = _dataset(dataset, rig, frames)
     with _progress() as progress:
-        result = calibrate(data, matcher=matcher, progress=progress)
+        result = calibrate(data, matcher=chosen, progress=progress)
     table = result.correspondences
     assert table is not None  # calibrate always keeps those of its last round
     table.save(out)
@@ -153,9 +153,10 @@ def solve(
     from calibgraph.load import load_rig
     from calibgraph.two_pass import solve
 
-    settings = _settings(config, preset, seed)
+    with _arguments():
+        settings, checked_terms = _settings(config, preset, seed), _terms(terms)
     table = load_correspondences(correspondences)
-    result = solve(load_rig(rig), table, settings, _terms(terms))
+    result = solve(load_rig(rig), table, settings, checked_terms)
     result = result.with_inputs({str(correspondences): sha256(correspondences)})
     _finish(result, [result.save(out)], as_json)
 
@@ -210,11 +211,31 @@ def main() -> None:
 
     try:
         app()
-    except (CalibrationError, ValueError, OSError) as error:
+    except (CalibrationError, OSError) as error:
         if "--debug" in sys.argv:
             raise
         print(f"calibgraph: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
+
+
+@contextmanager
+def _arguments() -> Iterator[None]:
+    """Turn a wrong argument, a ``ValueError`` in the library, into the user's one line."""
+    from calibgraph.errors import CalibrationError
+
+    try:
+        yield
+    except ValueError as error:
+        raise CalibrationError(str(error)) from error
+
+
+def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Dataset:
+    from calibgraph.dataset import load_dataset
+    from calibgraph.load import load_rig
+
+    data = load_dataset(folders, load_rig(rig) if rig else None)
+    with _arguments():
+        return data.select(frames) if frames is not None else data
 
 
 def _settings(config: Path | None, preset_name: str | None, seed: int) -> Config:

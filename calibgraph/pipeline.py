@@ -93,10 +93,10 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    chosen = matcher_named(matcher)
+    config = config or Config()
+    chosen = matcher_named(matcher, seed=config.seed)
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     initial = rig if rig is not None else data.rig
-    config = config or Config()
     if chosen.stage1 == "rig":
         config = config.changed(stage1="rig")
     report = progress or (lambda what, done, total: None)
@@ -121,8 +121,12 @@ def calibrate(
     )
 
 
-def matcher_named(matcher: Matcher | Correspondences | Path | str) -> Matcher:
+def matcher_named(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> Matcher:
     """A matcher by its name, by the file of its correspondences, or as it is.
+
+    Args:
+        matcher: what the user said.
+        seed: for a matcher by name that draws random numbers.
 
     Raises:
         ValueError: if it is a name, but not of a matcher.
@@ -135,7 +139,7 @@ def matcher_named(matcher: Matcher | Correspondences | Path | str) -> Matcher:
     if str(matcher) == "structure":
         from calibgraph.structure import StructureMatcher
 
-        return StructureMatcher()
+        return StructureMatcher(seed=seed)
     if Path(matcher).suffix in (".parquet", ".csv"):
         return Precomputed(load_correspondences(matcher))
     raise ValueError(

@@ -34,10 +34,11 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
     table = _table("Calibration", "camera", "verdict")
-    headings = ("sigma deg", "sigma cm", "moved deg", "moved cm",
-                "median px", "inliers", "matches", "frames")  # fmt: skip
-    for heading in headings:
-        table.add_column(heading, justify="right")
+    _add_numbers(
+        table,
+        "sigma\ndeg", "sigma\ncm", "moved\ndeg", "moved\ncm",
+        "median\npx", "inliers", "matches", "frames",
+    )  # fmt: skip
     for name, T in result.T_camera_lidar.items():
         moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
         sigmas, residuals = result.sigmas(name), result.residuals.get(name)
@@ -59,7 +60,7 @@ def result_table(result: Calibration) -> Table:
 
 def _table(title: str, *names: str) -> Table:
     """An empty table, narrow enough that numbers are whole on 80 columns."""
-    table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(title=title, box=SIMPLE, padding=0)
     for name in names:
         table.add_column(name, no_wrap=True)
     return table

@@ -22,6 +22,8 @@ def correspondences_at_peaks(scores: Scores, twist: Array, camera: str) -> Corre
     is an edge, times the mean score of its windows at the peak, their quality. The confidence is
     twice the quality, so that the least that is kept is the least that a solve keeps by default.
     """
+    if not len(scores.counts):  # nothing of the cloud is in view
+        return _no_correspondences(camera)
     shift, hessian, peak = local_peaks(scores.grids, scores.flow @ twist)
     quality = np.maximum(peak / scores.counts, 0.0)  # 0: no peak
     good = quality > MIN_QUALITY
@@ -36,6 +38,16 @@ def correspondences_at_peaks(scores: Scores, twist: Array, camera: str) -> Corre
         points_lidar_m=scores.points_lidar_m[good],
         confidence=np.clip(2 * quality[good], 2 * MIN_QUALITY, 1.0),
         information_px=information[good],
+    )
+
+
+def _no_correspondences(camera: str) -> Correspondences:
+    return Correspondences.from_arrays(
+        camera=camera,
+        frame=np.empty(0, np.int64),
+        pixels_px=np.empty((0, 2)),
+        points_lidar_m=np.empty((0, 3)),
+        information_px=np.empty((0, 3)),
     )
 
 
