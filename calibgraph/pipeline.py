@@ -17,7 +17,7 @@ from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.files import sha256
 from calibgraph.rig import Rig, angle_deg
 from calibgraph.two_pass import Clock, solve
-from calibgraph.verdict import rig_verdict, worst_of
+from calibgraph.verdict import rig_verdict, with_matching
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -26,6 +26,9 @@ Progress = Callable[[str, int, int], None]
 
 class Matcher(Protocol):
     """What finds correspondences. It may want several rounds, each from a better estimate.
+
+    If the metadata of its tables has ``contrast``, a number per camera that says by how many chance
+    spreads the matches' agreement stands out, the verdict heeds it.
 
     Attributes:
         rounds: how many rounds it wants.
@@ -112,7 +115,7 @@ def calibrate(
     with clock("hash inputs"):
         inputs = _input_hashes(data)
     return replace(
-        _judged_by_rounds(result, rounds),
+        _judged_by_matching(result, rounds, table),
         initial_rig=initial,
         correspondences=table,
         rounds=tuple(rounds),
@@ -162,29 +165,20 @@ def _round(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
     return cameras
 
 
-MOVING_WARN_DEG, MOVING_FAIL_DEG = 0.1, 0.4
-MOVING_WARN_CM, MOVING_FAIL_CM = 4.0, 12.0
-"""A last round that still moves a camera further than this has not arrived."""
-
-
-def _judged_by_rounds(result: Calibration, rounds: Sequence[dict[str, Any]]) -> Calibration:
-    """The result with a verdict that knows whether matching again still changed it."""
-    if len(rounds) == 1:
-        return result
-    verdicts = {}
-    for name, verdict in result.camera_verdicts.items():
-        last = rounds[-1][name]
-        ratio = max(last["moved_deg"] / MOVING_WARN_DEG, last["moved_cm"] / MOVING_WARN_CM)
-        moving = (
-            f"matching again still moves it by {last['moved_deg']:.2g} deg, "
-            f"{last['moved_cm']:.2g} cm"
+def _judged_by_matching(
+    result: Calibration, rounds: Sequence[dict[str, Any]], table: Correspondences
+) -> Calibration:
+    """The result with a verdict that knows how the matching went, not only the last solve."""
+    contrasts = table.metadata.get("contrast", {})
+    verdicts = {
+        name: with_matching(
+            verdict,
+            moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
+            moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
+            contrast=contrasts.get(name),
         )
-        failed = last["moved_deg"] > MOVING_FAIL_DEG or last["moved_cm"] > MOVING_FAIL_CM
-        status: Literal["PASS", "WARN", "FAIL"] = (
-            "FAIL" if failed else "WARN" if ratio > 1 else "PASS"
-        )
-        reasons = [(verdict.status, reason) for reason in verdict.reasons]
-        verdicts[name] = worst_of([*reasons, (status, moving)])
+        for name, verdict in result.camera_verdicts.items()
+    }
     return replace(result, camera_verdicts=verdicts, verdict=rig_verdict(verdicts))
 
 

@@ -24,6 +24,7 @@ _REFINEMENTS = 2
 _RANSAC_ITERATIONS = 2000
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _MIN_INLIER_SHARE = 0.1
+_MIN_SCALED_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,17 @@ def _refine(
         graph = projection_graph(["camera"], {"camera": block})
         optimum = optimize(graph, ["camera"], {"camera": T_camera_lidar})
         T_camera_lidar = optimum.T_camera_lidar["camera"]
+        if _is_degenerate(block.sums(to_T_lidar_camera(T_camera_lidar)).hessian):
+            return None
     return T_camera_lidar
+
+
+def _is_degenerate(hessian: Array) -> bool:
+    """Whether some direction of the pose is free: points on one line, or in one place."""
+    units = np.sqrt(np.diag(hessian))
+    if not units.all():
+        return True
+    return bool(np.linalg.eigvalsh(hessian / np.outer(units, units))[0] < _MIN_SCALED_EIGENVALUE)
 
 
 def aggregate(poses: Array, how: str) -> Array:

@@ -1,0 +1,230 @@
+"""The matcher `structure`: its parts on worked cases, the whole on the sample with exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import (
+    Calibration,
+    Camera,
+    CorrespondenceError,
+    Dataset,
+    Intrinsics,
+    Rig,
+    StructureMatcher,
+)
+from calibgraph.structure.consensus import find_consensus, summed_score
+from calibgraph.structure.level import LEVELS
+from calibgraph.structure.peaks import local_peaks
+from calibgraph.structure.scores import Scores
+from calibgraph.structure.windows import Cloud, build_windows, thin, unoccluded
+from tests.conftest import KANNALA, SAMPLE, make_camera
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture(scope="module")
+def result() -> Calibration:
+    return calibgraph.calibrate(SAMPLE)
+
+
+def blobs(centres: np.ndarray, reach: int = 12, width: float = 2.0) -> np.ndarray:
+    """Score grids with one peak each at the shifts (u, v)."""
+    axis = np.arange(-reach, reach + 1)
+    u, v = np.meshgrid(axis, axis)
+    squares = (u - centres[:, 0, None, None]) ** 2 + (v - centres[:, 1, None, None]) ** 2
+    grids = np.exp(-0.5 * squares / width**2)
+    return (grids - grids.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+
+
+def fake_scores(twist: np.ndarray, *, outliers: float, seed: int = 0) -> Scores:
+    """Groups whose peaks a twist explains, but for a share that peak anywhere."""
+    rng = np.random.default_rng(seed)
+    flow = rng.uniform(-1, 1, (300, 2, 6)) * [200, 200, 200, 40, 40, 40]
+    shifts = flow @ twist
+    wrong = rng.random(300) < outliers
+    shifts[wrong] = rng.uniform(-12, 12, (np.count_nonzero(wrong), 2))
+    zeros = np.zeros((300, 3))
+    return Scores(
+        grids=blobs(shifts),
+        flow=flow,
+        points_lidar_m=zeros,
+        pixels_px=zeros[:, :2],
+        frame=np.zeros(300, np.int64),
+        counts=np.full(300, 10),
+        steps_per_px=np.ones(2),
+    )
+
+
+def test_consensus_finds_the_twist_among_wrong_peaks() -> None:
+    twist = np.array([0.01, -0.015, 0.008, 0.05, -0.08, 0.06])
+    scores = fake_scores(twist, outliers=0.5)
+    found, contrast = find_consensus(scores, LEVELS[0], seed=0)
+    off = np.abs(scores.flow @ (found - twist)).max()
+    assert off < 1.0  # grid step: the peaks of the groups do the rest
+    assert contrast > 15
+
+
+def test_consensus_of_nothing_does_not_stand_out() -> None:
+    scores = fake_scores(np.zeros(6), outliers=1.0)
+    _, contrast = find_consensus(scores, LEVELS[0], seed=0)
+    assert contrast < 8
+
+
+def test_summed_score_interpolates() -> None:
+    scores = fake_scores(np.zeros(6), outliers=0.0)
+    scores = replace(scores, flow=np.tile(np.eye(2, 6), (300, 1, 1)))
+    here, between, there = summed_score(scores, np.eye(6)[[0, 0, 0]] * [[0.0], [0.5], [1.0]])
+    assert between == pytest.approx((here + there) / 2)
+
+
+def test_peaks_are_found_to_a_fraction_of_a_step() -> None:
+    rng = np.random.default_rng(1)
+    true = rng.uniform(-6, 6, (50, 2))
+    shift, hessian, peak = local_peaks(blobs(true), true + rng.uniform(-1, 1, (50, 2)))
+    assert np.isfinite(peak).all()
+    np.testing.assert_allclose(shift, true, atol=0.1)
+    # The curvature of a Gaussian of width 2 at its top, by least squares over +-1 step.
+    np.testing.assert_allclose(hessian[:, 0, 0], 0.25, rtol=0.25)
+    np.testing.assert_allclose(hessian[:, 0, 1], 0.0, atol=0.02)
+
+
+def test_an_edge_constrains_only_its_normal() -> None:
+    axis = np.arange(-12, 13)
+    u, v = np.meshgrid(axis, axis)
+    along = np.exp(-0.5 * (0.6 * u + 0.8 * v - 1.0) ** 2 / 4).astype(np.float32)
+    shift, hessian, _ = local_peaks(along[None], np.zeros((1, 2)))
+    values, vectors = np.linalg.eigh(hessian[0])
+    assert values[0] == pytest.approx(0.0, abs=1e-9)
+    assert abs(vectors[:, 1] @ [0.6, 0.8]) == pytest.approx(1.0, abs=1e-3)
+    assert shift[0] @ [0.6, 0.8] == pytest.approx(1.0, abs=0.1)
+
+
+def test_peaks_at_the_rim_are_dropped() -> None:
+    _, _, peak = local_peaks(blobs(np.array([[11.0, 0.0]])), np.array([[11.0, 0.0]]))
+    assert peak[0] == -np.inf
+
+
+def test_background_behind_a_near_object_is_hidden() -> None:
+    wall = np.column_stack(
+        [*(a.ravel() for a in np.mgrid[-2:2:0.05, -2:2:0.05]), np.full(6400, 20.0)]
+    )
+    post = np.column_stack([np.zeros(100), np.linspace(-0.4, 0.4, 100), np.full(100, 4.0)])
+    points = np.vstack([wall, post])
+    clear = unoccluded(points, np.radians(0.5))
+    assert clear[-100:].all()
+    behind = (np.abs(wall[:, 0]) < 0.04) & (np.abs(wall[:, 1]) < 1.5)
+    assert not clear[:-100][behind].any()
+    assert clear[:-100][np.abs(wall[:, 0]) > 0.5].all()
+
+
+def test_thinning_does_not_depend_on_the_order_of_points() -> None:
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-0.5, 0.5, (10_000, 2))
+    order = rng.permutation(10_000)
+    one, two = thin(angles, 0.05), thin(angles[order], 0.05)
+    assert len(one) == 400
+    np.testing.assert_array_equal(angles[one], angles[order][two])
+
+
+def test_windows_come_from_clouds_with_and_without_intensity() -> None:
+    data = calibgraph.load_dataset(SAMPLE, calibgraph.load_rig(SAMPLE / "reference.yaml"))
+    raw = data.frames[0].load_cloud()
+    camera = data.rig.cameras["front_left"]
+    windows = build_windows(Cloud.of(raw), camera, LEVELS[3], most=10_000)
+    raw[:, 3] = np.nan
+    blind = build_windows(Cloud.of(raw), camera, LEVELS[3], most=10_000)
+    assert len(windows.counts) > len(blind.counts) > 100
+    assert not blind.basis[:, :, 1].any()  # nothing from an intensity that is not there
+    # Columns are orthogonal to constants and to each other.
+    for w in range(50):
+        basis = windows.basis[w, : windows.counts[w]].astype(float)
+        np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-4)
+        gram = basis.T @ basis
+        np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-4)
+
+
+def test_the_sample_is_calibrated(result: Calibration, truth: Rig) -> None:
+    """From 2 deg and 0.2 m; with exact truth, to the resolution of a 640 px image."""
+    for name, error in calibgraph.evaluate(result.rig, truth).cameras.items():
+        assert error.rotation_error_deg < 0.12, name  # 1 px is 0.12 deg
+        assert error.translation_error_cm < 3, name
+    assert result.verdict.status == "PASS", result.verdict.reasons
+    assert len(result.rounds) == len(LEVELS)
+    assert result.correspondences is not None
+
+
+def test_the_table_of_the_last_round_repeats_the_solve(result: Calibration) -> None:
+    assert result.correspondences is not None
+    again = calibgraph.solve(result.rig, result.correspondences)
+    for name, T in result.T_camera_lidar.items():
+        delta = calibgraph.evaluate(again.rig, result.rig).cameras[name]
+        assert delta.rotation_error_deg < 0.01, name
+        assert delta.translation_error_cm < 0.2, name
+        assert T.shape == (4, 4)
+
+
+def shuffled(data: Dataset, folder: Path) -> Dataset:
+    """The dataset with the points of every cloud in another order."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for frame in data.frames:
+        cloud = np.load(frame.cloud_path)
+        path = folder / frame.cloud_path.name
+        np.save(path, cloud[rng.permutation(len(cloud))])
+        frames.append(replace(frame, cloud_path=path))
+    return replace(data, frames=tuple(frames))
+
+
+def test_the_order_of_the_points_does_not_matter(tmp_path: Path) -> None:
+    data = calibgraph.load_dataset(SAMPLE).select("0:2")
+    quick = LEVELS[:2]
+    given, other = (
+        calibgraph.calibrate(d, matcher=StructureMatcher(levels=quick))
+        for d in (data, shuffled(data, tmp_path))
+    )
+    for error in calibgraph.evaluate(given.rig, other.rig).cameras.values():
+        assert error.rotation_error_deg < 0.02
+        assert error.translation_error_cm < 0.5
+
+
+def test_the_same_seed_gives_the_same_numbers() -> None:
+    data = calibgraph.load_dataset(SAMPLE).select("0:2")
+    one, two = (
+        calibgraph.calibrate(data, matcher=StructureMatcher(levels=LEVELS[:1])) for _ in range(2)
+    )
+    for name, T in one.T_camera_lidar.items():
+        np.testing.assert_array_equal(T, two.T_camera_lidar[name])
+
+
+def test_a_camera_that_sees_none_of_the_cloud_is_named(truth: Rig) -> None:
+    T = dict(truth.T_camera_lidar)
+    T["left"] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ T["left"]
+    data = replace(calibgraph.load_dataset(SAMPLE).select("0"), rig=truth.moved_to(T))
+    with pytest.raises(CorrespondenceError, match="camera 'left' has 0 usable"):
+        calibgraph.calibrate(data)
+
+
+def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
+    raw = calibgraph.load_dataset(SAMPLE).frames[0].load_cloud()
+    camera = Camera(
+        model="fisheye",
+        width_px=2600,
+        height_px=2600,
+        intrinsics_px=Intrinsics(fx=700.0, fy=700.0, cx=1300.0, cy=1300.0),
+        distortion=KANNALA,
+        T_camera_lidar=make_camera().T_camera_lidar,
+    )
+    windows = build_windows(Cloud.of(raw), camera, LEVELS[2], most=10_000)
+    T = camera.T_camera_lidar
+    z = (windows.points_lidar_m @ T[:3, :3].T + T[:3, 3])[:, 2]
+    assert z.min() < 0 < z.max()
+    assert len(windows.counts) > 100
