@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,30 +10,23 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.assess import assess
 from calibgraph.calibration import Calibration
 from calibgraph.config import TERMS, Config, Terms
 from calibgraph.correspondences import Correspondences
-from calibgraph.covariance import cluster_robust_covariance
 from calibgraph.errors import CorrespondenceError
-from calibgraph.graph import (
-    Optimum,
-    joined,
-    optimize,
-    prior_graph,
-    projection_graph,
-    relative_pose_graph,
-    relative_prior_graph,
-)
-from calibgraph.matches import MIN_MATCHES, Matches, Scale, matches_by_camera
+from calibgraph.graph import joined, prior_graph, relative_pose_graph, relative_prior_graph
+from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
 from calibgraph.preprocess import FILTERS, preprocess
+from calibgraph.problem import Poses, Problem, Scales
 from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
-from calibgraph.verdict import Evidence, camera_verdict, rig_verdict
+from calibgraph.verdict import rig_verdict
 
 Array = NDArray[np.float64]
-Poses = dict[str, Array]
 
 _MAX_RESCALINGS = 10
+_SETTLED = 0.01  # relative change of the spread
 
 
 def solve(
@@ -70,42 +62,25 @@ def solve(
         stage1 = _stage1(rig, kept.table, config)
         start = _start(rig, matches, stage1.T_camera_lidar, terms)
     pose_graph = _pose_graph(rig, stage1.T_camera_lidar, config, terms)
+    problem = Problem(tuple(rig.cameras), matches, pose_graph, terms)
     with clock("pass1"):
-        poses, scales = _fit(matches, pose_graph, start, config, terms)
+        poses, scales = _fit(problem, start, config)
     with clock("pass2"):
-        inliers = {name: m.gated(poses[name], scales[name]) for name, m in matches.items()}
-        final = _minimize(inliers, pose_graph, poses, scales, terms)
+        inliers = _gated(problem, poses, scales)
+        solution = inliers.minimize(poses, scales)
+    found = solution.T_camera_lidar
     with clock("checks"):
-        uncertainty = _uncertainty(inliers, pose_graph, final.T_camera_lidar, scales, terms)
-        halves = _halves(inliers, pose_graph, final.T_camera_lidar, scales, terms)
-    residuals = {name: m.summary(final.T_camera_lidar[name], scales[name])
-                 for name, m in matches.items()}  # fmt: skip
-    counts = _counts(kept.counts, matches, inliers, stage1)
-    covariance = _by_name(list(rig.cameras), uncertainty)
-    verdicts = {
-        name: camera_verdict(
-            camera,
-            Evidence(
-                residuals=residuals.get(name),
-                used=counts[name]["used"],
-                frames=counts[name]["frames_used"],
-                covariance=covariance[name],
-                halves=halves.get(name),
-                converged=final.converged,
-                terms=terms,
-            ),
-        )
-        for name, camera in rig.cameras.items()
-    }
+        residuals = {name: m.summary(found[name], scales[name]) for name, m in matches.items()}
+        assessment = assess(rig, inliers, solution, scales, residuals)
     return Calibration(
-        rig=rig.moved_to(final.T_camera_lidar),
+        rig=rig.moved_to(found),
         initial_rig=rig,
-        covariance=covariance,
-        joint_covariance=uncertainty,
-        verdict=rig_verdict(verdicts),
-        camera_verdicts=verdicts,
+        covariance=assessment.covariance,
+        joint_covariance=assessment.joint_covariance,
+        verdict=rig_verdict(assessment.verdicts),
+        camera_verdicts=assessment.verdicts,
         residuals=residuals,
-        counts=counts,
+        counts=_counts(kept.counts, problem, inliers, stage1),
         timings_s=clock.seconds,
         terms=terms,
         config=config,
@@ -204,98 +179,51 @@ def _pose_graph(
     )  # fmt: skip
 
 
-def _fit(
-    matches: Mapping[str, Matches],
-    pose_graph: gtsam.NonlinearFactorGraph,
-    start: Poses,
-    config: Config,
-    terms: Terms,
-) -> tuple[Poses, dict[str, Scale]]:
+def _fit(problem: Problem, start: Poses, config: Config) -> tuple[Poses, Scales]:
     """Pass 1. With `auto` scales: fit and re-measure the spread until it stands still."""
-    poses = start
+    poses, scales = start, _scales(problem, start, config)
     for _ in range(_MAX_RESCALINGS):
-        scales = {name: m.scale(poses[name], config) for name, m in matches.items()}
-        poses = _minimize(matches, pose_graph, poses, scales, terms).T_camera_lidar
-        settled = all(
-            abs(m.scale(poses[name], config).sigma / scales[name].sigma - 1.0) < 0.01  # noqa: PLR2004
-            for name, m in matches.items()
-        )
-        if settled:
+        poses = problem.minimize(poses, scales).T_camera_lidar
+        before, scales = scales, _scales(problem, poses, config)
+        ratios = [scales[name].sigma / before[name].sigma for name in scales]
+        if all(abs(ratio - 1.0) < _SETTLED for ratio in ratios):
             break
-    return poses, {name: m.scale(poses[name], config) for name, m in matches.items()}
+    return poses, scales
 
 
-def _minimize(
-    matches: Mapping[str, Matches],
-    pose_graph: gtsam.NonlinearFactorGraph,
-    start: Poses,
-    scales: Mapping[str, Scale],
-    terms: Terms,
-) -> Optimum:
-    """Minimize the objective (paper, Eq. 5) with the scales held."""
-    if terms == "stage1":
-        return Optimum(start, math.nan, 0, True)
-    cameras = list(start)
-    blocks = {name: m.scaled(scales[name]) for name, m in matches.items()}
-    if terms == "priors":
-        return optimize(pose_graph, cameras, start)
-    return optimize(joined(projection_graph(cameras, blocks), pose_graph), cameras, start)
+def _scales(problem: Problem, poses: Poses, config: Config) -> Scales:
+    return {name: m.scale(poses[name], config) for name, m in problem.matches.items()}
 
 
-def _uncertainty(
-    inliers: Mapping[str, Matches],
-    pose_graph: gtsam.NonlinearFactorGraph,
-    poses: Poses,
-    scales: Mapping[str, Scale],
-    terms: Terms,
-) -> Array | None:
-    """(6 N, 6 N) joint covariance; None where the terms do not use the correspondences."""
-    if terms in ("stage1", "priors"):
-        return None
-    blocks = {name: m.scaled(scales[name]) for name, m in inliers.items()}
-    frames = {name: m.frame for name, m in inliers.items()}
-    return cluster_robust_covariance(blocks, frames, pose_graph, poses)
+def _gated(problem: Problem, poses: Poses, scales: Scales) -> Problem:
+    """The problem without the matches beyond the gate (paper, two-pass solver, 2).
 
-
-def _by_name(cameras: list[str], joint: Array | None) -> dict[str, Array | None]:
-    """Each camera's (6, 6) block of the joint covariance."""
-    return {
-        name: None if joint is None else joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        for i, name in enumerate(cameras)
-    }
-
-
-def _halves(
-    inliers: Mapping[str, Matches],
-    pose_graph: gtsam.NonlinearFactorGraph,
-    poses: Poses,
-    scales: Mapping[str, Scale],
-    terms: Terms,
-) -> dict[str, tuple[Array, Array]]:
-    """Per camera the solutions from every other frame and from the frames between, if possible."""
-    if terms in ("stage1", "priors"):
-        return {}
-    numbers = np.unique(np.concatenate([m.frame for m in inliers.values()]))
-    solutions = []
-    for half in (numbers[::2], numbers[1::2]):
-        part = {name: m.select(np.isin(m.frame, half)) for name, m in inliers.items()}
-        if any(len(m.frame) < MIN_MATCHES for m in part.values()):
-            return {}
-        solutions.append(_minimize(part, pose_graph, poses, scales, terms).T_camera_lidar)
-    return {name: (solutions[0][name], solutions[1][name]) for name in inliers}
+    Raises:
+        CorrespondenceError: if a camera is left with too few.
+    """
+    inliers = {name: m.gated(poses[name], scales[name]) for name, m in problem.matches.items()}
+    for name, left in inliers.items():
+        if len(left.frame) < MIN_MATCHES:
+            raise CorrespondenceError(
+                f"camera {name!r}: only {len(left.frame)} of {len(problem.matches[name].frame)} "
+                f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at least "
+                f"{MIN_MATCHES} are needed; the matches do not agree on a pose, or the gate is too "
+                "narrow",
+                camera=name,
+            )
+    return problem.with_matches(inliers)
 
 
 def _counts(
-    filters: Mapping[str, Mapping[str, int]],
-    matches: Mapping[str, Matches],
-    inliers: Mapping[str, Matches],
-    stage1: Stage1,
+    filters: Mapping[str, Mapping[str, int]], problem: Problem, inliers: Problem, stage1: Stage1
 ) -> dict[str, dict[str, int]]:
     """Per camera: correspondences left after each filter and the gate, and its frames."""
     counts = {}
     for name, before in filters.items():
-        given = matches[name].frame if name in matches else np.empty(0, np.int64)
-        used = inliers[name].frame if name in inliers else np.empty(0, np.int64)
+        given, used = (
+            p.matches[name].frame if name in p.matches else np.empty(0, np.int64)
+            for p in (problem, inliers)
+        )
         counts[name] = {
             **before,
             "used": len(used),

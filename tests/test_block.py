@@ -6,7 +6,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import LOSSES, Lens, ProjectionBlock, block_factor, projection_factor, square_root
+from factors import (
+    LOSSES,
+    Lens,
+    ProjectionBlock,
+    block_factor,
+    projection_factor,
+    projection_residual,
+    square_root,
+)
 from factors.block import BlockSums
 from tests.conftest import FORWARD, KANNALA, RADTAN5, RADTAN8
 
@@ -125,6 +133,28 @@ def test_gradient_agrees_with_finite_differences_of_the_error(name: str) -> None
             for d in step * np.eye(6)
         ]
         np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_projection_jacobian_agrees_with_finite_differences(name: str) -> None:
+    """By the pose, in GTSAM's tangent: near, off, far, and 1e-7 from the identity."""
+    lens = LENSES[name]
+    block = world(lens, 5)
+    identity = gtsam.Pose3.Expmap(1e-7 * np.array([1, -2, 3, 2, 1, -1.0]))
+    ahead = np.array([[0.5, -0.3, 5.0]])  # what a camera at the identity sees
+    for pose in [*poses()[:4], identity]:
+        points = ahead if pose is identity else block.points_lidar_m
+        for point in points:
+            residual, jacobian = projection_residual(lens, pose, point, np.zeros(2))
+            numeric = np.empty((2, 6))
+            for axis in range(6):
+                d = 1e-6 * np.eye(6)[axis]
+                plus, _ = projection_residual(lens, pose.retract(d), point, np.zeros(2))
+                minus, _ = projection_residual(lens, pose.retract(-d), point, np.zeros(2))
+                numeric[:, axis] = (plus - minus) / 2e-6
+            # Rounding: eps |residual| / step; truncation is smaller.
+            tolerance = 1e-9 * max(1e3, np.abs(residual).max()) + 1e-7 * np.abs(jacobian).max()
+            np.testing.assert_allclose(jacobian, numeric, rtol=0, atol=tolerance)
 
 
 def test_projection_factor_equals_gtsams_stock_factor() -> None:
