@@ -15,6 +15,7 @@ from calibgraph.matches import MIN_MATCHES
 from calibgraph.problem import Problem, Scales
 from calibgraph.rig import Rig
 from calibgraph.verdict import Evidence, camera_verdict
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -39,10 +40,26 @@ def assess(
     inliers: Problem,
     solution: Optimum,
     scales: Scales,
+    *,
     residuals: Mapping[str, Residuals],
+    systematic_sigmas: tuple[float, float],
 ) -> Assessment:
-    """Judge a solution by the inliers that it was fitted to, and by the residuals of all."""
+    """Judge a solution.
+
+    Args:
+        rig: lenses.
+        inliers: what the solution was fitted to.
+        solution: the poses.
+        scales: of the residuals.
+        residuals: of all correspondences, not only the inliers.
+        systematic_sigmas: rotation [rad] and translation [m] that all frames share, per axis: the
+            scatter between frames, which the covariance is made of, cannot show them.
+    """
     joint = _joint_covariance(inliers, solution, scales)
+    if joint is not None:
+        rotation, translation = systematic_sigmas
+        sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
+        joint = joint + np.diag(np.tile(sigmas**2, len(rig.cameras)))
     halves = _halves(inliers, solution, scales)
     covariance: dict[str, Array | None] = {}
     verdicts = {}

@@ -84,7 +84,8 @@ class Calibration:
     Attributes:
         rig: the rig with the estimated poses.
         initial_rig: the rig that the solve started from.
-        covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+        covariance: clustered by frames, plus the error that the matcher says its frames share:
+            per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None with too few frames to tell.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
         verdict: of the rig: the worst of its cameras'.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -116,6 +117,25 @@ class Correspondences:
         if name not in self.cameras:
             return self.select(slice(0, 0))
         return self.select(self.camera_index == self.cameras.index(name))
+
+    @property
+    def systematic_sigmas(self) -> tuple[float, float]:
+        """What the matcher says of the error that all its frames share, per axis of a camera.
+
+        Standard deviations of rotation [rad] and translation [m], from the metadata's keys
+        ``systematic_rotation_rad`` and ``systematic_translation_m``; zero where it says nothing.
+
+        Raises:
+            CorrespondenceError: if what it says is not a number >= 0.
+        """
+        keys = ("systematic_rotation_rad", "systematic_translation_m")
+        rotation, translation = (self.metadata.get(key, 0.0) for key in keys)
+        for key, value in zip(keys, (rotation, translation), strict=True):
+            if not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+                raise CorrespondenceError(
+                    f"metadata {key!r} must be a number >= 0, found {value!r}"
+                )
+        return float(rotation), float(translation)
 
     def counts(self) -> dict[str, int]:
         """Rows per camera."""
@@ -266,7 +286,9 @@ def from_arrow(table: pa.Table) -> Correspondences:
     encoded = table["camera"].cast(pa.string()).combine_chunks().dictionary_encode()
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.combine_chunks()
-    metadata = (table.schema.metadata or {}).get(b"matcher", b"{}")
+    metadata = json.loads((table.schema.metadata or {}).get(b"matcher", b"{}"))
+    if not isinstance(metadata, dict):
+        raise CorrespondenceError("the schema's metadata 'matcher' must be a JSON object")
     return Correspondences(
         cameras=tuple(encoded.dictionary.to_pylist()),
         camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
@@ -278,7 +300,7 @@ def from_arrow(table: pa.Table) -> Correspondences:
         else np.ones(len(table), np.float32),
         information_px=stack(_INFORMATION) if _INFORMATION[0] in given else None,
         stamp_ns=column("stamp_ns", np.int64) if "stamp_ns" in given else None,
-        metadata=json.loads(metadata),
+        metadata=metadata,
     )
 
 

@@ -22,8 +22,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         console.print(f"  {reason}", highlight=False, markup=False)
     console.print(result_table(result))
     console.print(
-        "sigma: standard deviation of the scatter between frames, largest axis; what all frames "
-        "share (the matcher's bias, wrong intrinsics) is not in it"
+        "sigma: standard deviation, largest axis: scatter between frames, and what the matcher "
+        "says its frames share; wrong intrinsics are not in it"
     )
     seconds = sum(result.timings_s.values())
     console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)

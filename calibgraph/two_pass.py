@@ -71,7 +71,14 @@ def solve(
     found = solution.T_camera_lidar
     with clock("checks"):
         residuals = {name: m.summary(found[name], scales[name]) for name, m in matches.items()}
-        assessment = assess(rig, inliers, solution, scales, residuals)
+        assessment = assess(
+            rig,
+            inliers,
+            solution,
+            scales,
+            residuals=residuals,
+            systematic_sigmas=table.systematic_sigmas,
+        )
     return Calibration(
         rig=rig.moved_to(found),
         initial_rig=rig,

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -202,6 +204,17 @@ def test_the_same_call_gives_the_same_numbers(pair: Rig) -> None:
     for name in pair.cameras:
         assert (one.T_camera_lidar[name] == two.T_camera_lidar[name]).all()
     assert (one.joint_covariance == two.joint_covariance).all()
+
+
+def test_an_error_that_all_frames_share_is_in_the_error_bar(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=8)
+    metadata = {"systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.02}
+    plain, honest = (solve(pair, t) for t in (table, replace(table, metadata=metadata)))
+    added = honest.covariance["left"] - plain.covariance["left"]
+    np.testing.assert_allclose(added, np.diag([1e-6] * 3 + [4e-4] * 3), atol=1e-15)
+    for wrong in (-1.0, "much", np.inf):
+        with pytest.raises(CorrespondenceError, match="systematic_translation_m"):
+            solve(pair, replace(table, metadata={"systematic_translation_m": wrong}))
 
 
 def test_too_few_frames_give_no_error_bar(pair: Rig) -> None:

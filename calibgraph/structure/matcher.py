@@ -26,6 +26,11 @@ from calibgraph.structure.windows import Cloud
 if TYPE_CHECKING:
     from calibgraph.pipeline import Progress
 
+SYSTEMATIC_ROTATION_RAD = float(np.radians(0.07))
+SYSTEMATIC_TRANSLATION_M = 0.02
+"""Error per axis that the frames of a scene share: its root mean square over recorded scenes of two
+rigs, each from a few places. One place alone is worse; synthetic scenes are better."""
+
 MAX_WINDOWS = 20_000  # per camera and round, over all frames: bounds the time, not the accuracy
 
 
@@ -71,6 +76,8 @@ class StructureMatcher:
             "round": round_index,
             "seed": self.seed,
             "contrast": contrasts,
+            "systematic_rotation_rad": SYSTEMATIC_ROTATION_RAD,
+            "systematic_translation_m": SYSTEMATIC_TRANSLATION_M,
         }
         return replace(concatenate(tables), metadata=settings)
 
