@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +14,8 @@ from calibgraph.covariance import cluster_robust_covariance
 from calibgraph.graph import Optimum
 from calibgraph.matches import MIN_MATCHES
 from calibgraph.problem import Problem, Scales
-from calibgraph.rig import Rig
-from calibgraph.verdict import Evidence, camera_verdict
+from calibgraph.rig import RelativePose, Rig, angle_deg
+from calibgraph.verdict import Conflict, Evidence, camera_verdict
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
@@ -55,11 +56,8 @@ def assess(
         systematic_sigmas: rotation [rad] and translation [m] that all frames share, per axis: the
             scatter between frames, which the covariance is made of, cannot show them.
     """
-    joint = _joint_covariance(inliers, solution, scales)
-    if joint is not None:
-        rotation, translation = systematic_sigmas
-        sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
-        joint = joint + np.diag(np.tile(sigmas**2, len(rig.cameras)))
+    joint = _joint_covariance(inliers, solution, scales, systematic_sigmas)
+    conflicts = _conflicts(rig, inliers, solution, scales, systematic_sigmas)
     halves = _halves(inliers, solution, scales)
     covariance: dict[str, Array | None] = {}
     verdicts = {}
@@ -73,6 +71,8 @@ def assess(
             frames=0 if matches is None else len(np.unique(matches.frame)),
             covariance=covariance[name],
             halves=halves.get(name),
+            conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
+            turned_deg=_angle_between(camera.T_camera_lidar, solution.T_camera_lidar[name]),
             converged=solution.converged,
             terms=inliers.terms,
         )
@@ -80,13 +80,66 @@ def assess(
     return Assessment(covariance, joint, verdicts)
 
 
-def _joint_covariance(inliers: Problem, solution: Optimum, scales: Scales) -> Array | None:
-    """(6 N, 6 N); None where the terms do not use the correspondences."""
+def _angle_between(one: Array, two: Array) -> float:
+    return angle_deg(one[:3, :3] @ two[:3, :3].T)
+
+
+def _joint_covariance(
+    inliers: Problem, solution: Optimum, scales: Scales, systematic_sigmas: tuple[float, float]
+) -> Array | None:
+    """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
     if not inliers.fits_matches:
         return None
     blocks = {name: m.scaled(scales[name]) for name, m in inliers.matches.items()}
     frames = {name: m.frame for name, m in inliers.matches.items()}
-    return cluster_robust_covariance(blocks, frames, inliers.pose_graph, solution.T_camera_lidar)
+    scatter = cluster_robust_covariance(blocks, frames, inliers.pose_graph, solution.T_camera_lidar)
+    if scatter is None:
+        return None
+    rotation, translation = systematic_sigmas
+    sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
+    return scatter + np.diag(np.tile(sigmas**2, len(solution.T_camera_lidar)))
+
+
+def _conflicts(
+    rig: Rig,
+    inliers: Problem,
+    solution: Optimum,
+    scales: Scales,
+    systematic_sigmas: tuple[float, float],
+) -> list[Conflict]:
+    """How the rig's relative poses fit what the correspondences alone say.
+
+    Asked of pairs in which both cameras have correspondences, by a solve without relative poses.
+    """
+    pairs = [p for p in rig.relative_poses if p.a in inliers.matches and p.b in inliers.matches]
+    if not pairs or not inliers.fits_matches:
+        return []
+    cameras = tuple(inliers.matches)
+    free = replace(inliers, cameras=cameras, pose_graph=gtsam.NonlinearFactorGraph())
+    start = {name: solution.T_camera_lidar[name] for name in cameras}
+    alone = free.minimize(start, scales)
+    covariance = _joint_covariance(free, alone, scales, systematic_sigmas)
+    return [_conflict(pair, cameras, alone.T_camera_lidar, covariance) for pair in pairs]
+
+
+def _conflict(
+    pair: RelativePose, cameras: tuple[str, ...], T: Mapping[str, Array], covariance: Array | None
+) -> Conflict:
+    """The difference of a relative pose from an estimate, and the sigma expected of it."""
+    estimated = T[pair.a] @ np.linalg.inv(T[pair.b])
+    difference = gtsam.Pose3.Logmap(gtsam.Pose3(np.linalg.inv(pair.T_a_b) @ estimated))
+    variance = (
+        pose_sigmas(rotation_rad=pair.rotation_sigma_rad, translation_m=pair.translation_sigma_m)
+        ** 2
+    )
+    if covariance is not None:
+        # T_a_b = exp(xi_a) T_a (exp(xi_b) T_b)^-1: in b, the difference is Ad(T_b_a) xi_a - xi_b.
+        i, j = 6 * cameras.index(pair.a), 6 * cameras.index(pair.b)
+        by_poses = np.zeros((6, len(covariance)))
+        by_poses[:, i : i + 6] = gtsam.Pose3(np.linalg.inv(estimated)).AdjointMap()
+        by_poses[:, j : j + 6] -= np.eye(6)
+        variance = variance + np.diag(by_poses @ covariance @ by_poses.T)
+    return Conflict(pair, difference, np.sqrt(variance))
 
 
 def _halves(inliers: Problem, solution: Optimum, scales: Scales) -> dict[str, tuple[Array, Array]]:

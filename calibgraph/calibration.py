@@ -77,7 +77,7 @@ class Residuals:
     gate_px: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """A calibrated rig.
 
@@ -147,12 +147,24 @@ class Calibration:
         write_yaml(path, self._to_mapping())
         return path
 
+    def __repr__(self) -> str:
+        return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"
+
+    def _sigma_mapping(self, name: str) -> dict[str, list[float]] | None:
+        covariance = self.covariance[name]
+        if covariance is None:
+            return None
+        sigmas = np.sqrt(np.diag(covariance)).tolist()
+        return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}
+
     def _to_mapping(self) -> dict[str, Any]:
         return {
             "format": CALIBRATION_FORMAT,
             "verdict": _verdict_mapping(self.verdict),
             "camera_verdicts": {k: _verdict_mapping(v) for k, v in self.camera_verdicts.items()},
             "frames": FRAMES_SENTENCE,
+            "T_camera_lidar": self.T_camera_lidar,
+            "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
             "rig": self.rig.model_dump(),
             "covariance_of": TANGENT_SENTENCE,
             "covariance": dict(self.covariance),

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
     "T_a_b maps coordinates in b to coordinates in a: p_camera = T_camera_lidar * p_lidar. "
-    "Wherever a RIG, ESTIMATE or REFERENCE is asked for, a rig file, a result (file or folder) "
-    "or a KITTI odometry sequence folder serves.",
+    "Wherever a RIG, ESTIMATE or REFERENCE is asked for, a rig file, a result (file or folder), "
+    "a dataset folder (its rig.yaml) or a KITTI odometry sequence folder serves.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -48,25 +48,45 @@ MatcherOption = Annotated[
     str, typer.Option(metavar="NAME|FILE", help="structure, or a table of correspondences.")
 ]
 FramesOption = Annotated[
-    str | None, typer.Option(metavar="A:B:STEP", help="Which frames, e.g. 0:90:10 or 0,5,7.")
+    str | None,
+    typer.Option(
+        metavar="A:B:STEP",
+        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.",
+    ),
 ]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")
 ]
 PresetOption = Annotated[
-    str | None, typer.Option(help="Settings of the solve by name: auto (default), kitti, walkley.")
+    str | None,
+    typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
 ]
 TermsOption = Annotated[
-    str, typer.Option(help="Terms of the objective: full, reprojection, priors, stage1.")
+    str,
+    typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
 ]
 OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"calibgraph {version('calibgraph')}")
+        raise typer.Exit
+
+
 @app.callback()
 def _options(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
 ) -> None:
     """Options before the command; ``--debug`` is read by :func:`main`."""
 
@@ -168,16 +188,16 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair."""
-    from calibgraph.load import load_rig
+    from calibgraph.load import load_rig, rig_file
     from calibgraph.metrics import evaluate
 
     errors = evaluate(load_rig(estimate), load_rig(reference))
     if as_json:
         _print_json(errors.to_mapping())
     else:
-        from calibgraph.tables import evaluation_table
+        from calibgraph.tables import print_evaluation
 
-        _console().print(evaluation_table(errors))
+        print_evaluation(_console(), errors, rig_file(estimate), rig_file(reference))
 
 
 @app.command()

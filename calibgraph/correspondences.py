@@ -28,7 +28,7 @@ _REQUIRED = ("camera", "frame", *_COORDINATES)
 _COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *_INFORMATION)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Correspondences:
     """2D-3D correspondences of several cameras and frames, as columns of equal length.
 
@@ -105,6 +105,10 @@ class Correspondences:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{name}: {count}" for name, count in self.counts().items())
+        return f"Correspondences({counts}; {len(np.unique(self.frame))} frames)"
 
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The table with only some rows: a mask, an index array or a slice."""
@@ -274,10 +278,17 @@ def from_arrow(table: pa.Table) -> Correspondences:
 
     for name in table.column_names:
         if table[name].null_count:
-            raise CorrespondenceError(f"column {name!r} has {table[name].null_count} empty values")
+            row = table[name].is_null().to_pylist().index(True)
+            raise CorrespondenceError(f"row {row}: column {name!r} is empty; fill in or drop it")
 
     def column(name: str, dtype: type) -> NDArray[Any]:
-        return np.asarray(table[name].to_numpy()).astype(dtype, casting="same_kind")
+        values = np.asarray(table[name].to_numpy())
+        if not np.can_cast(values.dtype, dtype, casting="same_kind"):
+            kind = "whole numbers" if dtype is np.int64 else "numbers"
+            raise CorrespondenceError(
+                f"column {name!r} must hold {kind}, found {table[name].type}, first {values[0]!r}"
+            )
+        return values.astype(dtype)
 
     def stack(names: Sequence[str]) -> Array:
         return np.stack([column(name, np.float64) for name in names], axis=1)

@@ -59,7 +59,10 @@ class Dataset:
     folders: tuple[Path, ...]
 
     def select(self, frames: str) -> Dataset:
-        """Keep some frames: ``start:stop:step`` as in Python, or numbers separated by commas.
+        """Keep some frames, by their position among the frames sorted by name, from 0.
+
+        Args:
+            frames: ``start:stop:step`` as in Python, or positions separated by commas.
 
         Raises:
             ValueError: if the text is neither, or selects nothing.
@@ -68,8 +71,8 @@ class Dataset:
             kept = [self.frames[i] for i in _indices(frames, len(self.frames))]
         except (ValueError, IndexError, TypeError) as error:
             raise ValueError(
-                f"frames {frames!r}: expected start:stop:step or numbers below "
-                f"{len(self.frames)}, like 0:100:10 or 0,5,7"
+                f"frames {frames!r}: expected start:stop:step or positions separated by commas, "
+                f"counted from 0 in the {len(self.frames)} frames sorted by name"
             ) from error
         if not kept:
             raise ValueError(f"frames {frames!r} selects none of the {len(self.frames)} frames")
@@ -121,7 +124,9 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     found, expected = (image.shape[1], image.shape[0]), (camera.width_px, camera.height_px)
     if found != expected:
         raise FileError(
-            path, f"is {found[0]}x{found[1]} px, the rig says {expected[0]}x{expected[1]} px"
+            path,
+            f"is {found[0]}x{found[1]} px, the rig says {expected[0]}x{expected[1]} px; correct "
+            "width_px and height_px, and the intrinsics if the image was scaled",
         )
     return np.asarray(image, dtype=np.uint8)
 
@@ -190,11 +195,15 @@ def _frames(folder: Path, rig: Rig) -> list[Frame]:
     if _is_kitti(folder):
         image_folders = kitti.camera_folders(folder)
     else:
-        image_folders = {name: folder / "cameras" / name for name in rig.cameras}
+        image_folders = {path.name: path for path in sorted((folder / "cameras").glob("*/"))}
     images = {}
     for name in rig.cameras:
         if name not in image_folders:
-            raise FileError(folder, f"has no images of the rig's camera {name!r}")
+            raise FileError(
+                folder,
+                f"has no images of the rig's camera {name!r}; it has "
+                f"{', '.join(image_folders) or 'none'}",
+            )
         images[name] = _files(image_folders[name], IMAGE_SUFFIXES)
         _require_pairs(folder, name, set(clouds), set(images[name]))
     return [

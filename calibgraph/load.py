@@ -21,24 +21,30 @@ def load_rig(path: Path | str) -> Rig:
     Raises:
         FileError: if there is none, or it is malformed.
     """
-    path = Path(path)
-    if path.is_dir():
-        return _load_from_folder(path)
+    path = rig_file(path)
+    if path.name == CALIBRATION_NAME:
+        return load_kitti_rig(path.parent)
     content = read_yaml(path)
     if is_calibration(content):
         return rig_of_calibration(content, path)
     return checked_model(Rig, content, path)
 
 
-def _load_from_folder(folder: Path) -> Rig:
+def rig_file(path: Path | str) -> Path:
+    """The file that :func:`load_rig` reads: the path itself, or the one that a folder stands for.
+
+    Raises:
+        FileError: if a folder holds none.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it
         names = (RIG_FILE, CALIBRATION_FILE)
-    for name in names:
+    for name in (*names, CALIBRATION_NAME):
         if (folder / name).is_file():
-            return load_rig(folder / name)
-    if (folder / CALIBRATION_NAME).is_file():
-        return load_kitti_rig(folder)
+            return folder / name
     raise FileError(
         folder, f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
     )

@@ -41,7 +41,11 @@ class PoseError:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of all cameras, and of all pairs ``"A->B"``: of T_B_A = T_B_lidar T_A_lidar^-1."""
+    """Errors of all cameras, and of all pairs.
+
+    The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
+    coordinates in B; its errors are along the axes of B.
+    """
 
     cameras: dict[str, PoseError]
     pairs: dict[str, PoseError]
@@ -64,7 +68,7 @@ def evaluate(estimate: Rig, reference: Rig) -> Evaluation:
         if name not in reference.cameras:
             raise RigError(
                 f"camera {name!r} of the estimate is not in the reference, which has "
-                f"{', '.join(reference.cameras)}",
+                f"{', '.join(map(repr, reference.cameras))}; give it the same name in both",
                 camera=name,
             )
     found, true = estimate.T_camera_lidar, reference.T_camera_lidar

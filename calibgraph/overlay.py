@@ -19,6 +19,7 @@ Image = NDArray[np.uint8]
 DEPTH_RANGE_M = (2.0, 60.0)
 _MAX_WIDTH_PX = 1280
 _BAR_PX = 34
+_COVERED_SHARE = 0.12  # of the image, by points
 
 
 def write_overlays(frame: Frame, initial: Rig, final: Rig, folder: Path) -> list[Path]:
@@ -62,12 +63,18 @@ def overlay(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
     column, row = np.rint(pixels).astype(np.intp).T
     colours = _colours(np.linalg.norm(points, axis=1))
     drawn = image.copy()
-    radius = max(1, round(camera.width_px / 1000))
+    radius = _dot_radius(image.shape[0] * image.shape[1], len(points))
     for dy in range(-radius, radius + 1):
         for dx in range(-radius, radius + 1):
             rows = np.clip(row + dy, 0, image.shape[0] - 1)
             drawn[rows, np.clip(column + dx, 0, image.shape[1] - 1)] = colours
     return drawn
+
+
+def _dot_radius(pixels: int, points: int) -> int:
+    """Radius of a point's square: large where points are few, so small that the image shows."""
+    side = np.sqrt(_COVERED_SHARE * pixels / max(points, 1))
+    return int(np.clip(round((side - 1) / 2), 0, 3))
 
 
 def write_image(path: Path, image: Image) -> None:
@@ -113,10 +120,11 @@ def _depth_bar(width: int) -> Image:
     bar = np.repeat(_colours(distances)[None], round(_BAR_PX * scale), axis=0)
     for tick in (2, 5, 10, 20, 50):
         x = int((np.log(tick) - low) / (high - low) * (width - 1))
-        cv2.putText(
-            bar, f"{tick} m", (x + 4, round(24 * scale)), cv2.FONT_HERSHEY_SIMPLEX, 0.7 * scale,
-            (0, 0, 0), max(1, round(1.5 * scale)), cv2.LINE_AA,
-        )  # fmt: skip
+        for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):  # outlined
+            cv2.putText(
+                bar, f"{tick} m", (x + 4, round(24 * scale)), cv2.FONT_HERSHEY_SIMPLEX,
+                0.7 * scale, colour, max(1, round(thickness * scale)), cv2.LINE_AA,
+            )  # fmt: skip
     return bar
 
 

@@ -112,7 +112,7 @@ def calibrate(
         rounds.append(_round(table, estimate, result.rig))
         estimate = result.rig
     report("done", chosen.rounds, chosen.rounds)
-    with clock("hash inputs"):
+    with clock("hash_inputs"):
         inputs = _input_hashes(data)
     return replace(
         _judged_by_matching(result, rounds, table),

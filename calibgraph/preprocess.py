@@ -41,7 +41,7 @@ def preprocess(rig: Rig, table: Correspondences, config: Config) -> Preprocessed
         if name not in rig.cameras:
             raise CorrespondenceError(
                 f"camera {name!r} of the correspondences is not in the rig, which has "
-                f"{', '.join(rig.cameras)}; rename it in one of them",
+                f"{', '.join(map(repr, rig.cameras))}; give it the same name in both",
                 camera=name,
             )
     numbers = np.array([list(rig.cameras).index(name) for name in table.cameras], dtype=np.int64)

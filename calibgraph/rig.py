@@ -168,7 +168,8 @@ class Rig(_Model):
         for name in T_camera_lidar:
             if name not in self.cameras:
                 raise RigError(
-                    f"camera {name!r} is not in the rig, which has {', '.join(self.cameras)}",
+                    f"camera {name!r} is not in the rig, which has "
+                    f"{', '.join(map(repr, self.cameras))}",
                     camera=name,
                 )
         cameras = {

@@ -25,6 +25,10 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         "sigma: standard deviation, largest axis: scatter between frames, and what the matcher "
         "says its frames share; wrong intrinsics are not in it"
     )
+    console.print(
+        "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
+        "the gate"
+    )
     seconds = sum(result.timings_s.values())
     console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
@@ -69,6 +73,15 @@ def _table(title: str, *names: str) -> Table:
 def _add_numbers(table: Table, *headings: str) -> None:
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
+
+
+def print_evaluation(console: Console, errors: Evaluation, estimate: Path, reference: Path) -> None:
+    """Print the errors, and which two files they are between."""
+    console.print(evaluation_table(errors))
+    for what, path in (("estimate", estimate), ("reference", reference)):
+        console.print(f"{what}: {path}", highlight=False, soft_wrap=True, markup=False)
+    if errors.pairs:
+        console.print("A->B: of the transform from A to B, in the axes of B", highlight=False)
 
 
 def evaluation_table(errors: Evaluation) -> Table:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibgraph.calibration import Residuals, Status, Verdict
 from calibgraph.config import Terms
 from calibgraph.covariance import MIN_FRAMES
-from calibgraph.rig import Camera, angle_deg
+from calibgraph.rig import Camera, RelativePose, angle_deg
 
 Array = NDArray[np.float64]
 
@@ -36,11 +36,38 @@ MOVING_WARN_DEG, MOVING_FAIL_DEG = 0.1, 0.4
 MOVING_WARN_CM, MOVING_FAIL_CM = 4.0, 12.0
 """A last round of matching that still moves a camera further has not arrived."""
 
+CONFLICT_WARN_SIGMAS, CONFLICT_FAIL_SIGMAS = 4.0, 8.0
+"""How far a relative pose may lie from what the correspondences alone say."""
+
+TURNED_WARN_DEG = 45.0
+"""A result turned further than this from the guess: the guess was of another convention."""
+
 CONTRAST_WARN, CONTRAST_FAIL = 15.0, 8.0
 """How many chance spreads a matcher's agreement must stand out by. On recorded data wrong results
 (over 0.3 deg) had up to 13, right ones from 9 on."""
 
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
+
+
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """A relative pose of the rig file against what the correspondences alone say.
+
+    Attributes:
+        pair: the relative pose.
+        difference: (6,) tangent from measured to estimated T_a_b: rotation [rad], translation [m],
+            along the axes of b.
+        sigmas: (6,) standard deviations expected of it: the measurement's and the estimate's.
+    """
+
+    pair: RelativePose
+    difference: Array
+    sigmas: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest component of the difference, in its standard deviations."""
+        return float(np.abs(self.difference / self.sigmas).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +80,8 @@ class Evidence:
         frames: frames that they come from.
         covariance: (6, 6) or None.
         halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
+        conflicts: the relative poses that name this camera.
+        turned_deg: angle between the result and the guess.
         converged: whether the last pass stopped by its tolerance.
         terms: the terms of the objective.
     """
@@ -62,6 +91,8 @@ class Evidence:
     frames: int
     covariance: Array | None
     halves: tuple[Array, Array] | None
+    conflicts: tuple[Conflict, ...]
+    turned_deg: float
     converged: bool
     terms: Terms
 
@@ -70,18 +101,26 @@ def camera_verdict(camera: Camera, evidence: Evidence) -> Verdict:
     """Judge one camera's result by its evidence."""
     residuals = evidence.residuals
     if residuals is None:
-        return Verdict("WARN", ("no correspondences: known only through relative_poses",))
+        few = f"{evidence.used} usable correspondences, too few: known only through relative_poses"
+        return Verdict("WARN", (few,))
     spread_deg = np.degrees(residuals.sigma_px / camera.intrinsics_px.fx)
     checks = [
         _above("residual spread", spread_deg, SPREAD_WARN_DEG, SPREAD_FAIL_DEG, "deg"),
         _below("inlier share", residuals.inlier_share, INLIERS_WARN, INLIERS_FAIL),
         *_sigma_checks(evidence.covariance),
+        *(_conflict_check(conflict) for conflict in evidence.conflicts),
     ]
     if evidence.terms in ("stage1", "priors"):
         unchecked = f"the terms {evidence.terms!r} do not fit the correspondences: no error bar"
         checks.append(("WARN", unchecked))
     else:
         checks += _halves_checks(evidence.halves)
+    if evidence.turned_deg > TURNED_WARN_DEG:
+        turned = (
+            f"turned by {evidence.turned_deg:.0f} deg from the guess: is its T_camera_lidar "
+            "inverted, or of other axes?"
+        )
+        checks.append(("WARN", turned))
     if evidence.used < MATCHES_WARN:
         few = f"only {evidence.used} correspondences used, fewer than {MATCHES_WARN}"
         checks.append(("WARN", few))
@@ -121,7 +160,11 @@ def with_matching(
     if contrast is not None:
         weak = contrast < CONTRAST_WARN
         limit = CONTRAST_FAIL if contrast < CONTRAST_FAIL else CONTRAST_WARN
-        text = f"image and cloud agree only {contrast:.1f} chance spreads, less than {limit:g}"
+        text = (
+            f"image and cloud agree only {contrast:.1f} times better than by chance, less than "
+            f"{limit:g}: check the guess (p_camera = T_camera_lidar * p_lidar: its direction, axes "
+            "and units), the intrinsics, and that images and clouds belong together"
+        )
         checks.append((_grade(weak, contrast < CONTRAST_FAIL), text))
     return worst_of(checks)
 
@@ -159,6 +202,18 @@ def _sigma_checks(covariance: Array | None) -> list[tuple[Status, str]]:
         _above("rotation sigma", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
         _above("translation sigma", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
     ]
+
+
+def _conflict_check(conflict: Conflict) -> tuple[Status, str]:
+    pair, sigmas = conflict.pair, conflict.largest
+    angle = np.degrees(np.linalg.norm(conflict.difference[:3]))
+    distance = 100 * np.linalg.norm(conflict.difference[3:])
+    text = (
+        f"the relative pose of {pair.a} and {pair.b} differs from what the correspondences say by "
+        f"{angle:.2g} deg, {distance:.2g} cm, {sigmas:.3g} sigma: is it p_a = T_a_b * p_b, and are "
+        "its sigmas right?"
+    )
+    return _grade(sigmas > CONFLICT_WARN_SIGMAS, sigmas > CONFLICT_FAIL_SIGMAS), text
 
 
 def _centre(T_camera_lidar: Array) -> Array:

@@ -145,6 +145,27 @@ def test_an_independent_relative_pose_is_honoured(pair: Rig) -> None:
     assert pairs[1].rotation_error_deg < np.degrees(4e-3) < pairs[0].rotation_error_deg
 
 
+def test_a_relative_pose_that_contradicts_the_data_is_not_passed(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=12)
+    right = stereo_relative_pose(pair)
+    wrong, inverted = right.T_a_b.copy(), np.linalg.inv(right.T_a_b)
+    wrong[0, 3] += 0.05
+    for T, status in ((right.T_a_b, "PASS"), (wrong, "FAIL"), (inverted, "FAIL")):
+        relative = right.model_copy(update={"T_a_b": T})
+        result = solve(pair.model_copy(update={"relative_poses": (relative,)}), table)
+        assert result.verdict.status == status
+        named = any("relative pose of left and right" in r for r in result.verdict.reasons)
+        assert named == (status == "FAIL")
+
+
+def test_an_inverted_guess_is_pointed_out(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=12)
+    inverted = pair.moved_to({n: np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()})
+    result = solve(inverted, table)
+    assert result.verdict.status != "PASS"
+    assert any("inverted" in reason for reason in result.verdict.reasons)
+
+
 def test_the_relative_prior_spans_all_cameras(mixed_rig: Rig) -> None:
     table = simulate_correspondences(mixed_rig, errors=NOISY, frames=6, matches=100)
     results = {
