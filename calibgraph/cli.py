@@ -66,7 +66,7 @@ TermsOption = Annotated[
     typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
 ]
 OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
@@ -105,9 +105,11 @@ def calibrate(
     as_json: JsonOption = False,
 ) -> None:
     """From images and clouds to one calibration of all cameras, with pictures before and after."""
+    from calibgraph.files import require_place_for_folder
     from calibgraph.overlay import write_overlays
     from calibgraph.pipeline import calibrate, matcher_named
 
+    require_place_for_folder(out)
     with _arguments():
         settings, chosen = _settings(config, preset, seed), matcher_named(matcher, seed=seed)
         checked_terms = _terms(terms)
@@ -169,10 +171,11 @@ def solve(
 ) -> None:
     """From a table of correspondences to one calibration of all cameras."""
     from calibgraph.correspondences import load_correspondences
-    from calibgraph.files import sha256
+    from calibgraph.files import require_place_for_folder, sha256
     from calibgraph.load import load_rig
     from calibgraph.two_pass import solve
 
+    require_place_for_folder(out)
     with _arguments():
         settings, checked_terms = _settings(config, preset, seed), _terms(terms)
     table = load_correspondences(correspondences)
@@ -218,9 +221,14 @@ def perturb(
     from calibgraph.perturbation import perturb
 
     given = load_rig(rig)
-    moved = perturb(
-        given, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed, uniform=uniform
-    )
+    with _arguments():
+        moved = perturb(
+            given,
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+            seed=seed,
+            uniform=uniform,
+        )
     moved.save(out)
     _console().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
 
@@ -230,12 +238,26 @@ def main() -> None:
     from calibgraph.errors import CalibrationError
 
     try:
-        app()
-    except (CalibrationError, OSError) as error:
+        sys.exit(app(standalone_mode=False) or 0)
+    except (CalibrationError, OSError, _UsageError) as error:
         if "--debug" in sys.argv:
             raise
-        print(f"calibgraph: {' '.join(str(error).split())}", file=sys.stderr)
+        if str(error) or not isinstance(error, _UsageError):  # else the help has been printed
+            print(f"calibgraph: {_one_line(error)}", file=sys.stderr)
         sys.exit(2)
+    except typer.Abort:
+        sys.exit("calibgraph: interrupted")
+
+
+_UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    text = error.format_message() if hasattr(error, "format_message") else str(error)
+    more = "; see calibgraph --help" if isinstance(error, _UsageError) else ""
+    return " ".join(text.split()).removesuffix(".") + more
 
 
 @contextmanager

@@ -76,9 +76,10 @@ def _with_intensity(
     xyz: NDArray[np.floating], intensity: NDArray[np.floating] | None
 ) -> NDArray[np.float32]:
     cloud = np.full((len(xyz), 4), np.nan, dtype=np.float32)
-    cloud[:, :3] = xyz
-    if intensity is not None:
-        cloud[:, 3] = intensity
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        cloud[:, :3] = xyz
+        if intensity is not None:
+            cloud[:, 3] = intensity
     return cloud
 
 

@@ -14,8 +14,10 @@ Terms = Literal["stage1", "reprojection", "priors", "full"]
 TERMS: tuple[Terms, ...] = get_args(Terms)
 PresetName = Literal["kitti", "walkley", "auto"]
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
+Weight = Annotated[float, Field(ge=0, le=1e12)]
+Cells = Annotated[int, Field(gt=0, le=100_000)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Config(BaseModel):
@@ -47,17 +49,17 @@ class Config(BaseModel):
     relative_prior_weight: Weight = 5.0
     relative_prior_pairs: Literal["spanning", "all"] = "spanning"
     loss: LossName = "cauchy"
-    loss_scale_px: Positive | None = None
-    gate_px: Positive | None = None
+    loss_scale_px: Pixels | None = None
+    gate_px: Pixels | None = None
     confidence_min: Annotated[float, Field(ge=0, le=1)] = 0.1
     confidence_weights: bool = False
-    grid_columns: Annotated[int, Field(gt=0)] = 40
-    grid_rows: Annotated[int, Field(gt=0)] = 25
+    grid_columns: Cells = 40
+    grid_rows: Cells = 25
     matches_max: Annotated[int, Field(gt=0)] = 10_000
     stage1: Literal["pnp", "rig"] = "pnp"
     aggregate: Literal["median", "mean", "mode"] = "median"
-    pnp_threshold_px: Positive = 8.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    pnp_threshold_px: Pixels = 8.0
+    seed: Seed = 0
 
     def changed(self, **settings: Any) -> Config:
         """A checked copy with some settings changed.

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 TABLE_FORMAT = "calibgraph-correspondences/1"
 
+MAX_COORDINATE = 1e6  # px or m: nothing that is matched lies farther
+MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e12  # 1/px^2
+
 _COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 _INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
 _REQUIRED = ("camera", "frame", *_COORDINATES)
@@ -68,6 +71,12 @@ class Correspondences:
                 raise CorrespondenceError(
                     f"{column} has shape {array.shape}, expected {shape} like the column frame"
                 )
+        if len(self.camera_index) and not (
+            0 <= self.camera_index.min() <= self.camera_index.max() < len(self.cameras)
+        ):
+            raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
+        if not isinstance(self.metadata, dict):
+            raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
         self._check_values()
 
     @staticmethod
@@ -87,8 +96,11 @@ class Correspondences:
         Raises:
             CorrespondenceError: on wrong shapes or values.
         """
-        pixels = np.asarray(pixels_px, dtype=np.float64)
+        pixels = np.atleast_2d(np.asarray(pixels_px, dtype=np.float64))
         n = len(pixels)
+        for name, numbers in (("frame", frame), ("stamp_ns", stamp_ns)):
+            if numbers is not None and n and np.asarray(numbers).dtype.kind not in "iu":
+                raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
         names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
         given = np.ones(n) if confidence is None else confidence
         return Correspondences(
@@ -179,17 +191,20 @@ class Correspondences:
 
     def _check_values(self) -> None:
         u, v = self.pixels_px, self.points_lidar_m
-        self._require(np.isfinite(u).all(axis=1), "pixel", u, "be finite")
-        self._require(np.isfinite(v).all(axis=1), "point", v, "be finite")
+        for what, values in (("pixel", u), ("point", v)):
+            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.information_px is not None:
             i = self.information_px
+            good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
+            self._require(good, "information", i, f"be finite and below {MAX_INFORMATION:g}")
             determinant = i[:, 0] * i[:, 2] - i[:, 1] ** 2
             tolerance = 1e-6 * np.maximum(i[:, 0], i[:, 2]) ** 2
             positive = (i[:, [0, 2]] >= 0).all(axis=1) & (determinant >= -tolerance)
-            good = np.isfinite(i).all(axis=1) & positive & (i[:, 0] + i[:, 2] > 0)
-            self._require(good, "information", i, "be finite, positive semidefinite and not zero")
+            good = positive & (i[:, 0] + i[:, 2] > MIN_INFORMATION)
+            self._require(good, "information", i, "be positive semidefinite and not zero")
 
     def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
         if good.all():
@@ -253,6 +268,8 @@ def load_correspondences(path: Path | str) -> Correspondences:
         FileError: if the file is missing, truncated, or lacks a column.
         CorrespondenceError: if a value is wrong.
     """
+    import pyarrow as pa
+
     path = require_file(Path(path))
     table = _read_arrow(path)
     missing = [name for name in _REQUIRED if name not in table.column_names]
@@ -261,6 +278,17 @@ def load_correspondences(path: Path | str) -> Correspondences:
         raise FileError(path, f"column {missing[0]!r} is missing; found {table.column_names}")
     if unknown:
         raise FileError(path, f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
+    if not len(table):
+        raise FileError(path, "holds no rows; write the correspondences into it")
+    if len(set(table.column_names)) < len(table.column_names):
+        raise FileError(path, f"has a column twice: {table.column_names}; keep one")
+    form = (
+        (table.schema.metadata or {})
+        .get(b"format", TABLE_FORMAT.encode())
+        .decode("utf-8", "replace")
+    )
+    if form != TABLE_FORMAT:
+        raise FileError(path, f"has the format {form!r}, expected {TABLE_FORMAT!r}")
     partial = [name for name in _INFORMATION if name in table.column_names]
     if partial and len(partial) < len(_INFORMATION):
         raise FileError(path, f"has only {partial} of the columns {list(_INFORMATION)}")
@@ -268,8 +296,8 @@ def load_correspondences(path: Path | str) -> Correspondences:
         return from_arrow(table)
     except CorrespondenceError as error:
         raise FileError(path, str(error)) from error
-    except (ValueError, TypeError) as error:
-        raise FileError(path, f"a column has the wrong type: {error}") from error
+    except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
+        raise FileError(path, f"a column or the metadata has the wrong type: {error}") from error
 
 
 def from_arrow(table: pa.Table) -> Correspondences:
@@ -283,10 +311,14 @@ def from_arrow(table: pa.Table) -> Correspondences:
 
     def column(name: str, dtype: type) -> NDArray[Any]:
         values = np.asarray(table[name].to_numpy())
-        if not np.can_cast(values.dtype, dtype, casting="same_kind"):
+        if values.dtype == np.uint64 and len(values) and values.max() < 2**63:
+            values = values.astype(np.int64)
+        if values.dtype.kind not in "iuf" or not np.can_cast(
+            values.dtype, dtype, casting="same_kind" if dtype is not np.int64 else "safe"
+        ):
             kind = "whole numbers" if dtype is np.int64 else "numbers"
             raise CorrespondenceError(
-                f"column {name!r} must hold {kind}, found {table[name].type}, first {values[0]!r}"
+                f"column {name!r} must hold {kind}, found {table[name].type}: {values[:1].tolist()}"
             )
         return values.astype(dtype)
 

@@ -17,7 +17,8 @@ from calibgraph.errors import FileError
 
 Model = TypeVar("Model", bound=BaseModel)
 
-MAX_YAML_BYTES = 16 * 2**20
+MAX_YAML_BYTES = 8 * 2**20
+MAX_YAML_VALUES = 1_000_000
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -25,6 +26,9 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
     A crash leaves the old file or the new one, never half of one.
     """
+    if path.is_dir():
+        raise FileError(path, "is a folder, expected the name of a file to write")
+    require_place_for_folder(path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
     os.close(handle)
@@ -40,6 +44,17 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_place_for_folder(folder: Path) -> None:
+    """Check, before hours of work, that a folder is there or can be made.
+
+    Raises:
+        FileError: if a file has its name, or a parent's.
+    """
+    for part in (folder, *folder.parents):
+        if part.exists() and not part.is_dir():
+            raise FileError(part, "is a file, expected a folder to write into; choose another")
 
 
 def _sync_folder(folder: Path) -> None:
@@ -90,13 +105,33 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
     try:
         content = yaml.load(path.read_text("utf-8"), Loader=_Loader)
+        expanded = _expanded_size(content, {})
     except UnicodeDecodeError as error:
         raise FileError(path, f"is not a text file ({error.reason}); expected YAML") from error
-    except yaml.YAMLError as error:
-        raise FileError(path, f"is not valid YAML: {error}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        text = str(error).replace('in "<unicode string>", ', "")
+        raise FileError(path, f"is not valid YAML: {text}") from error
+    except RecursionError:
+        raise FileError(
+            path, "is nested too deeply; expected a mapping of keys to values"
+        ) from None
     if not isinstance(content, dict):
         raise FileError(path, f"holds {_kind(content)}, expected a mapping of keys to values")
+    if expanded > MAX_YAML_VALUES:
+        raise FileError(
+            path, f"its aliases stand for over {MAX_YAML_VALUES} values; write them out"
+        )
     return content
+
+
+def _expanded_size(value: Any, known: dict[int, int]) -> int:
+    """How many values there are when every alias is written out; each is visited once."""
+    if not isinstance(value, (dict, list)):
+        return 1
+    if id(value) not in known:
+        children = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_expanded_size(child, known) for child in children)
+    return known[id(value)]
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
@@ -135,16 +170,25 @@ def _kind(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."  # noqa: PLR2004 - a line's worth
 
 
-class _Loader(yaml.SafeLoader):
+_FastLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
     """YAML that refuses a key given twice: PyYAML would silently keep the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                mark = node.start_mark
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} is given twice", problem_mark=mark)
-        return super().construct_mapping(node, deep)
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, (str, int)) and key in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark
+                )
+            seen.add(key if isinstance(key, (str, int)) else id(key_node))
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
 
 
 class _Dumper(yaml.SafeDumper):

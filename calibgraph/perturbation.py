@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,15 @@ def perturb(
         seed: of the draws; cameras are drawn in the rig's order.
         uniform: draw each of the six components uniformly within +- the value instead, the
             rotation as Euler angles about the camera's x, y, z axes.
+
+    Raises:
+        ValueError: if an angle or length is out of range.
     """
+    if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
+        raise ValueError(
+            f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "
+            f"and {translation_m} m"
+        )
     rng = np.random.default_rng(seed)
     draw = _uniform if uniform else _exact
     poses = {

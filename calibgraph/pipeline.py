@@ -102,6 +102,8 @@ def calibrate(
     initial = rig if rig is not None else data.rig
     if chosen.stage1 == "rig":
         config = config.changed(stage1="rig")
+    if chosen.rounds < 1:
+        raise ValueError(f"the matcher wants {chosen.rounds} rounds, expected at least 1")
     report = progress or (lambda what, done, total: None)
     clock, rounds, estimate = Clock(), list[dict[str, Any]](), initial
     for index in range(chosen.rounds):
@@ -169,7 +171,7 @@ def _judged_by_matching(
     result: Calibration, rounds: Sequence[dict[str, Any]], table: Correspondences
 ) -> Calibration:
     """The result with a verdict that knows how the matching went, not only the last solve."""
-    contrasts = table.metadata.get("contrast", {})
+    contrasts = table.metadata.get("contrast") or {}
     verdicts = {
         name: with_matching(
             verdict,

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -40,7 +42,7 @@ def rigid_transform(value: Any) -> Array:
     """
     try:
         T = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("expected a 4x4 matrix of numbers") from error
     if T.shape != (4, 4):
         raise ValueError(f"expected a 4x4 matrix, found shape {T.shape}")
@@ -52,7 +54,7 @@ def rigid_transform(value: Any) -> Array:
     if deviation > ROUNDING:
         raise ValueError(
             f"the upper left 3x3 is not a rotation: R^T R differs from the identity by "
-            f"{deviation:.3g}"
+            f"{deviation:.3g}; if its digits are rounded, write at least 4"
         )
     if np.linalg.det(T[:3, :3]) < 0:
         raise ValueError("the upper left 3x3 has determinant -1: it mirrors; check the axes' signs")
@@ -67,6 +69,24 @@ Transform = Annotated[
     BeforeValidator(rigid_transform),
     PlainSerializer(lambda T: T.tolist(), return_type=list),
 ]
+
+
+def _checked_name(name: str) -> str:
+    """A camera's name is part of file names and messages.
+
+    Raises:
+        ValueError: if it cannot be.
+    """
+    if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,100}", name) or name in (".", ".."):
+        raise ValueError(
+            f"camera name {name!r}: expected 1 to 100 characters without slashes, and not a dot"
+        )
+    return name
+
+
+CameraName = Annotated[str, AfterValidator(_checked_name)]
+Sigma = Annotated[float, Field(ge=1e-9, allow_inf_nan=False)]
+Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -88,8 +108,8 @@ class Camera(_Model):
     """One camera: its lens, its image size, and its pose guess (or truth, in a reference)."""
 
     model: Literal["pinhole", "fisheye"] = "pinhole"
-    width_px: Annotated[int, Field(gt=0)]
-    height_px: Annotated[int, Field(gt=0)]
+    width_px: Size
+    height_px: Size
     intrinsics_px: Intrinsics
     distortion: tuple[Finite, ...] = ()
     T_camera_lidar: Transform
@@ -129,8 +149,8 @@ class RelativePose(_Model):
     a: str
     b: str
     T_a_b: Transform
-    rotation_sigma_rad: Positive
-    translation_sigma_m: Positive
+    rotation_sigma_rad: Sigma
+    translation_sigma_m: Sigma
 
 
 class Rig(_Model):
@@ -138,7 +158,7 @@ class Rig(_Model):
 
     format: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
     lidar: str = "lidar"
-    cameras: Annotated[dict[str, Camera], Field(min_length=1)]
+    cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
     relative_poses: tuple[RelativePose, ...] = ()
 
     @model_validator(mode="after")

@@ -12,6 +12,8 @@ from calibgraph.rig import Camera, Rig
 
 Array = NDArray[np.float64]
 
+_MAX_TRIES = 1000
+
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherErrors:
@@ -96,11 +98,13 @@ def _visible_points(
     kept = np.empty((0, 3))
     spread = 1.2 * np.array([camera.width_px, camera.height_px]) / 2
     focal = np.array([camera.intrinsics_px.fx, camera.intrinsics_px.fy])
-    while len(kept) < count:
+    for _ in range(_MAX_TRIES):
         angles = rng.uniform(-1, 1, (2 * count, 2)) * np.minimum(spread / focal, 1.4)
         distance = np.exp(rng.uniform(low, high, 2 * count))
         rays = np.column_stack([np.tan(angles), np.ones(2 * count)])
         points = rays * (distance / np.linalg.norm(rays, axis=1))[:, None]
         pixels, valid = camera.lens.project(points)
         kept = np.vstack([kept, points[valid & camera.in_image(pixels)]])
-    return kept[:count]
+        if len(kept) >= count:
+            return kept[:count]
+    raise ValueError(f"no {count} points between {depth_m} m project into the image")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.box import SIMPLE
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from calibgraph.calibration import FRAMES_SENTENCE, Calibration
@@ -48,7 +49,7 @@ def result_table(result: Calibration) -> Table:
         sigmas, residuals = result.sigmas(name), result.residuals.get(name)
         status = result.camera_verdicts[name].status
         table.add_row(
-            name,
+            escape(name),
             f"[{_COLOURS[status]}]{status}[/]",
             "-" if sigmas is None else f"{sigmas[0].max():.3f}",
             "-" if sigmas is None else f"{sigmas[1].max():.2f}",
@@ -93,11 +94,11 @@ def evaluation_table(errors: Evaluation) -> Table:
         "roll\ndeg", "pitch\ndeg", "yaw\ndeg",
     )  # fmt: skip
     for name, error in errors.cameras.items():
-        table.add_row(name, *_cells(error))
+        table.add_row(escape(name), *_cells(error))
     if errors.pairs:
         table.add_section()
     for name, error in errors.pairs.items():
-        table.add_row(name, *_cells(error))
+        table.add_row(escape(name), *_cells(error))
     return table
 
 

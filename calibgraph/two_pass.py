@@ -123,11 +123,26 @@ def _require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> No
             raise CorrespondenceError(
                 f"camera {name!r} has {count['capped']} usable correspondences, at least "
                 f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
-                f"(left after each filter: {left}); if none were given, or most are not "
-                "projectable, the cloud is not where T_camera_lidar looks: check its direction "
-                "(p_camera = T_camera_lidar * p_lidar), its axes and its units",
+                f"(left after each filter: {left}): {_why_few(count)}",
                 camera=name,
             )
+
+
+def _why_few(count: Mapping[str, int]) -> str:
+    """What to do about too few correspondences, by the filter that took them."""
+    if count["given"] < MIN_MATCHES:
+        return (
+            "none or few were found; check that its images show something, that the cloud lies "
+            "where T_camera_lidar looks (p_camera = T_camera_lidar * p_lidar), and its name"
+        )
+    if count["projectable"] < MIN_MATCHES:
+        return (
+            "the points are not in front of it; check the direction of T_camera_lidar "
+            "(p_camera = T_camera_lidar * p_lidar), its axes and its units"
+        )
+    if count["confident"] < MIN_MATCHES:
+        return "their confidence is below confidence_min; lower it if they can be trusted"
+    return "they crowd in few cells of the image; match more of it"
 
 
 def _stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:

@@ -158,14 +158,14 @@ def with_matching(
         _above(what, moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
     ]
     if contrast is not None:
-        weak = contrast < CONTRAST_WARN
-        limit = CONTRAST_FAIL if contrast < CONTRAST_FAIL else CONTRAST_WARN
+        weak, failed = not contrast >= CONTRAST_WARN, not contrast >= CONTRAST_FAIL  # NaN fails
+        limit = CONTRAST_FAIL if failed else CONTRAST_WARN
         text = (
             f"image and cloud agree only {contrast:.1f} times better than by chance, less than "
             f"{limit:g}: check the guess (p_camera = T_camera_lidar * p_lidar: its direction, axes "
             "and units), the intrinsics, and that images and clouds belong together"
         )
-        checks.append((_grade(weak, contrast < CONTRAST_FAIL), text))
+        checks.append((_grade(weak, failed), text))
     return worst_of(checks)
 
 
