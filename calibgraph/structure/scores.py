@@ -147,14 +147,14 @@ def _flow(camera: Camera, points_camera_m: Array) -> tuple[Array, Array]:
 def _score_windows(image, places, counts, basis, group, reach, grids):  # type: ignore[no-untyped-def]
     """Add every window's score at all shifts to its group's grid.
 
-    image: (h, w); places: (n, l, 2) nearest pixels at shift 0; counts: (n,); basis: (n, l, 2);
+    image: (h, w); places: (n, l, 2) nearest pixels at shift 0; counts: (n,); basis: (n, l, 4);
     group: (n,); grids: (g, 2 reach + 1, 2 reach + 1). The score is d_D^2 + d_I |d_I|: squared for
     depth, which has no sign in an image, and signed for intensity; over the image's own variation.
     Shifts at which a window leaves the image count 0.
     """
     height, width = image.shape
     side = 2 * reach + 1
-    sums = np.empty((4, side), np.float32)  # depth, intensity, total, power
+    sums = np.empty((6, side), np.float32)  # depth, intensity, two of trend, total, power
     for w in range(places.shape[0]):
         n = counts[w]
         left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
@@ -168,15 +168,18 @@ def _score_windows(image, places, counts, basis, group, reach, grids):  # type: 
             for p in range(n):
                 row = image[places[w, p, 1] + shift]
                 start = places[w, p, 0] + first
-                a, b = basis[w, p, 0], basis[w, p, 1]
+                a, b, c, d = basis[w, p, 0], basis[w, p, 1], basis[w, p, 2], basis[w, p, 3]
                 for k in range(size):
                     value = row[start + k]
                     sums[0, k] += a * value
                     sums[1, k] += b * value
-                    sums[2, k] += value
-                    sums[3, k] += value * value
+                    sums[2, k] += c * value
+                    sums[3, k] += d * value
+                    sums[4, k] += value
+                    sums[5, k] += value * value
             grid = grids[group[w], shift + reach]
             for k in range(size):
-                power = sums[3, k] - sums[2, k] * sums[2, k] / n + n * np.float32(GRAY_NOISE**2)
+                power = sums[5, k] - sums[4, k] * sums[4, k] / n + n * np.float32(GRAY_NOISE**2)
+                power -= sums[2, k] * sums[2, k] + sums[3, k] * sums[3, k]
                 score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
                 grid[first + reach + k] += score / power

@@ -58,8 +58,8 @@ class Windows:
         points_lidar_m: (p, 3) the points that windows are made of, in the LiDAR frame.
         members: (w, WINDOW_POINTS) indices into the points, the window's centre first.
         counts: (w,) how many of the members are in use: the first ones.
-        basis: (w, WINDOW_POINTS, 2) columns: inverse range and intensity (orthonormal, shrunk where
-            they are flat).
+        basis: (w, WINDOW_POINTS, 4) columns: inverse range and intensity (orthonormal, shrunk where
+            they are flat), and the two linear functions of direction.
     """
 
     points_lidar_m: Array
@@ -144,7 +144,8 @@ def _neighbours(directions: Array, seeds: Rows, spacing_rad: float) -> tuple[Row
 def _trend(directions: Array, used: Mask) -> Array:
     """(w, l, 2) orthonormal basis of the linear functions of direction in each window.
 
-    Inverse range is linear in direction on any plane: without these parts only edges are left.
+    Inverse range is linear in direction on any plane, and shading mostly so: without these parts
+    only edges and markings are left to match.
     """
     count = np.maximum(used.sum(axis=1), 1)[:, None, None]
     mean = (directions * used[..., None]).sum(axis=1, keepdims=True) / count
@@ -161,32 +162,31 @@ def _basis(
 ) -> tuple[NDArray[np.float32], Array]:
     """Centre and orthonormalise inverse range and intensity, shrunk where they are flat.
 
-    Only inverse range loses its linear part: a slope of the intensity is signal, as in the image.
     Inverse range comes first: the part that it shares with the intensity has no reliable sign.
 
     Returns:
-        (w, l, 2) basis: inverse range, intensity; (w,) the larger of both reliabilities.
+        (w, l, 4) basis: inverse range, intensity, trend; (w,) the larger of both reliabilities.
     """
     count = np.maximum(used.sum(axis=1, keepdims=True), 1)
     inverse = 1.0 / distance
     inverse /= (inverse * used).sum(axis=1, keepdims=True) / count
-    bent = _centred(inverse, used, count)
-    linear = np.einsum("wli,wl->wi", trend, bent)
-    bent = bent - np.einsum("wli,wi->wl", trend, linear)
     columns: list[Array] = []
     weights: list[Array] = []
-    for column, noise in ((bent, DEPTH_NOISE), (_centred(rank, used, count), INTENSITY_NOISE)):
-        left = column
+    for values, noise in ((inverse, DEPTH_NOISE), (rank, INTENSITY_NOISE)):
+        column = _detrended(values, used, count, trend)
         for other in columns:
-            left = left - other * (left * other).sum(axis=1, keepdims=True)
-        power = (left**2).sum(axis=1, keepdims=True)
-        columns.append(left / np.sqrt(power + 1e-12))
+            column = column - other * (column * other).sum(axis=1, keepdims=True)
+        power = (column**2).sum(axis=1, keepdims=True)
+        columns.append(column / np.sqrt(power + 1e-12))
         weights.append(np.sqrt(power / (power + count * noise**2)))
     shrunk = [column * weight for column, weight in zip(columns, weights, strict=True)]
-    return np.stack(shrunk, axis=2).astype(np.float32), np.maximum(*weights)[:, 0]
+    basis = np.concatenate([np.stack(shrunk, axis=2), trend], axis=2)
+    return basis.astype(np.float32), np.maximum(*weights)[:, 0]
 
 
-def _centred(values: Array, used: Mask, count: NDArray[np.intp]) -> Array:
-    """Values (w, l) without their mean over what is used, 0 elsewhere."""
+def _detrended(values: Array, used: Mask, count: NDArray[np.intp], trend: Array) -> Array:
+    """Values (w, l) without their mean and their linear part."""
     mean = (values * used).sum(axis=1, keepdims=True) / count
-    return np.asarray((values - mean) * used)
+    centred = (values - mean) * used
+    linear = np.einsum("wli,wl->wi", trend, centred)
+    return np.asarray(centred - np.einsum("wli,wi->wl", trend, linear))
