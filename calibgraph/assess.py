@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.calibration import Residuals, Verdict
-from calibgraph.covariance import cluster_robust_covariance
-from calibgraph.graph import Optimum
+from calibgraph.covariance import cluster_robust_covariance, data_sigmas
+from calibgraph.graph import Optimum, relative_pose_graph
 from calibgraph.matches import MIN_MATCHES
 from calibgraph.problem import Problem, Scales
 from calibgraph.rig import RelativePose, Rig, angle_deg
@@ -59,6 +59,7 @@ def assess(
     joint = _joint_covariance(inliers, solution, scales, systematic_sigmas)
     conflicts = _conflicts(rig, inliers, solution, scales, systematic_sigmas)
     halves = _halves(inliers, solution, scales)
+    at_best = _data_sigmas(rig, inliers, solution, scales)
     covariance: dict[str, Array | None] = {}
     verdicts = {}
     for index, (name, camera) in enumerate(rig.cameras.items()):
@@ -70,6 +71,7 @@ def assess(
             used=0 if matches is None else len(matches.frame),
             frames=0 if matches is None else len(np.unique(matches.frame)),
             covariance=covariance[name],
+            data_sigmas=None if at_best is None else at_best[index],
             halves=halves.get(name),
             conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
             turned_deg=_angle_between(camera.T_camera_lidar, solution.T_camera_lidar[name]),
@@ -98,6 +100,15 @@ def _joint_covariance(
     rotation, translation = systematic_sigmas
     sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
     return scatter + np.diag(np.tile(sigmas**2, len(solution.T_camera_lidar)))
+
+
+def _data_sigmas(rig: Rig, inliers: Problem, solution: Optimum, scales: Scales) -> Array | None:
+    """(N, 6) what correspondences and measured relative poses could tell at best."""
+    if not inliers.fits_matches:
+        return None
+    blocks = {name: m.scaled(scales[name]) for name, m in inliers.matches.items()}
+    known = relative_pose_graph(inliers.cameras, rig.relative_poses)
+    return data_sigmas(blocks, known, solution.T_camera_lidar)
 
 
 def _conflicts(

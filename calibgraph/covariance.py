@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 MIN_FRAMES = 5
 """With fewer frames their scatter says too little to print a number."""
 
+_FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 _STEP = 1e-5  # rad and m: of the central differences of the gradient
 
 
@@ -62,6 +63,38 @@ def cluster_robust_covariance(
     spread = gradients @ (vectors / values) @ vectors.T
     covariance: Array = spread.T @ spread * (len(numbers) / (len(numbers) - 1))
     return covariance
+
+
+def data_sigmas(
+    blocks: Mapping[str, ProjectionBlock],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    T_camera_lidar: Mapping[str, Array],
+) -> Array:
+    """What the data could tell at best, if every correspondence were independent.
+
+    A lower bound of the true uncertainty: it shows the directions that the data do not determine.
+
+    Args:
+        blocks: per camera with correspondences.
+        pose_graph: measured relative poses; no priors.
+        T_camera_lidar: the solution, all cameras.
+
+    Returns:
+        (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
+        infinite where nothing is known.
+    """
+    cameras = list(T_camera_lidar)
+    hessian = _pose_hessian(pose_graph, cameras, T_camera_lidar)
+    for name, block in blocks.items():
+        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
+        hessian[rows, rows] += sums.hessian
+    units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
+    free = values < _FREE
+    variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
+    loose = (vectors[:, free] ** 2).sum(axis=1) > _FREE
+    return np.sqrt(np.where(loose, np.inf, variances)).reshape(-1, 6)
 
 
 def _pose_hessian(

@@ -117,7 +117,7 @@ def calibrate(
     with clock("hash_inputs"):
         inputs = _input_hashes(data)
     return replace(
-        _judged_by_matching(result, rounds, table),
+        _judged_by_matching(result, rounds, table, repeated=_repeated_frame(data, inputs)),
         initial_rig=initial,
         correspondences=table,
         rounds=tuple(rounds),
@@ -168,7 +168,11 @@ def _round(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
 
 
 def _judged_by_matching(
-    result: Calibration, rounds: Sequence[dict[str, Any]], table: Correspondences
+    result: Calibration,
+    rounds: Sequence[dict[str, Any]],
+    table: Correspondences,
+    *,
+    repeated: str | None,
 ) -> Calibration:
     """The result with a verdict that knows how the matching went, not only the last solve."""
     contrasts = table.metadata.get("contrast") or {}
@@ -178,6 +182,7 @@ def _judged_by_matching(
             moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
             moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
             contrast=contrasts.get(name),
+            repeated=repeated,
         )
         for name, verdict in result.camera_verdicts.items()
     }
@@ -190,3 +195,14 @@ def _input_hashes(dataset: Dataset) -> dict[str, str]:
         path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
     ]
     return {str(path): sha256(path) for path in files}
+
+
+def _repeated_frame(dataset: Dataset, hashes: dict[str, str]) -> str | None:
+    """Two frames with the very same cloud, if there are any: they are no independent evidence."""
+    seen: dict[str, str] = {}
+    for frame in dataset.frames:
+        digest = hashes[str(frame.cloud_path)]
+        if digest in seen:
+            return f"frames {seen[digest]} and {frame.name} have the same cloud"
+        seen[digest] = frame.name
+    return None

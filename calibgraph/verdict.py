@@ -79,6 +79,8 @@ class Evidence:
         used: correspondences in the final solve.
         frames: frames that they come from.
         covariance: (6, 6) or None.
+        data_sigmas: (6,) what the data alone could tell at best: rotation [rad], translation [m];
+            or None.
         halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
         conflicts: the relative poses that name this camera.
         turned_deg: angle between the result and the guess.
@@ -90,11 +92,17 @@ class Evidence:
     used: int
     frames: int
     covariance: Array | None
+    data_sigmas: Array | None
     halves: tuple[Array, Array] | None
     conflicts: tuple[Conflict, ...]
     turned_deg: float
     converged: bool
     terms: Terms
+
+    @property
+    def sigmas(self) -> Array | None:
+        """(6,) standard deviations: rotation [rad], translation [m]; or None."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
 
 
 def camera_verdict(camera: Camera, evidence: Evidence) -> Verdict:
@@ -107,7 +115,8 @@ def camera_verdict(camera: Camera, evidence: Evidence) -> Verdict:
     checks = [
         _above("residual spread", spread_deg, SPREAD_WARN_DEG, SPREAD_FAIL_DEG, "deg"),
         _below("inlier share", residuals.inlier_share, INLIERS_WARN, INLIERS_FAIL),
-        *_sigma_checks(evidence.covariance),
+        *_sigma_checks("sigma", evidence.sigmas),
+        *_sigma_checks("what the data alone could tell at best", evidence.data_sigmas),
         *(_conflict_check(conflict) for conflict in evidence.conflicts),
     ]
     if evidence.terms in ("stage1", "priors"):
@@ -141,7 +150,12 @@ def worst_of(checks: Iterable[tuple[Status, str]]) -> Verdict:
 
 
 def with_matching(
-    verdict: Verdict, *, moved_deg: float, moved_cm: float, contrast: float | None
+    verdict: Verdict,
+    *,
+    moved_deg: float,
+    moved_cm: float,
+    contrast: float | None,
+    repeated: str | None,
 ) -> Verdict:
     """A camera's verdict with what its matcher knows.
 
@@ -149,6 +163,7 @@ def with_matching(
         verdict: of the last solve.
         moved_deg: how far the last of several rounds turned the camera.
         moved_cm: how far it shifted it.
+        repeated: that frames repeat each other, if they do.
         contrast: how far the matches' agreement stands out from chance, if the matcher says.
     """
     what = "matching again still moves it:"
@@ -157,6 +172,8 @@ def with_matching(
         _above(what, moved_deg, MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
         _above(what, moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
     ]
+    if repeated is not None:
+        checks.append(("WARN", f"{repeated}: counted as if independent; remove one"))
     if contrast is not None:
         weak, failed = not contrast >= CONTRAST_WARN, not contrast >= CONTRAST_FAIL  # NaN fails
         limit = CONTRAST_FAIL if failed else CONTRAST_WARN
@@ -193,14 +210,13 @@ def _halves_checks(halves: tuple[Array, Array] | None) -> list[tuple[Status, str
     ]
 
 
-def _sigma_checks(covariance: Array | None) -> list[tuple[Status, str]]:
-    if covariance is None:
+def _sigma_checks(what: str, sigmas: Array | None) -> list[tuple[Status, str]]:
+    if sigmas is None:
         return []
-    sigmas = np.sqrt(np.diag(covariance))
     rotation, translation = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
     return [
-        _above("rotation sigma", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
-        _above("translation sigma", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
+        _above(f"{what}: rotation", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
+        _above(f"{what}: translation", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
     ]
 
 

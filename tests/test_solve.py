@@ -158,6 +158,28 @@ def test_a_relative_pose_that_contradicts_the_data_is_not_passed(pair: Rig) -> N
         assert named == (status == "FAIL")
 
 
+def test_points_on_one_line_are_not_passed(pair: Rig) -> None:
+    """The rotation about the line is known from the prior alone, and no scatter shows it."""
+    rng = np.random.default_rng(0)
+    tables = []
+    for name, camera in pair.cameras.items():
+        T = camera.T_camera_lidar
+        for frame in range(8):
+            line = [0.0, 0.0, 8.0] + rng.uniform(-2, 2, (200, 1)) * [1.0, 0.1, 0.3]
+            pixels = camera.lens.project(line)[0] + 0.5 * rng.standard_normal((200, 2))
+            tables.append(
+                Correspondences.from_arrays(
+                    camera=name,
+                    frame=frame,
+                    pixels_px=pixels,
+                    points_lidar_m=(line - T[:3, 3]) @ T[:3, :3],
+                )
+            )
+    result = solve(perturb(pair, rotation_deg=2, translation_m=0.2), concatenate(tables))
+    assert result.verdict.status == "FAIL"
+    assert any("data alone" in reason for reason in result.verdict.reasons)
+
+
 def test_an_inverted_guess_is_pointed_out(pair: Rig) -> None:
     table = simulate_correspondences(pair, errors=NOISY, frames=12)
     inverted = pair.moved_to({n: np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()})

@@ -196,6 +196,14 @@ def test_the_order_of_the_points_does_not_matter(tmp_path: Path) -> None:
         assert error.translation_error_cm < 0.5
 
 
+def test_a_frame_given_twice_is_pointed_out() -> None:
+    data = calibgraph.load_dataset(SAMPLE).select("0:2")
+    copy = replace(data.frames[0], index=2, name="copy")
+    data = replace(data, frames=(*data.frames, copy))
+    result = calibgraph.calibrate(data, matcher=StructureMatcher(levels=LEVELS[:1]))
+    assert any("000000 and copy have the same cloud" in r for r in result.verdict.reasons)
+
+
 def test_the_same_seed_gives_the_same_numbers() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
     one, two = (
