@@ -215,6 +215,35 @@ def test_an_unwritable_folder_is_one_line(problem: Path, call: Call) -> None:
     assert "occupied" in message
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("calibrate",),
+        ("calibrate", SAMPLE, "--seed", -1),
+        ("calibrate", SAMPLE, "--seed", 10**30),
+        ("calibrate", SAMPLE, "--colour", "red"),
+        ("guess", SAMPLE),
+        ("perturb", SAMPLE, "--out", "never.yaml", "--translation-m", "inf"),
+        ("perturb", SAMPLE, "--out", "never.yaml", "--rotation-deg", "nan"),
+        ("perturb", SAMPLE, "--out", SAMPLE),
+        ("calibrate", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+    ],
+)
+def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -> None:
+    one_line(*call(*arguments))
+
+
+def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:
+    rig = Rig(cameras={"[red]": make_camera(), "[bold]b": make_camera((0, 0.5, 0))})
+    rig.save(tmp_path / "rig.yaml")
+    simulate_correspondences(rig, frames=6).save(tmp_path / "table.parquet")
+    code, _, stderr = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet",
+                           "--out", tmp_path / "out")  # fmt: skip
+    assert code == 0
+    assert "[red]" in stderr
+    assert "[bold]b" in stderr
+
+
 def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     missing = str(tmp_path / "nothing.yaml")
     monkeypatch.setattr(sys, "argv", ["calibgraph", "--debug", "evaluate", missing, missing])

@@ -77,6 +77,11 @@ def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
         ({"confidence": [0.5, np.nan, 1, 1]}, "confidence"),
         ({"information_px": [[1, 2, 1]] * 4}, "positive semidefinite"),
         ({"information_px": [[0, 0, 0]] * 4}, "not zero"),
+        ({"pixels_px": [[1e308, 1]] * 4}, "pixel must be finite and below"),
+        ({"information_px": [[1e200, 2e200, 1e200]] * 4}, "information must be finite and below"),
+        ({"information_px": [[1e-200, 2e-200, 1e-200]] * 4}, "positive semidefinite"),
+        ({"frame": [0.5, 1, 1, 1]}, "frame must hold whole numbers"),
+        ({"metadata": [1]}, "metadata must be a mapping"),
         ({"points_lidar_m": [[1, 2]] * 4}, r"shape \(4, 2\), expected \(4, 3\)"),
         ({"confidence": [1.0]}, "shape"),
     ],
@@ -99,6 +104,8 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
         "short.csv": b"camera,frame\nleft,3\n",
         "words.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,zero,1,2,3,4,5\n",
         "half.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,0,1.5,2,3,4,\n",
+        "header.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\n",
+        "twice.csv": b"camera,camera,frame,u_px,v_px,x_m,y_m,z_m\na,a,0,1,2,3,4,5\n",
         "fraction.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,0.5,1,2,3,4,5\n",
     }.items():
         path = tmp_path / name
@@ -119,6 +126,35 @@ def test_unknown_and_missing_columns_are_named(tmp_path: Path) -> None:
     parquet.write_table(arrow.drop_columns(["u_px"]), path)
     with pytest.raises(FileError, match="column 'u_px' is missing"):
         load_correspondences(path)
+
+
+def test_tables_of_another_format_or_kind_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    arrow = table().to_arrow()
+    for metadata, message in (
+        (
+            {"format": "calibgraph-correspondences/9"},
+            "has the format 'calibgraph-correspondences/9'",
+        ),
+        ({"matcher": "not JSON"}, "metadata"),
+        ({"matcher": "[1]"}, "must be a JSON object"),
+        ({"matcher": "[" * 100_000}, "metadata"),
+    ):
+        parquet.write_table(arrow.replace_schema_metadata(metadata), path)
+        with pytest.raises(FileError, match=message) as caught:
+            load_correspondences(path)
+        assert "\n" not in str(caught.value)
+    for name, column in (
+        ("camera", pa.array([["a"]] * 4)),
+        ("frame", pa.array([True] * 4)),
+        ("frame", pa.array([2**63] * 4, pa.uint64())),
+        ("u_px", pa.array(["1"] * 4)),
+    ):
+        index = arrow.column_names.index(name)
+        parquet.write_table(arrow.set_column(index, name, column), path)
+        with pytest.raises(FileError, match=str(path)) as caught:
+            load_correspondences(path)
+        assert "\n" not in str(caught.value)
 
 
 def test_concatenating_keeps_rows_and_fills_information() -> None:

@@ -92,6 +92,53 @@ def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
         load_rig(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 2020-13-45", "not valid YAML"),
+        ("a: !!int abc", "not valid YAML"),
+        ("a: " + "9" * 5000, "not valid YAML"),
+        ("[" * 20_000, "not valid YAML|too deeply"),
+        ("{a: " * 1000, "not valid YAML|too deeply"),
+        ("&a [*a]", "."),
+    ],
+)
+def test_what_the_yaml_parser_chokes_on_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    with pytest.raises(FileError, match=message) as caught:
+        load_rig(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+    path = tmp_path / "rig.yaml"
+    path.write_text("\n".join([*lines, "cameras: {a: {T_camera_lidar: *a11}}"]))
+    with pytest.raises(FileError, match="aliases stand for over"):
+        load_rig(path)
+
+
+def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
+    T = pair.T_camera_lidar["left"].tolist()
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "cameras:\n"
+        "  a: &a {width_px: 640, height_px: 480, intrinsics_px: {fx: 500, fy: 500, cx: 320, cy: 9}"
+        f", T_camera_lidar: {T}}}\n"
+        "  b: {<<: *a, width_px: 320}\n"
+    )
+    cameras = load_rig(path).cameras
+    assert (cameras["a"].width_px, cameras["b"].width_px) == (640, 320)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../../up", "a/b", "a\\b", "a\nb", "x" * 101])
+def test_camera_names_that_are_no_file_names_are_refused(name: str, pair: Rig) -> None:
+    with pytest.raises(ValueError, match="camera name"):
+        Rig(cameras={name: pair.cameras["left"]})
+
+
 def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:
     (tmp_path / "rig.bin").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(FileError, match="not a text file"):
