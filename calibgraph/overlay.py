@@ -19,7 +19,8 @@ Image = NDArray[np.uint8]
 DEPTH_RANGE_M = (2.0, 60.0)
 _MAX_WIDTH_PX = 1280
 _BAR_PX = 34
-_COVERED_SHARE = 0.12  # of the image, by points
+_COVERED_SHARE = 0.2  # of the image, by points
+_MAX_DOT_PX = 7
 
 
 def write_overlays(frame: Frame, initial: Rig, final: Rig, folder: Path) -> list[Path]:
@@ -63,18 +64,17 @@ def overlay(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
     column, row = np.rint(pixels).astype(np.intp).T
     colours = _colours(np.linalg.norm(points, axis=1))
     drawn = image.copy()
-    radius = _dot_radius(image.shape[0] * image.shape[1], len(points))
-    for dy in range(-radius, radius + 1):
-        for dx in range(-radius, radius + 1):
-            rows = np.clip(row + dy, 0, image.shape[0] - 1)
-            drawn[rows, np.clip(column + dx, 0, image.shape[1] - 1)] = colours
+    side = _dot_side(image.shape[0] * image.shape[1], len(points))
+    for dy, dx in np.ndindex(side, side):
+        rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
+        drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
     return drawn
 
 
-def _dot_radius(pixels: int, points: int) -> int:
-    """Radius of a point's square: large where points are few, so small that the image shows."""
+def _dot_side(pixels: int, points: int) -> int:
+    """Side of a point's square: large where points are few, so small that the image shows."""
     side = np.sqrt(_COVERED_SHARE * pixels / max(points, 1))
-    return int(np.clip(round((side - 1) / 2), 0, 3))
+    return int(np.clip(round(side), 1, _MAX_DOT_PX))
 
 
 def write_image(path: Path, image: Image) -> None:

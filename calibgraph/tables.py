@@ -20,7 +20,7 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     status = result.verdict.status
     console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
     for reason in result.verdict.reasons:
-        console.print(f"  {reason}", highlight=False, markup=False)
+        console.print(f"  {reason}", highlight=False, markup=False, soft_wrap=True)
     console.print(result_table(result))
     console.print(
         "sigma: standard deviation, largest axis: scatter between frames, and what the matcher "
