@@ -13,7 +13,8 @@ _HOMES = {
     "calibgraph.pipeline": ("Matcher", "calibrate"),
     "calibgraph.calibration": ("Calibration", "Residuals", "Verdict", "load_calibration"),
     "calibgraph.config": ("Config", "load_config", "preset"),
-    "calibgraph.correspondences": ("Correspondences", "concatenate", "load_correspondences"),
+    "calibgraph.correspondence_file": ("load_correspondences",),
+    "calibgraph.correspondences": ("Correspondences", "concatenate"),
     "calibgraph.dataset": ("Dataset", "Frame", "load_dataset"),
     "calibgraph.errors": (
         "CalibrationError",

@@ -7,9 +7,9 @@ from calibgraph.calibration import load_calibration as load_calibration
 from calibgraph.config import Config as Config
 from calibgraph.config import load_config as load_config
 from calibgraph.config import preset as preset
+from calibgraph.correspondence_file import load_correspondences as load_correspondences
 from calibgraph.correspondences import Correspondences as Correspondences
 from calibgraph.correspondences import concatenate as concatenate
-from calibgraph.correspondences import load_correspondences as load_correspondences
 from calibgraph.dataset import Dataset as Dataset
 from calibgraph.dataset import Frame as Frame
 from calibgraph.dataset import load_dataset as load_dataset

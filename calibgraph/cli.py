@@ -170,7 +170,7 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """From a table of correspondences to one calibration of all cameras."""
-    from calibgraph.correspondences import load_correspondences
+    from calibgraph.correspondence_file import load_correspondences
     from calibgraph.files import require_place_for_folder, sha256
     from calibgraph.load import load_rig
     from calibgraph.two_pass import solve

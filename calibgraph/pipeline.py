@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from calibgraph.calibration import Calibration
 from calibgraph.config import Config, Terms
-from calibgraph.correspondences import Correspondences, load_correspondences
+from calibgraph.correspondence_file import load_correspondences
+from calibgraph.correspondences import Correspondences
 from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.files import sha256
 from calibgraph.rig import Rig, angle_deg

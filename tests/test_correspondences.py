@@ -18,6 +18,7 @@ from calibgraph import (
     load_correspondences,
     simulate_correspondences,
 )
+from calibgraph.correspondence_file import to_arrow
 from calibgraph.preprocess import constrained_error_px, preprocess, sqrt_information
 
 
@@ -119,7 +120,7 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
 
 def test_unknown_and_missing_columns_are_named(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
-    arrow = table().to_arrow()
+    arrow = to_arrow(table())
     parquet.write_table(arrow.append_column("weight", pa.array([1.0] * 4)), path)
     with pytest.raises(FileError, match="unknown column 'weight'"):
         load_correspondences(path)
@@ -130,7 +131,7 @@ def test_unknown_and_missing_columns_are_named(tmp_path: Path) -> None:
 
 def test_tables_of_another_format_or_kind_are_named(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
-    arrow = table().to_arrow()
+    arrow = to_arrow(table())
     for metadata, message in (
         (
             {"format": "calibgraph-correspondences/9"},
