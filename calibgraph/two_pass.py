@@ -60,7 +60,7 @@ def solve(
         matches = matches_by_camera(rig, kept.table, config)
     with clock("stage1"):
         stage1 = _stage1(rig, kept.table, config)
-        start = _start(rig, matches, stage1.T_camera_lidar, terms)
+        start = _start(rig, matches, stage1.T_camera_lidar, config=config, terms=terms)
     pose_graph = _pose_graph(rig, stage1.T_camera_lidar, config, terms)
     problem = Problem(tuple(rig.cameras), matches, pose_graph, terms)
     with clock("pass1"):
@@ -153,12 +153,17 @@ def _stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
 
 
 def _start(
-    rig: Rig, matches: Mapping[str, Matches], T_hat: Mapping[str, Array], terms: Terms
+    rig: Rig,
+    matches: Mapping[str, Matches],
+    T_hat: Mapping[str, Array],
+    *,
+    config: Config,
+    terms: Terms,
 ) -> Poses:
     """Where the first pass starts.
 
-    Per camera it is the better of Stage 1 and the rig's guess, by the median error of the
-    matches; with the terms ``stage1``, Stage 1 itself. Cameras
+    Per camera it is the better of Stage 1 and the rig's guess, by the errors of the matches with a
+    Cauchy loss of the PnP's threshold; with the terms ``stage1``, Stage 1 itself. Cameras
     without matches start where a relative pose puts them.
     """
     start = {}
@@ -172,8 +177,9 @@ def _start(
         candidates = [T_hat[name]] if name in T_hat else []
         if terms != "stage1":
             candidates.append(rig.cameras[name].T_camera_lidar)
-        medians = [np.median(matches[name].errors_px(T)[0]) for T in candidates]
-        start[name] = candidates[int(np.argmin(medians))]
+        errors = [matches[name].errors_px(T)[0] / config.pnp_threshold_px for T in candidates]
+        costs = [float(np.mean(np.log1p(e**2))) for e in errors]
+        start[name] = candidates[int(np.argmin(costs))]
     for _ in rig.cameras:
         for pair in rig.relative_poses:
             if pair.b in start:

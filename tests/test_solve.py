@@ -19,6 +19,7 @@ from calibgraph import (
     solve,
 )
 from calibgraph.config import TERMS
+from calibgraph.matches import robust_spread
 from tests.conftest import stereo_relative_pose
 
 CLEAN = MatcherErrors(noise_px=0.0)
@@ -258,6 +259,30 @@ def test_an_error_that_all_frames_share_is_in_the_error_bar(pair: Rig) -> None:
     for wrong in (-1.0, "much", np.inf):
         with pytest.raises(CorrespondenceError, match="systematic_translation_m"):
             solve(pair, replace(table, metadata={"systematic_translation_m": wrong}))
+
+
+def test_seven_of_ten_outliers_and_a_guess_20_deg_off_are_survived(mixed_rig: Rig) -> None:
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.7, informative_confidence=False)
+    for seed in range(3):
+        table = simulate_correspondences(mixed_rig, matches=300, errors=errors, seed=seed)
+        start = perturb(mixed_rig, rotation_deg=20, translation_m=1.5, seed=seed)
+        result = solve(start, table)
+        degrees, centimetres = worst(result.rig, mixed_rig)
+        assert degrees < 0.1
+        assert centimetres < 3
+        assert result.residuals["front"].sigma_px == pytest.approx(1.0, rel=0.1)
+        assert result.verdict.status != "PASS"  # so few inliers are worth a word
+
+
+def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:
+    rng = np.random.default_rng(0)
+    for inliers in (1.0, 0.6, 0.3):
+        core = np.hypot(*rng.standard_normal((2, 4000))) / 1.17741
+        values = np.concatenate([core, rng.uniform(0, 300, round(4000 * (1 / inliers - 1)))])
+        assert robust_spread(values) == pytest.approx(1.0, rel=0.05)
+    # Values without a core have the spread of all of them.
+    assert robust_spread(rng.uniform(0, 300, 4000)) == pytest.approx(150, rel=0.05)
+    assert robust_spread(np.zeros(10)) == 0.0
 
 
 def test_too_few_frames_give_no_error_bar(pair: Rig) -> None:
