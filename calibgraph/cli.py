@@ -6,8 +6,6 @@ WARN), 1 the calibration FAILed (its files are written, and say so), 2 bad input
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -150,7 +148,9 @@ def match(
     assert table is not None  # calibrate always keeps those of its last round
     table.save(out)
     if as_json:
-        _print_json({"out": str(out), "matches": table.counts()})
+        from calibgraph.json_output import print_json
+
+        print_json({"out": str(out), "matches": table.counts()})
     else:
         counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
         _console().print(f"{out}: {len(table)} correspondences ({counts})")
@@ -196,7 +196,9 @@ def evaluate(
 
     errors = evaluate(load_rig(estimate), load_rig(reference))
     if as_json:
-        _print_json(errors.to_mapping())
+        from calibgraph.json_output import print_json
+
+        print_json(errors.to_mapping())
     else:
         from calibgraph.tables import print_evaluation
 
@@ -322,45 +324,12 @@ def _progress() -> Iterator[Progress]:
 def _finish(result: Calibration, written: list[Path], as_json: bool) -> None:
     """Print a result and exit with the code of its verdict."""
     if as_json:
-        _print_json(_summary(result, written))
+        from calibgraph.json_output import print_json, result_summary
+
+        print_json(result_summary(result, written))
     else:
         from calibgraph.tables import print_result
 
         print_result(_console(), result, written)
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)
-
-
-def _summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
-    cameras = {}
-    for name, T in result.T_camera_lidar.items():
-        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
-        cameras[name] = {
-            "T_camera_lidar": T.tolist(),
-            "verdict": result.camera_verdicts[name].status,
-            "reasons": list(result.camera_verdicts[name].reasons),
-            "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
-            "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
-            "residuals": None if residuals is None else vars(residuals),
-            "counts": result.counts[name],
-        }
-    return {
-        "verdict": result.verdict.status,
-        "reasons": list(result.verdict.reasons),
-        "cameras": cameras,
-        "timings_s": result.timings_s,
-        "files": [str(path) for path in written],
-    }
-
-
-def _print_json(content: dict[str, Any]) -> None:
-    print(json.dumps(_finite(content), indent=2, allow_nan=False))
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers that JSON does not have by null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,47 @@
+"""What ``--json`` prints: results as plain values on stdout, for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from calibgraph.calibration import Calibration
+
+
+def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
+    """A result as plain values: degrees, centimetres and pixels, named in every key."""
+    cameras = {}
+    for name, T in result.T_camera_lidar.items():
+        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+        cameras[name] = {
+            "T_camera_lidar": T.tolist(),
+            "verdict": result.camera_verdicts[name].status,
+            "reasons": list(result.camera_verdicts[name].reasons),
+            "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
+            "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
+            "residuals": None if residuals is None else vars(residuals),
+            "counts": result.counts[name],
+        }
+    return {
+        "verdict": result.verdict.status,
+        "reasons": list(result.verdict.reasons),
+        "cameras": cameras,
+        "timings_s": result.timings_s,
+        "files": [str(path) for path in written],
+    }
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    print(json.dumps(_finite(content), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
