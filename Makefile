@@ -17,7 +17,7 @@ $(VENV)/base: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/base
-	$(INSTALL) --editable '.[test,pointcloud]'
+	$(INSTALL) --editable '.[test,pointcloud,learned]'
 	@touch $@
 
 install: $(VENV)/base ## Install into .venv

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calibgraph.calibration import Calibration
     from calibgraph.config import Config
     from calibgraph.dataset import Dataset
-    from calibgraph.pipeline import Progress
+    from calibgraph.pipeline import Matcher, Progress
 
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
@@ -43,7 +43,54 @@ RigOption = Annotated[
     Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
 ]
 MatcherOption = Annotated[
-    str, typer.Option(metavar="NAME|FILE", help="structure, or a table of correspondences.")
+    str,
+    typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
+]
+_CMRNEXT = "Matcher cmrnext"
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="FILE...",
+        help="Weights of the networks, .tar or .safetensors, in the order in which they are run; "
+        "a file may come again: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+EstimateOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="frame|joint",
+        help="What a network starts from: each frame's own pose by the network before (default), "
+        "or the joint solve over all frames and cameras.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+DeviceOption = Annotated[
+    str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.", rich_help_panel=_CMRNEXT)
+]
+IterationsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Of each network's recurrent update. [12]", rich_help_panel=_CMRNEXT),
+]
+HalfOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--half-resolution/--full-resolution",
+        help="Halve the images or not [as the weights say; else from 1400 px width on].",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+OcclusionOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--occlusion-filter",
+        help="Leave out points seen through something nearer.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+BatchOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Images at once. [1 on a CPU, 4 on a GPU]", rich_help_panel=_CMRNEXT),
 ]
 FramesOption = Annotated[
     str | None,
@@ -101,16 +148,33 @@ def calibrate(
     out: OutOption = Path("calibration"),
     seed: SeedOption = 0,
     as_json: JsonOption = False,
+    weights: WeightsOption = None,
+    estimate: EstimateOption = None,
+    device: DeviceOption = "auto",
+    iterations: IterationsOption = None,
+    half_resolution: HalfOption = None,
+    occlusion_filter: OcclusionOption = None,
+    batch: BatchOption = None,
 ) -> None:
     """From images and clouds to one calibration of all cameras, with pictures before and after."""
     from calibgraph.files import require_place_for_folder
     from calibgraph.overlay import write_overlays
-    from calibgraph.pipeline import calibrate, matcher_named
+    from calibgraph.pipeline import calibrate
 
     require_place_for_folder(out)
     with _arguments():
-        settings, chosen = _settings(config, preset, seed), matcher_named(matcher, seed=seed)
-        checked_terms = _terms(terms)
+        settings, checked_terms = _settings(config, preset, seed), _terms(terms)
+        chosen = _matcher(
+            matcher,
+            weights,
+            seed=seed,
+            device=device,
+            estimate=estimate,
+            iterations=iterations,
+            half_resolution=half_resolution,
+            occlusion_filter=occlusion_filter,
+            batch=batch,
+        )
     data = _dataset(dataset, rig, frames)
     with _progress() as progress:
         result = calibrate(
@@ -133,14 +197,31 @@ def match(
     ] = Path("correspondences.parquet"),
     seed: SeedOption = 0,
     as_json: JsonOption = False,
+    weights: WeightsOption = None,
+    estimate: EstimateOption = None,
+    device: DeviceOption = "auto",
+    iterations: IterationsOption = None,
+    half_resolution: HalfOption = None,
+    occlusion_filter: OcclusionOption = None,
+    batch: BatchOption = None,
 ) -> None:
     """Find correspondences and write them as a table, without keeping the calibration."""
-    from calibgraph.pipeline import calibrate, matcher_named
+    from calibgraph.pipeline import calibrate
 
     with _arguments():
         if out.suffix not in (".parquet", ".csv"):
             raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
-        chosen = matcher_named(matcher, seed=seed)
+        chosen = _matcher(
+            matcher,
+            weights,
+            seed=seed,
+            device=device,
+            estimate=estimate,
+            iterations=iterations,
+            half_resolution=half_resolution,
+            occlusion_filter=occlusion_filter,
+            batch=batch,
+        )
     data = _dataset(dataset, rig, frames)
     with _progress() as progress:
         result = calibrate(data, matcher=chosen, progress=progress)
@@ -235,10 +316,153 @@ def perturb(
     _console().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
 
 
+@app.command()
+def weights(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Convert to this .safetensors file.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a file of CMRNext weights, say what is in it, and convert it to safetensors."""
+    from calibgraph.cmrnext import load_checkpoint
+
+    with _arguments():
+        if out is not None and out.suffix != ".safetensors":
+            raise ValueError(f"--out {out}: the name must end in .safetensors")
+    checkpoint = load_checkpoint(file)
+    if out is not None:
+        checkpoint.save_safetensors(out)
+    if as_json:
+        from calibgraph.json_output import print_json
+
+        print_json(checkpoint.summary())
+    else:
+        from calibgraph.tables import print_weights
+
+        print_weights(_console(), checkpoint.summary(), out)
+
+
+@app.command()
+def train(
+    dataset: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DATASET...",
+            help="Folders with a trusted extrinsic: KITTI sequences, or datasets with a "
+            "reference.yaml; they may be of different rigs.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Weights to write.")],
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Folder to validate on, may come again. [the last fifth of each DATASET]",
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(metavar="RIG", help="Trusted extrinsic, instead of the folders'.")
+    ] = None,
+    rotation_deg: Annotated[
+        float, typer.Option(min=0, help="Largest perturbation per axis.")
+    ] = 20.0,
+    translation_m: Annotated[
+        float, typer.Option(min=0, help="Largest perturbation per axis.")
+    ] = 1.5,
+    steps: Annotated[int, typer.Option(min=1, help="Optimizer steps in all.")] = 100_000,
+    batch: Annotated[int, typer.Option(min=1, help="Samples per step.")] = 4,
+    width: Annotated[
+        int,
+        typer.Option(min=8, help="Channels of the first layer: 64 as published, 16 for a CPU."),
+    ] = 64,
+    fourier_levels: Annotated[int, typer.Option(help="Of the depth's encoding, -1: none.")] = 12,
+    reflectance: Annotated[
+        bool, typer.Option("--reflectance", help="Show the network the LiDAR's intensity too.")
+    ] = False,
+    context: Annotated[
+        str, typer.Option(metavar="lidar|rgb", help="What the context encoder reads.")
+    ] = "lidar",
+    iterations: Annotated[int, typer.Option(min=1, help="Of the recurrent update.")] = 12,
+    crop_px: Annotated[
+        str, typer.Option(metavar="HxW|none", help="Random crops, at full resolution.")
+    ] = "320x960",
+    half_resolution: Annotated[
+        bool, typer.Option("--half-resolution", help="Halve the images.")
+    ] = False,
+    learning_rate: Annotated[float, typer.Option(min=0, help="Peak of the one-cycle.")] = 3e-4,
+    warm_up_share: Annotated[
+        float, typer.Option(min=0.01, max=0.99, help="Of the steps, until that peak.")
+    ] = 0.4,
+    correlation_weight: Annotated[
+        float,
+        typer.Option(min=0, help="Of a loss on the correlation itself; 0.1 for short trainings."),
+    ] = 0.0,
+    correlation_steps: Annotated[
+        int, typer.Option(min=0, help="Steps at first with that loss alone.")
+    ] = 0,
+    validate_every: Annotated[
+        int, typer.Option(min=1, help="Steps; the weights are written then.")
+    ] = 500,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.")] = "auto",
+    seed: SeedOption = 0,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on where FILE stopped, with the settings in it."),
+    ] = False,
+) -> None:
+    """Train a CMRNext network by perturbing trusted extrinsics; any image and cloud will do."""
+    from calibgraph.cmrnext import TrainSettings, train
+    from calibgraph.cmrnext.training import parsed_crop, split, trusted_dataset
+    from calibgraph.load import load_rig
+    from calibgraph.tables import print_validation
+
+    with _arguments():
+        settings = TrainSettings(
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+            steps=steps,
+            batch=batch,
+            iterations=iterations,
+            learning_rate=learning_rate,
+            warm_up_share=warm_up_share,
+            correlation_weight=correlation_weight,
+            correlation_steps=correlation_steps,
+            crop_px=parsed_crop(crop_px),
+            half_resolution=half_resolution,
+            width=width,
+            fourier_levels=fourier_levels,
+            reflectance=reflectance,
+            context=context,  # type: ignore[arg-type]
+            seed=seed,
+        )
+    trusted = load_rig(rig) if rig else None
+    data = [trusted_dataset(folder, trusted) for folder in dataset]
+    if held_out:
+        others = [trusted_dataset(folder, trusted) for folder in held_out]
+    else:
+        data, others = split(data)
+    console = _console()
+    with _progress() as progress, _arguments():
+        train(
+            data,
+            others,
+            out,
+            None if resume else settings,
+            device=device,
+            validate_every=validate_every,
+            resume=resume,
+            report=lambda validation: print_validation(console, validation),
+            progress=progress,
+        )
+    console.print(f"{out}: trained", soft_wrap=True, markup=False)
+
+
 def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
+    sys.argv[1:] = list(_each_with_its_option(sys.argv[1:]))
     try:
         sys.exit(app(standalone_mode=False) or 0)
     except (CalibrationError, OSError, _UsageError) as error:
@@ -249,6 +473,23 @@ def main() -> None:
         sys.exit(2)
     except typer.Abort:
         sys.exit("calibgraph: interrupted")
+
+
+_WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
+
+
+def _each_with_its_option(arguments: list[str]) -> Iterator[str]:
+    """Spell out ``--weights a.tar b.tar`` as ``--weights a.tar --weights b.tar``."""
+    listing, before = False, ""
+    for argument in arguments:
+        if before == "--weights":
+            listing = True
+        elif listing and argument.endswith(_WEIGHTS_SUFFIXES):
+            yield "--weights"
+        else:
+            listing = False
+        yield argument
+        before = argument
 
 
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
@@ -280,6 +521,26 @@ def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Datas
     data = load_dataset(folders, load_rig(rig) if rig else None)
     with _arguments():
         return data.select(frames) if frames is not None else data
+
+
+def _matcher(name: str, weights: list[Path] | None, *, seed: int, **options: Any) -> Matcher:
+    """The matcher of that name or file; the options are those of cmrnext, None if not given.
+
+    Raises:
+        ValueError: if they do not go together.
+    """
+    given = {key: value for key, value in options.items() if value is not None}
+    if name == "cmrnext" and weights:
+        from calibgraph.cmrnext import CmrNextMatcher
+
+        return CmrNextMatcher(weights, seed=seed, **given)
+    from calibgraph.pipeline import matcher_named
+
+    chosen = matcher_named(name, seed=seed)
+    for option in ("weights", *(given.keys() - {"device"})):
+        if option != "weights" or weights:
+            raise ValueError(f"--{option.replace('_', '-')} is for --matcher cmrnext only")
+    return chosen
 
 
 def _settings(config: Path | None, preset_name: str | None, seed: int) -> Config:

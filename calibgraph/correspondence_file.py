@@ -23,8 +23,9 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 
 _COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 _INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+_WHOLE = ("stamp_ns", "point_index")
 _REQUIRED = ("camera", "frame", *_COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *_INFORMATION)
+_COLUMNS = (*_REQUIRED, "confidence", *_WHOLE, *_INFORMATION)
 
 
 def save_correspondences(table: Correspondences, path: Path) -> None:
@@ -52,8 +53,8 @@ def to_arrow(table: Correspondences) -> pa.Table:
         **dict(zip(_COORDINATES[2:], table.points_lidar_m.T, strict=True)),
         "confidence": table.confidence,
     }
-    if table.stamp_ns is not None:
-        columns["stamp_ns"] = table.stamp_ns
+    optional = {name: getattr(table, name) for name in _WHOLE}
+    columns |= {name: column for name, column in optional.items() if column is not None}
     if table.information_px is not None:
         columns |= dict(zip(_INFORMATION, table.information_px.T, strict=True))
     metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(table.metadata)}
@@ -146,7 +147,7 @@ def from_arrow(table: pa.Table) -> Correspondences:
         if "confidence" in given
         else np.ones(len(table), np.float32),
         information_px=stack(_INFORMATION) if _INFORMATION[0] in given else None,
-        stamp_ns=column("stamp_ns", np.int64) if "stamp_ns" in given else None,
+        **{name: column(name, np.int64) for name in _WHOLE if name in given},
         metadata=metadata,
     )
 

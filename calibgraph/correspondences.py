@@ -34,6 +34,7 @@ class Correspondences:
             [1/px^2], positive semidefinite; it may have rank one (an edge constrains only its
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
+        point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
         metadata: where the table comes from: the matcher and its settings.
 
     Raises:
@@ -48,6 +49,7 @@ class Correspondences:
     confidence: NDArray[np.float32]
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
+    point_index: NDArray[np.int64] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,6 +79,7 @@ class Correspondences:
         confidence: ArrayLike | None = None,
         information_px: ArrayLike | None = None,
         stamp_ns: ArrayLike | None = None,
+        point_index: ArrayLike | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> Correspondences:
         """Build a table from arrays; ``camera`` and ``frame`` may be one value for all rows.
@@ -86,7 +89,8 @@ class Correspondences:
         """
         pixels = np.atleast_2d(np.asarray(pixels_px, dtype=np.float64))
         n = len(pixels)
-        for name, numbers in (("frame", frame), ("stamp_ns", stamp_ns)):
+        whole = {"frame": frame, "stamp_ns": stamp_ns, "point_index": point_index}
+        for name, numbers in whole.items():
             if numbers is not None and n and np.asarray(numbers).dtype.kind not in "iu":
                 raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
         names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
@@ -100,6 +104,7 @@ class Correspondences:
             confidence=np.asarray(given, dtype=np.float32),
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
+            point_index=_optional(point_index, np.int64),
             metadata=metadata or {},
         )
 
@@ -184,7 +189,7 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1,
+    "information_px": 3, "stamp_ns": 1, "point_index": 1,
 }  # fmt: skip
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
 
@@ -213,8 +218,10 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     )  # fmt: skip
     if any(table.information_px is not None for table in tables):
         columns["information_px"] = np.concatenate([_information(t) for t in tables])
-    if all(table.stamp_ns is not None for table in tables):
-        columns["stamp_ns"] = np.concatenate([t.stamp_ns for t in tables if t.stamp_ns is not None])
+    for name in ("stamp_ns", "point_index"):
+        given = [getattr(table, name) for table in tables]
+        if all(column is not None for column in given):
+            columns[name] = np.concatenate(given)
     return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
 
 

@@ -18,7 +18,7 @@ from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.files import sha256
 from calibgraph.rig import Rig, angle_deg
 from calibgraph.two_pass import Clock, solve
-from calibgraph.verdict import rig_verdict, with_matching
+from calibgraph.verdict import Matching, rig_verdict, with_matching
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -28,8 +28,11 @@ Progress = Callable[[str, int, int], None]
 class Matcher(Protocol):
     """What finds correspondences. It may want several rounds, each from a better estimate.
 
-    If the metadata of its tables has ``contrast``, a number per camera that says by how many chance
-    spreads the matches' agreement stands out, the verdict heeds it.
+    The verdict heeds what the metadata of its tables says, each a mapping of camera names:
+    ``contrast``: by how many chance spreads the matches' agreement stands out;
+    ``start_dependence``: which share of a displaced start remains in the matches (0 to 1);
+    ``recall``: which share of the way back it finds without the image (0 to 1);
+    ``failed_frames``: the names of frames that it left out.
 
     Attributes:
         rounds: how many rounds it wants.
@@ -118,7 +121,13 @@ def calibrate(
     with clock("hash_inputs"):
         inputs = _input_hashes(data)
     return replace(
-        _judged_by_matching(result, rounds, table, repeated=_repeated_frame(data, inputs)),
+        _judged_by_matching(
+            result,
+            rounds,
+            table,
+            frames=len(data.frames),
+            repeated=_repeated_frame(data, inputs),
+        ),
         initial_rig=initial,
         correspondences=table,
         rounds=tuple(rounds),
@@ -148,9 +157,14 @@ def matcher_named(matcher: Matcher | Correspondences | Path | str, *, seed: int 
         return StructureMatcher(seed=seed)
     if Path(matcher).suffix in (".parquet", ".csv"):
         return Precomputed(load_correspondences(matcher))
+    if str(matcher) == "cmrnext":
+        raise ValueError(
+            "the matcher 'cmrnext' needs weights: --weights iter1.tar iter5.tar iter6.tar, or "
+            "calibgraph.cmrnext.CmrNextMatcher([...])"
+        )
     raise ValueError(
-        f"unknown matcher {str(matcher)!r}; known are 'structure' and a table of correspondences "
-        "(.parquet or .csv)"
+        f"unknown matcher {str(matcher)!r}; known are 'structure', 'cmrnext' and a table of "
+        "correspondences (.parquet or .csv)"
     )
 
 
@@ -173,17 +187,23 @@ def _judged_by_matching(
     rounds: Sequence[dict[str, Any]],
     table: Correspondences,
     *,
+    frames: int,
     repeated: str | None,
 ) -> Calibration:
     """The result with a verdict that knows how the matching went, not only the last solve."""
-    contrasts = table.metadata.get("contrast") or {}
+    said = table.metadata
     verdicts = {
         name: with_matching(
             verdict,
-            moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
-            moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
-            contrast=contrasts.get(name),
-            repeated=repeated,
+            Matching(
+                moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
+                moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
+                contrast=(said.get("contrast") or {}).get(name),
+                start_dependence=(said.get("start_dependence") or {}).get(name),
+                recall=(said.get("recall") or {}).get(name),
+                failed_share=len((said.get("failed_frames") or {}).get(name, ())) / frames,
+                repeated=repeated,
+            ),
         )
         for name, verdict in result.camera_verdicts.items()
     }

@@ -24,6 +24,8 @@ _REFINEMENTS = 2
 _RANSAC_ITERATIONS = 2000
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _MIN_INLIER_SHARE = 0.1
+_STRAY = 6.0  # median distances from the median: farther frames do not count
+_STRAY_RAD, _STRAY_M = np.radians(0.05), 0.01  # nearer ones always do
 _MIN_SCALED_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
@@ -33,8 +35,8 @@ class Stage1:
 
     Attributes:
         T_camera_lidar: per camera with at least one solved frame, (4, 4): T_hat of the paper.
-        per_frame: per camera, (f, 4, 4) the poses of its solved frames.
-        failed_frames: per camera, how many frames gave no pose.
+        per_frame: per camera, (f, 4, 4) the poses of its frames that did not fail.
+        failed_frames: per camera, how many frames gave no pose, or one far from all others.
     """
 
     T_camera_lidar: dict[str, Array]
@@ -55,18 +57,41 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
         for name, camera in rig.cameras.items():
             rows = table.of_camera(name)
             frames = [rows.select(rows.frame == frame) for frame in np.unique(rows.frame)]
-            starts = list(pool.map(lambda f, c=camera: _ransac_pnp(c, f, config), frames))
-            solved = [
-                pose
-                for frame, start in zip(frames, starts, strict=True)
-                if start is not None
-                if (pose := _refine(camera, frame, start, config)) is not None
-            ]
-            per_frame[name] = np.array(solved).reshape(-1, 4, 4)
-            failed[name] = len(frames) - len(solved)
-            if solved:
+            poses = pool.map(lambda f, c=camera: frame_pose(c, f, config), frames)
+            solved = np.array([p for p in poses if p is not None]).reshape(-1, 4, 4)
+            per_frame[name] = solved[agreeing(solved)]
+            failed[name] = len(frames) - len(per_frame[name])
+            if len(solved):
                 estimates[name] = aggregate(per_frame[name], config.aggregate)
     return Stage1(estimates, per_frame, failed)
+
+
+def frame_pose(camera: Camera, matches: Correspondences, config: Config) -> Array | None:
+    """(4, 4) T_camera_lidar from one camera's matches in one frame, None if they give none.
+
+    MAGSAC on the undistorted plane, then inliers re-selected and refined with the full lens model.
+    No pose, if too few matches agree on one, or if they leave a direction free.
+    """
+    start = _ransac_pnp(camera, matches, config)
+    return None if start is None else _refine(camera, matches, start, config)
+
+
+def agreeing(poses: Array) -> NDArray[np.bool_]:
+    """Which of (f, 4, 4) poses are not far from all others, judged by the poses alone.
+
+    Far is more than 6 times the median distance from their median, in rotation or translation;
+    up to 0.05 degrees and 1 cm never are. Fewer than 3 poses cannot be judged.
+    """
+    if len(poses) < 3:  # noqa: PLR2004
+        return np.ones(len(poses), dtype=np.bool_)
+    rotations, translations = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    angles = (rotations * geodesic_median(rotations).inv()).magnitude()
+    lengths = np.linalg.norm(translations - np.median(translations, axis=0), axis=1)
+    near = [
+        distances <= max(least, _STRAY * float(np.median(distances)))
+        for distances, least in ((angles, _STRAY_RAD), (lengths, _STRAY_M))
+    ]
+    return np.asarray(near[0] & near[1])
 
 
 def normalized(camera: Camera, pixels_px: Array) -> Array:

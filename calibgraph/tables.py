@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE
 from rich.console import Console
@@ -11,6 +13,9 @@ from rich.table import Table
 
 from calibgraph.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.metrics import Evaluation, PoseError, pose_error
+
+if TYPE_CHECKING:
+    from calibgraph.cmrnext.training import Validation
 
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
@@ -34,6 +39,30 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
         console.print(f"  {path}", highlight=False, soft_wrap=True, markup=False)
+
+
+def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:
+    """Print what a file of weights holds."""
+    console.print(f"{summary['file']}: CMRNext, {summary['parameters']} parameters", markup=False,
+                  soft_wrap=True, highlight=False)  # fmt: skip
+    network = ", ".join(f"{key} {value}" for key, value in summary["network"].items())
+    config = ", ".join(f"{key} {value}" for key, value in summary["config"].items())
+    for line in (f"sha256 {summary['sha256']}", f"network: {network}", f"config: {config}"):
+        console.print(f"  {line}", markup=False, soft_wrap=True, highlight=False)
+    if converted is not None:
+        console.print(f"{converted}: written", markup=False, soft_wrap=True, highlight=False)
+
+
+def print_validation(console: Console, validation: Validation) -> None:
+    """Print how a network in training does on frames held out."""
+    v = validation
+    console.print(
+        f"step {v.step}: loss {v.train_loss:.4g}; held out: flow error {v.epe_px:.2f} px (median "
+        f"{v.median_px:.2f}) of {v.zero_px:.2f}; pose of a frame {v.pose_deg:.3f} deg "
+        f"{v.pose_cm:.1f} cm of {v.start_deg:.3f} deg {v.start_cm:.1f} cm (medians; "
+        f"{v.failed_share:.0%} failed)",
+        markup=False, soft_wrap=True, highlight=False,
+    )  # fmt: skip
 
 
 def result_table(result: Calibration) -> Table:

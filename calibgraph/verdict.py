@@ -46,6 +46,12 @@ CONTRAST_WARN, CONTRAST_FAIL = 15.0, 8.0
 """How many chance spreads a matcher's agreement must stand out by. On recorded data wrong results
 (over 0.3 deg) had up to 13, right ones from 9 on."""
 
+START_WARN, START_FAIL = 0.25, 0.5
+RECALL_WARN, RECALL_FAIL = 0.3, 0.6
+FAILED_WARN, FAILED_FAIL = 0.3, 0.7
+"""What a learned matcher may leave of a displaced start, what it may undo of it without the image,
+and which share of the frames may fail."""
+
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
 
 
@@ -149,32 +155,41 @@ def worst_of(checks: Iterable[tuple[Status, str]]) -> Verdict:
     return Verdict(status, tuple(reason for _, reason in failed))
 
 
-def with_matching(
-    verdict: Verdict,
-    *,
-    moved_deg: float,
-    moved_cm: float,
-    contrast: float | None,
-    repeated: str | None,
-) -> Verdict:
-    """A camera's verdict with what its matcher knows.
+@dataclass(frozen=True)
+class Matching:
+    """What is known of one camera from its matching.
 
-    Args:
-        verdict: of the last solve.
+    Attributes:
         moved_deg: how far the last of several rounds turned the camera.
         moved_cm: how far it shifted it.
-        repeated: that frames repeat each other, if they do.
         contrast: how far the matches' agreement stands out from chance, if the matcher says.
+        start_dependence: share of a displaced start that remains in the matches, if it says.
+        recall: share of the way back that it finds without the image, if it says.
+        failed_share: of the frames.
+        repeated: that frames repeat each other, if they do.
     """
+
+    moved_deg: float = 0.0
+    moved_cm: float = 0.0
+    contrast: float | None = None
+    start_dependence: float | None = None
+    recall: float | None = None
+    failed_share: float = 0.0
+    repeated: str | None = None
+
+
+def with_matching(verdict: Verdict, matching: Matching) -> Verdict:
+    """A camera's verdict, given that of the last solve, with what its matcher knows."""
     what = "matching again still moves it:"
     checks: list[tuple[Status, str]] = [
         *((verdict.status, reason) for reason in verdict.reasons),
-        _above(what, moved_deg, MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
-        _above(what, moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
+        _above(what, matching.moved_deg, MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
+        _above(what, matching.moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
+        *_shares_checks(matching),
     ]
-    if repeated is not None:
-        checks.append(("WARN", f"{repeated}: counted as if independent; remove one"))
-    if contrast is not None:
+    if matching.repeated is not None:
+        checks.append(("WARN", f"{matching.repeated}: counted as if independent; remove one"))
+    if (contrast := matching.contrast) is not None:
         weak, failed = not contrast >= CONTRAST_WARN, not contrast >= CONTRAST_FAIL  # NaN fails
         limit = CONTRAST_FAIL if failed else CONTRAST_WARN
         text = (
@@ -184,6 +199,23 @@ def with_matching(
         )
         checks.append((_grade(weak, failed), text))
     return worst_of(checks)
+
+
+def _shares_checks(matching: Matching) -> list[tuple[Status, str]]:
+    """What a learned matcher does with its start, without its image, and with its frames."""
+    limits = (
+        (matching.start_dependence, START_WARN, START_FAIL,
+         "of a displaced start remains in the matches: the network does not measure here"),
+        (matching.recall, RECALL_WARN, RECALL_FAIL,
+         "of a displaced start is undone even without the image: the network knows its training's "
+         "rig by heart and pulls towards it"),
+        (matching.failed_share, FAILED_WARN, FAILED_FAIL, "of the frames failed to be matched"),
+    )  # fmt: skip
+    return [
+        (_grade(not share <= warn, not share <= fail), f"{share:.0%} {text}")  # NaN fails
+        for share, warn, fail, text in limits
+        if share is not None
+    ]
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Intrinsics, RelativePose, Rig
+from calibgraph import Camera, Intrinsics, RelativePose, Rig, cli
+
+Call = Callable[..., tuple[int, str, str]]
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample"
@@ -54,6 +58,21 @@ def stereo_relative_pose(rig: Rig, a: str = "left", b: str = "right") -> Relativ
 
 
 @pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """Run the command line in this process: exit code, stdout, stderr."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            cli.main()
+            raise SystemExit(0)
+        captured = capsys.readouterr()
+        return int(exit_.value.code or 0), captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
 def pair() -> Rig:
     """Two cameras side by side, without distortion."""
     return Rig(
@@ -83,3 +102,13 @@ def realdata() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real data at {path}; set CALIBGRAPH_REALDATA to run this")
     return path
+
+
+@pytest.fixture(scope="session")
+def reference_folder() -> Path:
+    """Test vectors of the original network."""
+    default = ROOT.parent / "shared" / "reference"
+    folder = Path(os.environ.get("CALIBGRAPH_REFERENCE", default))
+    if not (folder / "cmrnext_golden.npz").is_file():
+        pytest.skip("the original network's test vectors are not here ($CALIBGRAPH_REFERENCE)")
+    return folder

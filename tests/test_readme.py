@@ -5,24 +5,54 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import calibgraph
-from tests.conftest import ROOT
+from tests.conftest import ROOT, SAMPLE
 
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_python_example_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+def test_the_python_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    first, own_matcher = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    exec(compile(code, "README.md", "exec"), names)
+    names: dict[str, object] = {"your_matches": true_matches}
+    exec(compile(first, "README.md", "exec"), names)
     result = names["result"]
     assert isinstance(result, calibgraph.Calibration)
     assert result.verdict.status == "PASS"
     assert (tmp_path / "out" / "python" / "calibration.yaml").is_file()
+    exec(compile(own_matcher, "README.md", "exec"), names)
+    table = calibgraph.load_correspondences(tmp_path / "matches.parquet")
+    assert table.point_index is not None and len(np.unique(table.frame)) == 6
+    result = names["result"]
+    assert isinstance(result, calibgraph.Calibration)
+    for error in calibgraph.evaluate(result.rig, TRUTH).cameras.values():
+        assert error.rotation_error_deg < 0.1
+
+
+TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+def true_matches(
+    image: np.ndarray, cloud: np.ndarray, camera: calibgraph.Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A matcher that knows the truth up to half a pixel."""
+    (name,) = [
+        n
+        for n, c in calibgraph.load_rig(SAMPLE).cameras.items()
+        if np.array_equal(c.T_camera_lidar, camera.T_camera_lidar)
+    ]
+    T = TRUTH.T_camera_lidar[name]
+    rng = np.random.default_rng(len(cloud))
+    rows = rng.permutation(len(cloud))[:3000]
+    points = cloud[rows, :3].astype(np.float64)
+    pixels, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+    seen = valid & camera.in_image(pixels)
+    noisy = pixels[seen] + rng.normal(0, 0.5, (np.count_nonzero(seen), 2))
+    return noisy, rows[seen], np.ones(len(noisy))
 
 
 def test_the_rig_example_is_a_rig(tmp_path: Path) -> None:
