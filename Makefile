@@ -39,8 +39,9 @@ lint: type ## Check style and types
 type: $(VENV)/test ## Check types
 	$(BIN)/mypy
 
-bench: $(VENV)/test ## Measure the solve against other ways
+bench: $(VENV)/test ## Measure the solve and the network against other ways
 	$(BIN)/python benchmarks/solve.py
+	$(BIN)/python benchmarks/cmrnext.py
 
 clean: ## Remove everything that was made
 	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -364,6 +364,12 @@ def train(
     rig: Annotated[
         Path | None, typer.Option(metavar="RIG", help="Trusted extrinsic, instead of the folders'.")
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", metavar="FILE", help="Fine-tune these weights; the network is theirs."
+        ),
+    ] = None,
     rotation_deg: Annotated[
         float, typer.Option(min=0, help="Largest perturbation per axis.")
     ] = 20.0,
@@ -413,7 +419,8 @@ def train(
 ) -> None:
     """Train a CMRNext network by perturbing trusted extrinsics; any image and cloud will do."""
     from calibgraph.cmrnext import TrainSettings, train
-    from calibgraph.cmrnext.training import parsed_crop, split, trusted_dataset
+    from calibgraph.cmrnext.train_settings import parsed_crop
+    from calibgraph.cmrnext.trusted import split, trusted_dataset
     from calibgraph.load import load_rig
     from calibgraph.tables import print_validation
 
@@ -451,6 +458,7 @@ def train(
             None if resume else settings,
             device=device,
             validate_every=validate_every,
+            start=start,
             resume=resume,
             report=lambda validation: print_validation(console, validation),
             progress=progress,

@@ -15,7 +15,7 @@ from calibgraph.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.metrics import Evaluation, PoseError, pose_error
 
 if TYPE_CHECKING:
-    from calibgraph.cmrnext.training import Validation
+    from calibgraph.cmrnext.validation import Validation
 
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 

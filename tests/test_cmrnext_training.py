@@ -15,9 +15,13 @@ from calibgraph import DatasetError, FileError, load_rig
 from calibgraph.cmrnext import TrainSettings, load_checkpoint, train
 from calibgraph.cmrnext.inputs import View
 from calibgraph.cmrnext.samples import Scene, _mirrored, _turned, make_sample, perturbation
-from calibgraph.cmrnext.training import one_cycle, parsed_crop, split, trusted_dataset
+from calibgraph.cmrnext.train_settings import parsed_crop
+from calibgraph.cmrnext.training import one_cycle
+from calibgraph.cmrnext.trusted import split, trusted_dataset
+from calibgraph.cmrnext.variant import Variant
 from calibgraph.dataset import Dataset
 from tests.conftest import SAMPLE, Call
+from tests.test_cmrnext_checkpoint import good_content, saved
 
 TINY = TrainSettings(
     rotation_deg=1.0,
@@ -152,6 +156,29 @@ def test_the_checkpoint_says_what_it_was_trained_for(
     assert 0.3 < validation.start_deg < np.sqrt(3)
     assert 1.0 < validation.zero_px < 30.0  # 1 deg is 10 px
     assert not list(tmp_path.glob(".writing-*"))
+
+
+def test_fine_tuning_starts_from_given_weights(
+    parts: tuple[Dataset, Dataset], tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first.tar", tmp_path / "second.tar"
+    train([parts[0]], [parts[1]], first, replace(TINY, steps=1, fourier_levels=3))
+    gentle = replace(TINY, steps=1, learning_rate=1e-12)
+    train([parts[0]], [parts[1]], second, gentle, start=first)
+    before, after = load_checkpoint(first), load_checkpoint(second)
+    assert after.variant == before.variant
+    weights = [name for name in before.state if name.endswith("weight")]
+    for name in weights:  # with no learning rate to speak of, they are the same
+        torch.testing.assert_close(after.state[name], before.state[name], atol=1e-6, rtol=0)
+    sigmas = saved(tmp_path / "nll.tar", nll_content())
+    with pytest.raises(FileError, match="uncertainty head"):
+        train([parts[0]], [parts[1]], tmp_path / "third.tar", TINY, start=sigmas)
+
+
+def nll_content() -> dict[str, object]:
+    content = good_content(Variant(width=8, uncertainty="nll"))
+    content["config"]["uncertainty"] = True
+    return content
 
 
 def test_encoders_learn_to_find_each_other(trusted: Dataset, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ except ModuleNotFoundError as error:
 
 from calibgraph.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.cmrnext.matcher import CmrNextMatcher
-from calibgraph.cmrnext.training import TrainSettings, Validation, train
+from calibgraph.cmrnext.train_settings import TrainSettings
+from calibgraph.cmrnext.training import train
+from calibgraph.cmrnext.validation import Validation
 
 __all__ = [
     "Checkpoint",
