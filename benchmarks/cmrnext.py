@@ -1,7 +1,7 @@
 """One pass of a CMRNext network: seconds and peak memory, beside the plainest way to compute it.
 
 Each measurement runs in a process of its own, so that its peak memory is its own. The plainest way
-is the tests' rendering of the description: correlation by `grid_sample`, nothing computed once only.
+is the tests' rendering of the description: correlation by `grid_sample`, nothing kept.
 
     python benchmarks/cmrnext.py [--full]      # --full: also 1216x1920, a minute
 """

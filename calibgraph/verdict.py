@@ -5,6 +5,7 @@ The thresholds are in the units of the error that a user would suffer, and the s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -212,7 +213,10 @@ def _shares_checks(matching: Matching) -> list[tuple[Status, str]]:
         (matching.failed_share, FAILED_WARN, FAILED_FAIL, "of the frames failed to be matched"),
     )  # fmt: skip
     return [
-        (_grade(not share <= warn, not share <= fail), f"{share:.0%} {text}")  # NaN fails
+        (
+            _grade(not share <= warn, not share <= fail),  # NaN fails
+            f"an unknown share {text}" if math.isnan(share) else f"{share:.0%} {text}",
+        )
         for share, warn, fail, text in limits
         if share is not None
     ]

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import calibgraph
-from calibgraph import Camera, Dataset, DatasetError, evaluate, load_dataset, load_rig, perturb
+from calibgraph import (
+    Camera,
+    Dataset,
+    DatasetError,
+    Verdict,
+    evaluate,
+    load_dataset,
+    load_rig,
+    perturb,
+)
 from calibgraph.cmrnext import CmrNextMatcher, confidence, probe
 from calibgraph.cmrnext.inputs import (
     LidarImage,
@@ -25,6 +34,7 @@ from calibgraph.cmrnext.inputs import (
 )
 from calibgraph.cmrnext.network import CmrNext, Flow
 from calibgraph.cmrnext.variant import Variant
+from calibgraph.verdict import Matching, with_matching
 from tests.conftest import KANNALA, RADTAN5, SAMPLE, Call, make_camera
 from tests.test_cmrnext_checkpoint import good_content, saved
 
@@ -375,6 +385,27 @@ def test_the_probe_tells_measuring_from_following() -> None:
         found = probe.remaining_share(camera, one, (T_two, table(T_two, share)))
         # Slope of 4000 values with noise sqrt(2) over motions of about 10 px: sigma 2e-3.
         assert found == pytest.approx(share, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("matching", "status"),
+    [
+        (Matching(), "PASS"),
+        (Matching(start_dependence=0.1, recall=0.1, failed_share=0.1), "PASS"),
+        (Matching(start_dependence=0.3), "WARN"),
+        (Matching(start_dependence=0.9), "FAIL"),
+        (Matching(start_dependence=float("nan")), "FAIL"),
+        (Matching(recall=0.4), "WARN"),
+        (Matching(recall=1.0), "FAIL"),
+        (Matching(recall=-0.5), "PASS"),
+        (Matching(failed_share=0.5), "WARN"),
+        (Matching(failed_share=1.0), "FAIL"),
+    ],
+)
+def test_the_verdict_heeds_the_matcher(matching: Matching, status: str) -> None:
+    verdict = with_matching(Verdict("PASS", ()), matching)
+    assert verdict.status == status
+    assert len(verdict.reasons) == (status != "PASS")
 
 
 def test_perturbed_starts_are_matched_like_others(sample: Dataset, weights: Path) -> None:

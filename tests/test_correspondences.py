@@ -39,13 +39,14 @@ def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
     given = table(
         information_px=[[1, 0, 1], [2, 0.5, 1], [1, 1, 1], [4, 0, 0]],
         stamp_ns=[1, 2, 2, 1_700_000_000_123_456_789],
+        point_index=[7, -1, 0, 2**40],
         metadata={"matcher": "by hand", "settings": {"k": 1}},
     )
     path = tmp_path / f"table{suffix}"
     given.save(path)
     read = load_correspondences(path)
     assert [read.cameras[i] for i in read.camera_index] == ["left", "left", "right", "left"]
-    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns"):
+    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns", "point_index"):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
     np.testing.assert_array_equal(read.information_px, given.information_px)
     if suffix == ".parquet":

@@ -8,6 +8,9 @@ import pytest
 
 import calibgraph
 from calibgraph import Calibration, Rig
+from calibgraph.cmrnext.variant import Variant
+from tests.conftest import Call
+from tests.test_cmrnext_checkpoint import good_content, saved
 
 pytestmark = pytest.mark.realdata
 
@@ -53,3 +56,18 @@ def test_other_rigs_and_sensors_improve_in_rotation(realdata: Path, name: str) -
     for camera, error in calibgraph.evaluate(result.rig, reference).cameras.items():
         assert error.rotation_error_deg < 1.0, camera
     assert result.verdict.status != "PASS"  # 3 frames, or 8 of one spot with 16 beams
+
+
+def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, call: Call) -> None:
+    """Their matches agree with each other and with the guess; the verdict is FAIL all the same."""
+    weights = saved(tmp_path / "random.tar", good_content(Variant(width=16)))
+    (folder,) = sequences(realdata, "07")
+    for estimate in ("frame", "joint"):
+        code, _, text = call(
+            "calibrate", folder, "--frames", "0,1", "--matcher", "cmrnext",
+            "--weights", weights, weights, "--estimate", estimate, "--half-resolution",
+            "--out", tmp_path / estimate,
+        )  # fmt: skip
+        assert code == 1
+        assert "of a displaced start remains" in text
+        assert (tmp_path / estimate / "calibration.yaml").is_file()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,6 +17,7 @@ from calibgraph import (
 )
 from calibgraph.stage1 import (
     aggregate,
+    agreeing,
     estimate_stage1,
     geodesic_median,
     half_sample_mode,
@@ -116,3 +119,27 @@ def test_the_half_sample_mode_is_where_samples_are_densest() -> None:
 def test_unknown_aggregates_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown aggregate"):
         aggregate(np.eye(4)[None], "best")
+
+
+def test_stray_frames_are_recognised_without_a_reference() -> None:
+    rng = np.random.default_rng(7)
+    good, bad = poses(rng, 20, 0.01), poses(rng, 5, 0.5)
+    both = np.concatenate([good, bad])
+    kept = agreeing(both)
+    # A Gaussian vector in 3 dimensions lies within 6 medians (9 sigma) of its centre.
+    assert kept[:20].all() and not kept[20:].any()
+    np.testing.assert_allclose(aggregate(both[kept], "mean"), aggregate(good, "mean"))
+    assert agreeing(np.tile(np.eye(4), (4, 1, 1))).all()
+    assert agreeing(bad[:2]).all()  # of two, none can be said to be the wrong one
+
+
+def test_stray_frames_count_as_failed(pair: Rig) -> None:
+    """One of ten frames has the matches of a camera half a metre away."""
+    wrong = pair.cameras["left"].T_camera_lidar.copy()
+    wrong[0, 3] += 0.5
+    good = simulate_correspondences(pair, frames=9, matches=200)
+    bad = simulate_correspondences(pair.moved_to({"left": wrong}), frames=1, matches=200)
+    table = concatenate([good, replace(bad, frame=bad.frame + 9)])
+    stage1 = estimate_stage1(pair, table, Config())
+    assert stage1.failed_frames == {"left": 1, "right": 0}
+    assert len(stage1.per_frame["left"]) == 9

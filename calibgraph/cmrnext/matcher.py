@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -164,7 +164,8 @@ class CmrNextMatcher:
         probed = _spread_out([frame.index for frame in dataset.frames], _PROBED_FRAMES)
         done = 0
         for jobs in self._batches(dataset, rig):
-            progress("matching", round_index * total + done, self.rounds * total)
+            what = f"round {round_index + 1} of {self.rounds}: {jobs[0].frame.name}"
+            progress(what, round_index * total + done, self.rounds * total)
             results = self._chain(jobs, schedule)
             if round_index == self.rounds - 1:
                 results = [self._probed(each, schedule[-1]) if each.job.frame.index in probed
@@ -173,16 +174,7 @@ class CmrNextMatcher:
                 found[each.job.name].append(each)
             done += len(jobs)
         tables = [each.matches for all_ in found.values() for each in _not_failed(all_)]
-        failed = {
-            name: [each.job.frame.name for each in all_ if each.failed]
-            for name, all_ in found.items()
-        }
-        probes = {
-            key: {name: value for name, all_ in found.items()
-                  if (value := _median([getattr(each, key) for each in all_])) is not None}
-            for key in ("start_dependence", "recall")
-        }  # fmt: skip
-        metadata = self._metadata(schedule, round_index) | {"failed_frames": failed} | probes
+        metadata = self._metadata(schedule, round_index) | _findings(found)
         return replace(concatenate(tables), metadata=metadata)
 
     def _chain(self, jobs: list[_Job], schedule: Sequence[_Network]) -> list[_Found]:
@@ -257,9 +249,8 @@ class CmrNextMatcher:
         """Jobs of equal image size, frame by frame, loaded when they are asked for."""
         views = {name: View(camera, crop_even=True) for name, camera in rig.cameras.items()}
 
-        def size(name: str) -> tuple[int, int, bool]:
-            halved = self.networks[0].halves(rig.cameras[name], self.half_resolution)
-            return views[name].height, views[name].width, halved
+        def size(name: str) -> tuple[int, int]:
+            return views[name].height, views[name].width
 
         for _, group in groupby(sorted(rig.cameras, key=size), key=size):
             names = list(group)
@@ -308,9 +299,25 @@ def _spread_out(values: Sequence[int], most: int) -> set[int]:
     return {values[place] for place in places}
 
 
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None and np.isfinite(value)]
-    return float(np.median(known)) if known else None
+def _findings(found: Mapping[str, Sequence[_Found]]) -> dict[str, Any]:
+    """What the verdict heeds, per camera: failed frames, and in the last round the probes."""
+    findings: dict[str, Any] = {
+        "failed_frames": {
+            name: [each.job.frame.name for each in all_ if each.failed]
+            for name, all_ in found.items()
+        }
+    }
+    for key in ("start_dependence", "recall"):
+        values = {name: [getattr(each, key) for each in all_] for name, all_ in found.items()}
+        measured = {name: [v for v in all_ if v is not None] for name, all_ in values.items()}
+        findings[key] = {name: _finite_median(all_) for name, all_ in measured.items() if all_}
+    return findings
+
+
+def _finite_median(values: Sequence[float]) -> float:
+    """Median of those that could be measured; NaN if none could."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float("nan")
 
 
 def _not_failed(found: list[_Found]) -> list[_Found]:
