@@ -206,8 +206,10 @@ def match(
     batch: BatchOption = None,
 ) -> None:
     """Find correspondences and write them as a table, without keeping the calibration."""
+    from calibgraph.files import require_place_for_file
     from calibgraph.pipeline import calibrate
 
+    require_place_for_file(out)
     with _arguments():
         if out.suffix not in (".parquet", ".csv"):
             raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
@@ -425,7 +427,7 @@ def train(
     from calibgraph.tables import print_validation
 
     with _arguments():
-        settings = TrainSettings(
+        settings = TrainSettings().changed(
             rotation_deg=rotation_deg,
             translation_m=translation_m,
             steps=steps,
@@ -440,7 +442,7 @@ def train(
             width=width,
             fourier_levels=fourier_levels,
             reflectance=reflectance,
-            context=context,  # type: ignore[arg-type]
+            context=context,
             seed=seed,
         )
     trusted = load_rig(rig) if rig else None
@@ -490,9 +492,9 @@ def _each_with_its_option(arguments: list[str]) -> Iterator[str]:
     """Spell out ``--weights a.tar b.tar`` as ``--weights a.tar --weights b.tar``."""
     listing, before = False, ""
     for argument in arguments:
-        if before == "--weights":
+        if before == "--weights" or argument.startswith("--weights="):
             listing = True
-        elif listing and argument.endswith(_WEIGHTS_SUFFIXES):
+        elif listing and argument.lower().endswith(_WEIGHTS_SUFFIXES):
             yield "--weights"
         else:
             listing = False

@@ -16,6 +16,7 @@ from calibgraph.errors import CorrespondenceError
 Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: nothing that is matched lies farther
+_MAX_WHOLE = 2**63 - 1
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e12  # 1/px^2
 
 
@@ -93,6 +94,8 @@ class Correspondences:
         for name, numbers in whole.items():
             if numbers is not None and n and np.asarray(numbers).dtype.kind not in "iu":
                 raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
+            if numbers is not None and n and np.asarray(numbers).max() > _MAX_WHOLE:
+                raise CorrespondenceError(f"{name} holds a number beyond 64 bits")
         names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
         given = np.ones(n) if confidence is None else confidence
         return Correspondences(
@@ -164,6 +167,8 @@ class Correspondences:
             self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
+        if self.point_index is not None:
+            self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
         if self.information_px is not None:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
@@ -219,8 +224,8 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     if any(table.information_px is not None for table in tables):
         columns["information_px"] = np.concatenate([_information(t) for t in tables])
     for name in ("stamp_ns", "point_index"):
-        given = [getattr(table, name) for table in tables]
-        if all(column is not None for column in given):
+        given = [getattr(table, name) for table in tables if len(table)]
+        if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
     return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
 

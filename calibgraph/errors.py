@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+MAX_MESSAGE = 2000
+"""Characters of a message; what a file says of itself may be longer."""
+
 
 class CalibrationError(Exception):
     """Data that cannot be calibrated. ``camera`` and ``frame`` say where, when that is known."""
@@ -14,9 +17,17 @@ class CalibrationError(Exception):
     def __init__(
         self, message: str, *, camera: str | None = None, frame: str | int | None = None
     ) -> None:
-        super().__init__(" ".join(message.split()))
+        super().__init__(_one_line(message))
         self.camera = camera
         self.frame = frame
+
+
+def _one_line(message: str) -> str:
+    """The message without line breaks and control characters, and of a readable length."""
+    text = " ".join(message.split())
+    if len(text) > MAX_MESSAGE:
+        text = f"{text[:MAX_MESSAGE]}..."
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 class FileError(CalibrationError):

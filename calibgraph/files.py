@@ -26,9 +26,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
     A crash leaves the old file or the new one, never half of one.
     """
-    if path.is_dir():
-        raise FileError(path, "is a folder, expected the name of a file to write")
-    require_place_for_folder(path.parent)
+    require_place_for_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
     os.close(handle)
@@ -44,6 +42,21 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_place_for_file(path: Path) -> None:
+    """Check, before hours of work, that a file can be written.
+
+    Raises:
+        FileError: if a folder has its name, a file that of a folder above it, or the folder is not
+            to be written to.
+    """
+    if path.is_dir():
+        raise FileError(path, "is a folder, expected the name of a file to write")
+    require_place_for_folder(path.parent)
+    there = next(part for part in (path.parent, *path.parent.parents) if part.exists())
+    if not os.access(there, os.W_OK):
+        raise FileError(there, "may not be written to; choose another folder")
 
 
 def require_place_for_folder(folder: Path) -> None:

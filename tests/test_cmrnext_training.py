@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from calibgraph import DatasetError, FileError, load_rig
+from calibgraph import CalibrationError, DatasetError, FileError, load_rig
 from calibgraph.cmrnext import TrainSettings, load_checkpoint, train
 from calibgraph.cmrnext.inputs import View
 from calibgraph.cmrnext.samples import Scene, _mirrored, _turned, make_sample, perturbation
@@ -146,7 +146,7 @@ def test_the_checkpoint_says_what_it_was_trained_for(
     parts: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:
     out = tmp_path / "net.tar"
-    settings = replace(TINY, steps=1, half_resolution=True, reflectance=True, fourier_levels=4)
+    settings = TINY.changed(steps=1, half_resolution=True, reflectance=True, fourier_levels=4)
     (validation,) = train([parts[0]], [parts[1]], out, settings)
     checkpoint = load_checkpoint(out)
     assert checkpoint.range_deg_m == (1.0, 0.1)
@@ -162,8 +162,8 @@ def test_fine_tuning_starts_from_given_weights(
     parts: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:
     first, second = tmp_path / "first.tar", tmp_path / "second.tar"
-    train([parts[0]], [parts[1]], first, replace(TINY, steps=1, fourier_levels=3))
-    gentle = replace(TINY, steps=1, learning_rate=1e-12)
+    train([parts[0]], [parts[1]], first, TINY.changed(steps=1, fourier_levels=3))
+    gentle = TINY.changed(steps=1, learning_rate=1e-12)
     train([parts[0]], [parts[1]], second, gentle, start=first)
     before, after = load_checkpoint(first), load_checkpoint(second)
     assert after.variant == before.variant
@@ -183,8 +183,8 @@ def nll_content() -> dict[str, object]:
 
 def test_encoders_learn_to_find_each_other(trusted: Dataset, tmp_path: Path) -> None:
     """On one picture, over and over: the correlation loss falls below ignorance, ln 49."""
-    settings = replace(
-        TINY, steps=60, correlation_steps=60, correlation_weight=1.0, learning_rate=5e-3,
+    settings = TINY.changed(
+        steps=60, correlation_steps=60, correlation_weight=1.0, learning_rate=5e-3,
         warm_up_share=0.1, crop_px=None, half_resolution=True, width=16, fourier_levels=4,
     )  # fmt: skip
     one = replace(trusted.select("0"), rig=trusted.rig)
@@ -201,12 +201,94 @@ def test_misuse_is_refused(parts: tuple[Dataset, Dataset], tmp_path: Path) -> No
     out = tmp_path / "net.tar"
     with pytest.raises(DatasetError, match="hold out others"):
         train([parts[0]], [parts[0]], out, TINY)
-    with pytest.raises(FileError, match="no such file"):
+    with pytest.raises(FileError, match="no such checkpoint"):
         train([parts[0]], [parts[1]], out, resume=True)
+    with pytest.raises(FileError, match="must end in"):
+        train([parts[0]], [parts[1]], tmp_path / "net.safetensors", TINY)
     out.write_bytes(b"precious")
+    with pytest.raises(FileError, match="is a file, expected a folder"):
+        train([parts[0]], [parts[1]], out / "net.tar", TINY)
     with pytest.raises(FileError, match="is there already"):
         train([parts[0]], [parts[1]], out, TINY)
     assert out.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"context": "foo"},
+        {"width": 12},
+        {"width": 100_000},
+        {"rotation_deg": 0.0},
+        {"rotation_deg": float("inf")},
+        {"learning_rate": float("nan")},
+        {"correlation_weight": 0.0, "correlation_steps": 5},
+        {"crop_px": (32, 64)},
+        {"fourier_levels": 50},
+        {"steps": 0},
+        {"surplus": 1},
+    ],
+)
+def test_settings_that_cannot_be_trained_are_refused_at_once(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError) as caught:
+        TINY.changed(**wrong)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c["config"].update(train_width=16),
+        lambda c: c["config"].update(train_context="rgb"),
+        lambda c: c["config"].update(train_batch=0),
+        lambda c: c["config"].update(train_crop_px=(3, "x")),
+        lambda c: c["config"].update(train_steps="x"),
+        lambda c: c.update(epoch=float("inf")),
+        lambda c: c.update(epoch=-5),
+        lambda c: c.update(optimizer=5),
+        lambda c: c["optimizer"].update(state=5),
+        lambda c: c["optimizer"]["state"][0].update(exp_avg=torch.zeros(1)),
+        lambda c: c["optimizer"]["state"][0]["exp_avg"].fill_(torch.nan),
+        lambda c: [c["config"].pop(key) for key in list(c["config"]) if "train_" in key],
+    ],
+)
+def test_resuming_from_a_changed_file_is_refused(
+    once: Path, parts: tuple[Dataset, Dataset], tmp_path: Path, change: object
+) -> None:
+    content = torch.load(once, weights_only=True)
+    change(content)  # type: ignore[operator]
+    path = saved(tmp_path / "changed.tar", content)
+    before = path.read_bytes()
+    with pytest.raises(FileError, match="changed.tar") as caught:
+        train([parts[0]], [parts[1]], path, resume=True)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 2500
+    assert path.read_bytes() == before
+
+
+@pytest.fixture(scope="module")
+def once(parts: tuple[Dataset, Dataset], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training of 3 steps, stopped after the first."""
+    path = tmp_path_factory.mktemp("once") / "net.tar"
+
+    def stop(what: str, done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train([parts[0]], [parts[1]], path, TINY.changed(steps=3), validate_every=1, progress=stop)
+    return path
+
+
+def test_a_training_that_diverges_says_so(
+    once: Path, parts: tuple[Dataset, Dataset], tmp_path: Path
+) -> None:
+    content = torch.load(once, weights_only=True)
+    content["state_dict"]["update_block.flow_head.conv2.weight"].fill_(3e38)
+    path = saved(tmp_path / "net.tar", content)
+    before = path.read_bytes()
+    with pytest.raises(CalibrationError, match="diverged at step 1"):
+        train([parts[0]], [parts[1]], path, resume=True)
+    assert path.read_bytes() == before
 
 
 def test_frames_are_split_at_the_end(trusted: Dataset) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from calibgraph.cmrnext.network import CmrNext
@@ -20,6 +21,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import sha256, write_atomically
 
 SAFETENSORS = ".safetensors"
+TORCH_SUFFIXES = (".tar", ".pt", ".pth")
 
 DOWNLOAD = (
     "the published weights are at "
@@ -28,11 +30,15 @@ DOWNLOAD = (
     "own with calibgraph train"
 )
 
-_REQUIRED: dict[str, Any] = {
-    "max_depth": (int, float),
-    "use_reflectance": bool,
-    "normalize_images": bool,
-}
+_NUMBERS = {
+    "max_depth": (1.0, 10_000.0, True),
+    "max_r": (0.0, 180.0, False),
+    "max_t": (0.0, 1000.0, False),
+    "systematic_rotation_rad": (0.0, 10.0, False),
+    "systematic_translation_m": (0.0, 1000.0, False),
+}  # least, most, and whether they must be there
+_SWITCHES = {"use_reflectance": True, "normalize_images": True, "half_resolution": False}
+_MAX_TEXT, _MAX_INTEGER = 200, 2**53
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +67,8 @@ class Checkpoint:
     @property
     def range_deg_m(self) -> tuple[float, float] | None:
         """Largest perturbation per axis in training, degrees and metres, if the file says."""
-        values = [self.config.get(key) for key in ("max_r", "max_t")]
-        if all(isinstance(v, (int, float)) and 0 < v < float("inf") for v in values):
-            return float(values[0]), float(values[1])  # type: ignore[arg-type]
-        return None
+        rotation, translation = (self.config.get(key) for key in ("max_r", "max_t"))
+        return (float(rotation), float(translation)) if rotation and translation else None
 
     def summary(self) -> dict[str, Any]:
         """What the file holds, as plain values."""
@@ -109,75 +113,99 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
             from what it says of itself.
     """
     path = Path(path)
-    if not path.is_file():
+    if path.exists() and not path.is_file():
+        raise FileError(path, "is not a file; expected weights, .tar or .safetensors")
+    if not path.exists():
         raise FileError(path, f"no such file of weights; {DOWNLOAD}")
-    config, arrays = _read_safetensors(path) if path.suffix == SAFETENSORS else _read_torch(path)
+    given, tensors = _read_safetensors(path) if path.suffix == SAFETENSORS else _read_torch(path)
     try:
-        _require_keys(config)
-        shapes = {name: array.shape for name, array in arrays.items()}
+        config = _plain(given)
+        _require_sound(config)
+        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         variant = recognised(shapes, reflectance=config["use_reflectance"])
         require_config_agrees(variant, config)
-        state = _checked_state(variant, arrays)
+        state = _checked_state(variant, tensors)
     except ValueError as error:
         raise FileError(path, f"{error}") from None
     return Checkpoint(path, sha256(path), variant, config, state)
 
 
-def training_state(path: Path) -> Mapping[str, Any]:
-    """Everything in a checkpoint that ``calibgraph train`` wrote, tensors as arrays."""
-    return read_checkpoint(path)
-
-
-def _read_torch(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def _read_torch(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     content = read_checkpoint(path)
     for key in ("config", "state_dict"):
         if not isinstance(content.get(key), dict):
             raise FileError(path, f"lacks {key!r}: expected the checkpoint of a CMRNext training")
-    arrays = {}
+    tensors = {}
     for name, array in content["state_dict"].items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray):
-            raise FileError(path, f"its state_dict holds {name!r}, which is not a tensor")
-        arrays[name.removeprefix("module.")] = array
-    plain = (bool, int, float, str, type(None))
-    config = {
-        key: value
-        for key, value in content["config"].items()
-        if isinstance(key, str) and isinstance(value, plain)
-    }
-    return config, arrays
+            raise FileError(path, f"its state_dict holds {str(name)[:100]!r}, which is no tensor")
+        # A number that is repeated by a stride of zero is copied only when its shape is right.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # torch: the array is read-only; so be it
+            tensors[name.removeprefix("module.")] = torch.from_numpy(array)
+    return content["config"], tensors
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    from safetensors import SafetensorError, safe_open
+def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
 
     try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        config = json.loads(metadata["config"])
-    except KeyError:
+        data = path.read_bytes()
+        tensors = load(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        text = header.get("__metadata__", {}).get("config")
+        config = None if text is None else json.loads(text)
+    except (SafetensorError, ValueError, OSError, RecursionError, KeyError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FileError(path, f"cannot be read as safetensors: {reason}") from None
+    if not isinstance(config, dict):
         raise FileError(
             path, "has no config in its metadata; convert the original with calibgraph weights"
-        ) from None
-    except (SafetensorError, ValueError, OSError, RecursionError) as error:
-        text = " ".join(str(error).split())
-        raise FileError(path, f"cannot be read as safetensors: {text}") from None
-    if not isinstance(config, dict):
-        raise FileError(path, "its config is not a mapping")
-    return config, arrays
+        )
+    return config, tensors
 
 
-def _require_keys(config: Mapping[str, Any]) -> None:
-    for key, kinds in _REQUIRED.items():
-        if key not in config:
-            raise ValueError(f"its config lacks {key!r}")
-        if not isinstance(config[key], kinds):
-            raise ValueError(f"its config has {key} = {config[key]!r}, of the wrong kind")
-    if not 0 < config["max_depth"] < float("inf"):
-        raise ValueError(f"its config has max_depth = {config['max_depth']!r}, expected metres")
+def _plain(config: Mapping[Any, Any]) -> dict[str, Any]:
+    """The part of a config that is plain, printable values of ordinary size."""
+    return {key: value for key, value in config.items() if _is_plain(key) and _is_plain(value)}
 
 
-def _checked_state(variant: Variant, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, str):
+        return len(value) <= _MAX_TEXT and value.isprintable()
+    if isinstance(value, (list, tuple)):
+        return len(value) <= 2 and all(type(item) is int and _is_plain(item) for item in value)  # noqa: PLR2004
+    if isinstance(value, (int, float)):
+        return math.isfinite(value) if isinstance(value, float) else abs(value) <= _MAX_INTEGER
+    return value is None
+
+
+def _require_sound(config: Mapping[str, Any]) -> None:
+    """Check the keys of the config that anything depends on.
+
+    Raises:
+        ValueError: on the first that is missing or out of its range.
+    """
+    for key, (least, most, needed) in _NUMBERS.items():
+        value = config.get(key)
+        if value is None and not needed:
+            continue
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not (least <= value <= most)
+        ):
+            raise ValueError(
+                f"its config has {key!r} = {value!r}, expected a number from {least} to {most}"
+            )
+    for key, needed in _SWITCHES.items():
+        value = config.get(key)
+        if not isinstance(value, bool) and (needed or value is not None):
+            raise ValueError(f"its config has {key!r} = {value!r}, expected true or false")
+
+
+def _checked_state(variant: Variant, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The state dict, after comparing every name and shape with the network's.
 
     Raises:
@@ -186,19 +214,21 @@ def _checked_state(variant: Variant, arrays: Mapping[str, NDArray[Any]]) -> dict
     with torch.device("meta"):
         expected = CmrNext(variant).state_dict()
     for kind, names in (
-        ("lacks", expected.keys() - arrays.keys()),
-        ("has the unknown", arrays.keys() - expected.keys()),
+        ("lacks", expected.keys() - tensors.keys()),
+        ("has the unknown", tensors.keys() - expected.keys()),
     ):
         if names:
             raise ValueError(f"{kind} weights {min(names)!r} ({len(names)} such names)")
     state = {}
     for name, like in expected.items():
-        array = arrays[name]
-        if array.shape != tuple(like.shape):
-            raise ValueError(f"{name!r} has shape {array.shape}, expected {tuple(like.shape)}")
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"{name!r} holds {array.dtype}, expected numbers")
-        state[name] = torch.tensor(np.array(array)).to(like.dtype)
+        tensor = tensors[name]
+        if tensor.shape != like.shape:
+            raise ValueError(
+                f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}"
+            )
+        if tensor.is_floating_point() != like.is_floating_point():
+            raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
+        state[name] = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
         if not torch.isfinite(state[name]).all():
             raise ValueError(f"{name!r} holds values that are not finite")
         if name.endswith("running_var") and (state[name] < 0).any():

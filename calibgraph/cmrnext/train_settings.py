@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibgraph.cmrnext.checkpoint import Checkpoint
 from calibgraph.cmrnext.samples import SampleSettings
 from calibgraph.cmrnext.validation import Validation
-from calibgraph.cmrnext.variant import Variant
+from calibgraph.cmrnext.variant import FULL_WIDTH, Variant
+from calibgraph.config import Seed
 from calibgraph.errors import FileError
+from calibgraph.files import describe
+
+Count = Annotated[int, Field(ge=1, le=10**9)]
+CropSize = Annotated[int, Field(ge=64, le=100_000)]
 
 
-@dataclass(frozen=True)
-class TrainSettings:
+class TrainSettings(BaseModel):
     """What to train, and on what. Everything is written into the checkpoint.
 
     Attributes:
@@ -35,23 +40,40 @@ class TrainSettings:
         seed: of the weights and of all samples.
     """
 
-    rotation_deg: float = 20.0
-    translation_m: float = 1.5
-    steps: int = 100_000
-    batch: int = 4
-    iterations: int = 12
-    learning_rate: float = 3e-4
-    warm_up_share: float = 0.4
-    correlation_weight: float = 0.0
-    correlation_steps: int = 0
-    crop_px: tuple[int, int] | None = (320, 960)
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rotation_deg: Annotated[float, Field(gt=0, le=180)] = 20.0
+    translation_m: Annotated[float, Field(gt=0, le=1000)] = 1.5
+    steps: Count = 100_000
+    batch: Annotated[int, Field(ge=1, le=1024)] = 4
+    iterations: Annotated[int, Field(ge=1, le=100)] = 12
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 3e-4
+    warm_up_share: Annotated[float, Field(ge=0.01, le=0.99)] = 0.4
+    correlation_weight: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    correlation_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    crop_px: tuple[CropSize, CropSize] | None = (320, 960)
     half_resolution: bool = False
-    width: int = 64
+    width: int = FULL_WIDTH
     fourier_levels: int = 12
     reflectance: bool = False
     context: Literal["lidar", "rgb"] = "lidar"
-    max_depth_m: float = 160.0
-    seed: int = 0
+    max_depth_m: Annotated[float, Field(ge=1, le=10_000)] = 160.0
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _can_be_trained(self) -> Self:
+        _ = self.variant
+        if self.correlation_steps and not self.correlation_weight:
+            raise ValueError("correlation_steps need a correlation_weight above 0")
+        return self
+
+    def changed(self, **settings: Any) -> TrainSettings:
+        """A checked copy with some settings changed.
+
+        Raises:
+            ValueError: on an unknown setting or a wrong value, in one line.
+        """
+        return _checked({**self.model_dump(), **settings})
 
     @property
     def variant(self) -> Variant:
@@ -105,7 +127,7 @@ def config_of(settings: TrainSettings, validation: Validation) -> dict[str, Any]
         "al_contrario": False,
         "max_r": settings.rotation_deg,
         "max_t": settings.translation_m,
-        **{f"train_{key}": value for key, value in asdict(settings).items()},
+        **{f"train_{key}": value for key, value in settings.model_dump().items()},
         "half_resolution": settings.half_resolution,
         "systematic_rotation_rad": validation.systematic_rotation_rad,
         "systematic_translation_m": validation.systematic_translation_m,
@@ -113,11 +135,25 @@ def config_of(settings: TrainSettings, validation: Validation) -> dict[str, Any]
 
 
 def settings_in(config: Mapping[str, Any]) -> TrainSettings:
-    """The settings in a config that :func:`config_of` made."""
-    said = {key.removeprefix("train_"): v for key, v in config.items() if key.startswith("train_")}
-    if said["crop_px"] is not None:
-        said["crop_px"] = tuple(said["crop_px"])
-    return TrainSettings(**said)
+    """The settings in a config that :func:`config_of` made.
+
+    Raises:
+        ValueError: if it was made otherwise.
+    """
+    prefix = "train_"
+    said = {key.removeprefix(prefix): v for key, v in config.items() if key.startswith(prefix)}
+    if not said:
+        raise ValueError("it was not made by calibgraph train; start from it with --from")
+    if missing := TrainSettings.model_fields.keys() - said.keys():
+        raise ValueError(f"its config lacks a sound {prefix}{min(missing)}")
+    return _checked(said)
+
+
+def _checked(settings: Mapping[str, Any]) -> TrainSettings:
+    try:
+        return TrainSettings.model_validate(settings)
+    except ValidationError as error:
+        raise ValueError(describe(error)) from error
 
 
 def settings_from(settings: TrainSettings, checkpoint: Checkpoint) -> TrainSettings:
@@ -133,8 +169,7 @@ def settings_from(settings: TrainSettings, checkpoint: Checkpoint) -> TrainSetti
             "has an uncertainty head or reads images that are not normalised: training such a "
             "network is not supported; start from plain weights",
         )
-    return replace(
-        settings,
+    return settings.changed(
         width=variant.width,
         fourier_levels=variant.fourier_levels,
         reflectance=variant.reflectance,

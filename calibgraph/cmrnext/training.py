@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from calibgraph.cmrnext.checkpoint import load_checkpoint, training_state
+from calibgraph.cmrnext.checkpoint import TORCH_SUFFIXES, load_checkpoint
 from calibgraph.cmrnext.correlation import WINDOW, Correlation, cross_entropy
 from calibgraph.cmrnext.network import CELL, CmrNext, torch_device
+from calibgraph.cmrnext.pickle_reader import read_checkpoint
 from calibgraph.cmrnext.samples import (
     Sample,
     Scene,
@@ -37,8 +38,8 @@ from calibgraph.cmrnext.validation import (
     validation_samples,
 )
 from calibgraph.dataset import Dataset
-from calibgraph.errors import DatasetError, FileError
-from calibgraph.files import require_place_for_folder, write_atomically
+from calibgraph.errors import CalibrationError, DatasetError, FileError
+from calibgraph.files import require_place_for_file, write_atomically
 
 Array = NDArray[np.float64]
 Report = Callable[[str, int, int], None]
@@ -50,6 +51,9 @@ _WEIGHT_DECAY = 5e-6
 _START, _END = 0.1, 1e-6  # of the one-cycle learning rate, as shares of its peak
 _GRADIENT_NORM = 1.0
 _OFFSET_CELLS = 3.5  # of the correlation loss's windows from the truth, at most
+_FOREIGN = (
+    ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip # what torch raises on the state of another optimizer
 _TRIES = 20  # to draw a sample that shows enough points
 
 
@@ -144,12 +148,30 @@ class _Run:
             loss = loss + s.correlation_weight * self._correlation_loss(correlation, samples)
         if self.step >= s.correlation_steps:
             loss = loss + self._flow_loss(correlation, rgb, lidar, samples)
+        if not torch.isfinite(loss):
+            raise CalibrationError(
+                f"training diverged at step {self.step}: the loss is {float(loss.detach())}; lower "
+                "the learning rate; the weights written last are as they were"
+            )
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), _GRADIENT_NORM)
         self.optimizer.step()
         self.step += 1
         return float(loss.detach())
+
+    def require_sound(self) -> None:
+        """Check the optimizer's state against the network.
+
+        Raises:
+            ValueError: if it is of another network, or not finite.
+        """
+        if not 0 <= self.step <= self.settings.steps:
+            raise ValueError(f"it says {self.step} of {self.settings.steps} steps")
+        for parameter, state in self.optimizer.state.items():
+            for key in ("exp_avg", "exp_avg_sq"):
+                if state[key].shape != parameter.shape or not torch.isfinite(state[key]).all():
+                    raise ValueError(f"its optimizer's {key!r} is of another network or not finite")
 
     @torch.inference_mode()
     def validate(self, samples: list[tuple[Scene, Sample]], train_loss: float) -> Validation:
@@ -253,7 +275,9 @@ def _initialize(network: nn.Module) -> None:
 def _fresh(out: Path, settings: TrainSettings, device: str, start: Path | str | None) -> _Run:
     if out.exists():
         raise FileError(out, "is there already; go on with it (--resume), or choose another name")
-    require_place_for_folder(out.parent)
+    if out.suffix.lower() not in TORCH_SUFFIXES:
+        raise FileError(out, f"the weights' name must end in one of {', '.join(TORCH_SUFFIXES)}")
+    require_place_for_file(out)
     if start is None:
         return _Run(settings, device)
     checkpoint = load_checkpoint(start)
@@ -263,30 +287,41 @@ def _fresh(out: Path, settings: TrainSettings, device: str, start: Path | str | 
 
 
 def _resumed(out: Path, device: str) -> _Run:
+    if not out.exists():
+        raise FileError(out, "no such checkpoint to go on with; start without --resume")
     checkpoint = load_checkpoint(out)
-    content = training_state(out)
+    content = read_checkpoint(out)
     try:
-        settings = settings_in(content["config"])
+        settings = settings_in(checkpoint.config)
         run = _Run(settings, device)
         run.network.load_state_dict(checkpoint.state)
-        run.optimizer.load_state_dict(_tensors(content["optimizer"]))
+        run.optimizer.load_state_dict(_optimizer_state(content["optimizer"]))
         run.step = int(content["epoch"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileError(out, f"is no checkpoint that training can go on with ({error})") from None
+        run.require_sound()
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise FileError(out, f"is no checkpoint that training can go on with: {error}") from None
     if run.step >= settings.steps:
         raise FileError(out, f"has had all its {settings.steps} steps")
     return run
 
 
-def _tensors(content: Any) -> Any:
-    """Nested plain data with its arrays as tensors of their own."""
-    if isinstance(content, np.ndarray):
-        return torch.tensor(np.array(content))
-    if isinstance(content, dict):
-        return {key: _tensors(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_tensors(value) for value in content]
-    return content
+def _optimizer_state(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Adam's state as torch takes it, from a checkpoint's plain data."""
+    state = {
+        number: {
+            key: torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
+            for key, value in each.items()
+        }
+        for number, each in content["state"].items()
+    }
+    return {"state": state, "param_groups": content["param_groups"]}
 
 
 def _batches(

@@ -74,6 +74,8 @@ def validation_samples(
 
 def pose_error(scene: Scene, sample: Sample, flow_px: NDArray[np.float32]) -> Array | None:
     """(6,) rotation [rad] and translation [m] of a frame's pose against the truth, or None."""
+    if not np.isfinite(flow_px).all():
+        return None
     camera = scene.camera.model_copy(update={"model": "pinhole", "distortion": ()})
     matches = Correspondences.from_arrays(
         camera="camera",

@@ -14,6 +14,7 @@ FULL_WIDTH = 64
 _UNCERTAINTY_OF_OUTPUTS = {2: "none", 4: "nll"}
 _DER_OUTPUTS = (6, 8)
 _RGB = 3
+_MAX_WIDTH = 256
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,10 @@ class Variant:
     width: int = FULL_WIDTH
 
     def __post_init__(self) -> None:
-        if self.width < 8 or self.width % 8:  # noqa: PLR2004 - thirds and quarters stay whole
-            raise ValueError(f"network width {self.width}: expected a multiple of 8")
+        if not 8 <= self.width <= _MAX_WIDTH or self.width % 8:  # noqa: PLR2004 - all parts whole
+            raise ValueError(
+                f"network width {self.width}: expected a multiple of 8 up to {_MAX_WIDTH}"
+            )
         if not (self.fourier_levels == -1 or 1 <= self.fourier_levels <= 20):  # noqa: PLR2004
             raise ValueError(f"fourier_levels {self.fourier_levels}: expected 1 to 20, or -1")
 
