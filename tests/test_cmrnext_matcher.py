@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -423,3 +424,13 @@ def test_networks_are_for_evaluation(weights: Path) -> None:
     assert isinstance(
         model(torch.zeros(1, 3, 128, 128), torch.zeros(1, 25, 128, 128), iterations=1), Flow
     )
+
+
+def test_a_missing_torch_is_said_in_one_line(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(sys.modules):
+        if name.startswith("calibgraph.cmrnext"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    code, _, line = call("weights", "iter1.tar")
+    assert code == 2
+    assert "pip install 'calibgraph[learned]'" in line and line.count("\n") == 1

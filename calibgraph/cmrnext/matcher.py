@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -225,7 +226,7 @@ class CmrNextMatcher:
             seen.append(lidar)
             rgbs.append(rgb_tensor(image, normalize=checkpoint.config["normalize_images"]))
             lidars.append(lidar_tensor(halved_lidar(channels) if halved else channels))
-        with torch.inference_mode():
+        with torch.inference_mode(), _exact():
             rgb, raw = torch.stack(rgbs).to(self.device), torch.stack(lidars).to(self.device)
             inputs = encoded(raw, checkpoint.variant)
             flow = network.model(rgb, inputs, iterations=self.iterations)
@@ -286,6 +287,14 @@ class CmrNextMatcher:
             "confidence": "uncalibrated" if last.variant.uncertainty == "none" else "predicted",
             **{key: last.config.get(key, value) for key, value in default.items()},
         }  # fmt: skip
+
+
+def _exact() -> AbstractContextManager[None]:
+    """A GPU in full float32, and the same numbers at every call."""
+    flags = torch.backends.cudnn.flags(
+        enabled=True, benchmark=False, deterministic=True, allow_tf32=False
+    )
+    return cast(AbstractContextManager[None], flags)
 
 
 def _job(frame: Frame, name: str, camera: Camera, view: View) -> _Job:
