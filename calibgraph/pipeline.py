@@ -32,7 +32,7 @@ class Matcher(Protocol):
     ``contrast``: by how many chance spreads the matches' agreement stands out;
     ``start_dependence``: which share of a displaced start remains in the matches (0 to 1);
     ``recall``: which share of the way back it finds without the image (0 to 1);
-    ``failed_frames``: the names of frames that it left out.
+    ``failed_share``: which share of the frames it left out (0 to 1).
 
     Attributes:
         rounds: how many rounds it wants.
@@ -121,13 +121,7 @@ def calibrate(
     with clock("hash_inputs"):
         inputs = _input_hashes(data)
     return replace(
-        _judged_by_matching(
-            result,
-            rounds,
-            table,
-            frames=len(data.frames),
-            repeated=_repeated_frame(data, inputs),
-        ),
+        _judged_by_rounds(result, rounds, repeated=_repeated_frame(data, inputs)),
         initial_rig=initial,
         correspondences=table,
         rounds=tuple(rounds),
@@ -182,26 +176,16 @@ def _round(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
     return cameras
 
 
-def _judged_by_matching(
-    result: Calibration,
-    rounds: Sequence[dict[str, Any]],
-    table: Correspondences,
-    *,
-    frames: int,
-    repeated: str | None,
+def _judged_by_rounds(
+    result: Calibration, rounds: Sequence[dict[str, Any]], *, repeated: str | None
 ) -> Calibration:
-    """The result with a verdict that knows how the matching went, not only the last solve."""
-    said = table.metadata
+    """The result with a verdict that knows of all rounds, not only of the last solve."""
     verdicts = {
         name: with_matching(
             verdict,
             Matching(
                 moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
                 moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
-                contrast=(said.get("contrast") or {}).get(name),
-                start_dependence=(said.get("start_dependence") or {}).get(name),
-                recall=(said.get("recall") or {}).get(name),
-                failed_share=len((said.get("failed_frames") or {}).get(name, ())) / frames,
                 repeated=repeated,
             ),
         )

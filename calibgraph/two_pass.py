@@ -21,7 +21,7 @@ from calibgraph.preprocess import FILTERS, preprocess
 from calibgraph.problem import Poses, Problem, Scales
 from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
-from calibgraph.verdict import rig_verdict
+from calibgraph.verdict import rig_verdict, said_by_matcher, with_matching
 
 Array = NDArray[np.float64]
 
@@ -79,13 +79,17 @@ def solve(
             residuals=residuals,
             systematic_sigmas=table.systematic_sigmas,
         )
+    verdicts = {
+        name: with_matching(verdict, said_by_matcher(table.metadata, name))
+        for name, verdict in assessment.verdicts.items()
+    }
     return Calibration(
         rig=rig.moved_to(found),
         initial_rig=rig,
         covariance=assessment.covariance,
         joint_covariance=assessment.joint_covariance,
-        verdict=rig_verdict(assessment.verdicts),
-        camera_verdicts=assessment.verdicts,
+        verdict=rig_verdict(verdicts),
+        camera_verdicts=verdicts,
         residuals=residuals,
         counts=_counts(kept.counts, problem, inliers, stage1),
         timings_s=clock.seconds,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from calibgraph.calibration import Residuals, Status, Verdict
 from calibgraph.config import Terms
 from calibgraph.covariance import MIN_FRAMES
+from calibgraph.errors import CorrespondenceError
 from calibgraph.rig import Camera, RelativePose, angle_deg
 
 Array = NDArray[np.float64]
@@ -177,6 +179,26 @@ class Matching:
     recall: float | None = None
     failed_share: float = 0.0
     repeated: str | None = None
+
+
+def said_by_matcher(metadata: Mapping[str, Any], camera: str) -> Matching:
+    """What a table's metadata says of one camera's matching.
+
+    Raises:
+        CorrespondenceError: if it is no number.
+    """
+    said: dict[str, Any] = {}
+    for key in ("contrast", "start_dependence", "recall", "failed_share"):
+        of_cameras = metadata.get(key) or {}
+        value = of_cameras.get(camera, 0.0) if isinstance(of_cameras, dict) else None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise CorrespondenceError(
+                f"metadata {key!r} must map camera names to numbers, found {of_cameras!r}",
+                camera=camera,
+            )
+        if camera in of_cameras:
+            said[key] = float(value)
+    return Matching(**said)
 
 
 def with_matching(verdict: Verdict, matching: Matching) -> Verdict:

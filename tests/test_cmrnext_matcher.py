@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -283,8 +284,9 @@ def test_untrained_weights_fail_on_the_command_line(
     table = calibgraph.load_correspondences(out / "correspondences.parquet")
     assert len(table.metadata["schedule"]) == 3
     assert table.metadata["half_resolution"] is True
-    # The table alone can be solved again, without the network.
-    assert call("solve", SAMPLE, out / "correspondences.parquet", "--out", tmp_path / "o")[0] <= 1
+    # The table alone can be solved again, without the network, and says the same.
+    code, _, text = call("solve", SAMPLE, out / "correspondences.parquet", "--out", tmp_path / "o")
+    assert code == 1 and "of a displaced start remains" in text
 
 
 @pytest.mark.parametrize(
@@ -434,3 +436,16 @@ def test_a_missing_torch_is_said_in_one_line(call: Call, monkeypatch: pytest.Mon
     code, _, line = call("weights", "iter1.tar")
     assert code == 2
     assert "pip install 'calibgraph[learned]'" in line and line.count("\n") == 1
+
+
+def test_a_table_carries_what_its_matcher_said(pair: calibgraph.Rig) -> None:
+    """The verdict of a later solve heeds it, and refuses nonsense in a line."""
+    table = calibgraph.simulate_correspondences(pair, frames=8, matches=200)
+    assert calibgraph.solve(pair, table).verdict.status == "PASS"
+    said = replace(table, metadata={"start_dependence": {"left": 0.9}})
+    result = calibgraph.solve(pair, said)
+    assert result.camera_verdicts["left"].status == "FAIL"
+    assert result.camera_verdicts["right"].status == "PASS"
+    for nonsense in ({"left": "high"}, {"left": True}, 3, [1]):
+        with pytest.raises(calibgraph.CorrespondenceError, match="recall"):
+            calibgraph.solve(pair, replace(table, metadata={"recall": nonsense}))

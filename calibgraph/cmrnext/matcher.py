@@ -310,11 +310,11 @@ def _spread_out(values: Sequence[int], most: int) -> set[int]:
 
 def _findings(found: Mapping[str, Sequence[_Found]]) -> dict[str, Any]:
     """What the verdict heeds, per camera: failed frames, and in the last round the probes."""
+    failed = {name: [each.job.frame.name for each in all_ if each.failed]
+              for name, all_ in found.items()}  # fmt: skip
     findings: dict[str, Any] = {
-        "failed_frames": {
-            name: [each.job.frame.name for each in all_ if each.failed]
-            for name, all_ in found.items()
-        }
+        "failed_frames": failed,
+        "failed_share": {name: len(failed[name]) / len(all_) for name, all_ in found.items()},
     }
     for key in ("start_dependence", "recall"):
         values = {name: [getattr(each, key) for each in all_] for name, all_ in found.items()}
