@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -80,7 +81,12 @@ def solve(
             systematic_sigmas=table.systematic_sigmas,
         )
     verdicts = {
-        name: with_matching(verdict, said_by_matcher(table.metadata, name))
+        name: with_matching(
+            verdict,
+            replace(
+                said_by_matcher(table.metadata, name), systematic_sigmas=table.systematic_sigmas
+            ),
+        )
         for name, verdict in assessment.verdicts.items()
     }
     return Calibration(

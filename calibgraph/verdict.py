@@ -169,6 +169,8 @@ class Matching:
         start_dependence: share of a displaced start that remains in the matches, if it says.
         recall: share of the way back that it finds without the image, if it says.
         failed_share: of the frames.
+        systematic_sigmas: what the matcher says of the error that its frames share, per axis:
+            rotation [rad], translation [m].
         repeated: that frames repeat each other, if they do.
     """
 
@@ -178,6 +180,7 @@ class Matching:
     start_dependence: float | None = None
     recall: float | None = None
     failed_share: float = 0.0
+    systematic_sigmas: tuple[float, float] = (0.0, 0.0)
     repeated: str | None = None
 
 
@@ -209,6 +212,7 @@ def with_matching(verdict: Verdict, matching: Matching) -> Verdict:
         _above(what, matching.moved_deg, MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
         _above(what, matching.moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
         *_shares_checks(matching),
+        *_sigma_checks("the matcher's own error", np.repeat(matching.systematic_sigmas, 3)),
     ]
     if matching.repeated is not None:
         checks.append(("WARN", f"{matching.repeated}: counted as if independent; remove one"))

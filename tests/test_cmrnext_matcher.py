@@ -372,7 +372,7 @@ def test_the_probe_tells_measuring_from_following() -> None:
     points = cloud[:, :3].astype(np.float64)
 
     def table(T: Array, share: float) -> calibgraph.Correspondences:
-        """Matches that follow the start by a share, with noise and a fifth of nonsense."""
+        """Matches that follow the start by a share, with noise."""
         truth, start = (
             camera.lens.project(points @ M[:3, :3].T + M[:3, 3])[0]
             for M in (rig.T_camera_lidar["camera"], T)
@@ -384,10 +384,11 @@ def test_the_probe_tells_measuring_from_following() -> None:
         )  # fmt: skip
 
     for share in (0.0, 0.4, 1.0):
-        one = (camera.T_camera_lidar, table(camera.T_camera_lidar, share))
-        found = probe.remaining_share(camera, one, (T_two, table(T_two, share)))
-        # Slope of 4000 values with noise sqrt(2) over motions of about 10 px: sigma 2e-3.
+        found = probe.remaining_share(camera, camera.T_camera_lidar, T_two, table(T_two, share))
+        # Slope of 4000 values with noise 1 over motions of about 10 px: sigma 2e-3.
         assert found == pytest.approx(share, abs=0.01)
+    few = table(T_two, 0.0).select(slice(0, 10))
+    assert np.isnan(probe.remaining_share(camera, camera.T_camera_lidar, T_two, few))
 
 
 @pytest.mark.parametrize(

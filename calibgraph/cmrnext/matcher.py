@@ -208,8 +208,7 @@ class CmrNextMatcher:
             for image in (job.image, blank)
         )
         dependence, kept = (
-            probe.remaining_share(job.camera, (job.T_camera_lidar, found.matches), (T, table))
-            for table in (again, without)
+            probe.remaining_share(job.camera, base, T, table) for table in (again, without)
         )
         return replace(found, start_dependence=dependence, recall=1.0 - kept)
 

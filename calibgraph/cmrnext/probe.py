@@ -17,9 +17,6 @@ from calibgraph.correspondences import Correspondences
 from calibgraph.rig import Camera
 
 Array = NDArray[np.float64]
-Matched = tuple[Array, Correspondences]
-"""A start T_camera_lidar (4, 4), and what was matched from it."""
-
 BLANK = (124, 116, 104)
 """The mean colour of the networks' training: zero, once normalised."""
 
@@ -41,21 +38,26 @@ def displaced(
     return np.asarray(D @ T_camera_lidar)
 
 
-def remaining_share(camera: Camera, one: Matched, two: Matched) -> float:
-    """How much of the motion between two starts is left between their matches.
+def remaining_share(
+    camera: Camera, T_base: Array, T_displaced: Array, matches: Correspondences
+) -> float:
+    """How much of a displacement is left in the matches that were found from it.
 
-    The slope of the matches' motion over the starts' motion, over the points that both matched:
-    0 for a matcher that measures, 1 for one that gives back its start; NaN with too few points.
+    Args:
+        camera: its lens.
+        T_base: (4, 4) T_camera_lidar that the network led to before.
+        T_displaced: (4, 4) the start of these matches.
+        matches: of one frame.
+
+    Returns:
+        The slope of the matches' distance from the base over the start's: 0 for a network that
+        measures, 1 for one that gives back its start; NaN with too few matches.
     """
-    (T_one, matches_one), (T_two, matches_two) = one, two
-    assert matches_one.point_index is not None and matches_two.point_index is not None
-    _, i, j = np.intersect1d(
-        matches_one.point_index, matches_two.point_index, assume_unique=True, return_indices=True
+    points = matches.points_lidar_m
+    base, start = (
+        camera.lens.project(points @ T[:3, :3].T + T[:3, 3])[0] for T in (T_base, T_displaced)
     )
-    if len(i) < _MIN_POINTS:
+    moved, left = start - base, matches.pixels_px - base
+    if len(points) < _MIN_POINTS:
         return float("nan")
-    points = matches_one.points_lidar_m[i]
-    starts = [camera.lens.project(points @ T[:3, :3].T + T[:3, 3])[0] for T in (T_one, T_two)]
-    moved = starts[1] - starts[0]
-    followed = matches_two.pixels_px[j] - matches_one.pixels_px[i]
-    return float((followed * moved).sum() / (moved**2).sum())
+    return float((left * moved).sum() / (moved**2).sum())
