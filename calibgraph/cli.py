@@ -70,13 +70,15 @@ DeviceOption = Annotated[
 ]
 IterationsOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Of each network's recurrent update. [12]", rich_help_panel=_CMRNEXT),
+    typer.Option(
+        min=1, help="Of each network's recurrent update (default: 12).", rich_help_panel=_CMRNEXT
+    ),
 ]
 HalfOption = Annotated[
     bool | None,
     typer.Option(
         "--half-resolution/--full-resolution",
-        help="Halve the images or not [as the weights say; else from 1400 px width on].",
+        help="Halve the images or not (default: as the weights say, else from 1400 px width on).",
         rich_help_panel=_CMRNEXT,
     ),
 ]
@@ -90,7 +92,9 @@ OcclusionOption = Annotated[
 ]
 BatchOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Images at once. [1 on a CPU, 4 on a GPU]", rich_help_panel=_CMRNEXT),
+    typer.Option(
+        min=1, help="Images at once (default: 1 on a CPU, 4 on a GPU).", rich_help_panel=_CMRNEXT
+    ),
 ]
 FramesOption = Annotated[
     str | None,
@@ -360,7 +364,8 @@ def train(
         list[Path] | None,
         typer.Option(
             metavar="DATASET",
-            help="Folder to validate on, may come again. [the last fifth of each DATASET]",
+            help="Folder to validate on (up to 100 images), may come again. "
+            "(default: the last fifth of each DATASET)",
         ),
     ] = None,
     rig: Annotated[
@@ -419,7 +424,7 @@ def train(
         typer.Option("--resume", help="Go on where FILE stopped, with the settings in it."),
     ] = False,
 ) -> None:
-    """Train a CMRNext network by perturbing trusted extrinsics; any image and cloud will do."""
+    """Train a CMRNext network by perturbing trusted extrinsics."""
     from calibgraph.cmrnext import TrainSettings, train
     from calibgraph.cmrnext.train_settings import parsed_crop
     from calibgraph.cmrnext.trusted import split, trusted_dataset

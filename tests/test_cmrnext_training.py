@@ -18,6 +18,7 @@ from calibgraph.cmrnext.samples import Scene, _mirrored, _turned, make_sample, p
 from calibgraph.cmrnext.train_settings import parsed_crop
 from calibgraph.cmrnext.training import one_cycle
 from calibgraph.cmrnext.trusted import split, trusted_dataset
+from calibgraph.cmrnext.validation import MAX_SCENES, _spread_out
 from calibgraph.cmrnext.variant import Variant
 from calibgraph.dataset import Dataset
 from tests.conftest import SAMPLE, Call
@@ -297,6 +298,14 @@ def test_frames_are_split_at_the_end(trusted: Dataset) -> None:
     assert [f.index for f in last.frames] == [5]
     with pytest.raises(DatasetError, match="--held-out"):
         split([trusted.select("0")])
+
+
+def test_validation_keeps_few_of_many_scenes(trusted: Dataset) -> None:
+    many = [scene(trusted)] * 250 + [scene(trusted, "left")] * 250
+    kept = _spread_out(many)
+    assert len(kept) == MAX_SCENES
+    assert sum(s.name == "left" for s in kept) == MAX_SCENES // 2
+    assert _spread_out(many[:3]) == many[:3]
 
 
 def test_crops_are_read() -> None:

@@ -19,6 +19,9 @@ from calibgraph.stage1 import frame_pose
 
 Array = NDArray[np.float64]
 
+MAX_SCENES = 100
+"""Images validated on, spread evenly over those held out: they are kept in memory."""
+
 _PNP_MATCHES = 4000
 
 
@@ -56,7 +59,7 @@ class Validation:
 def validation_samples(
     held_out: Sequence[Scene], settings: SampleSettings, variant: Variant, *, seed: int
 ) -> list[tuple[Scene, Sample]]:
-    """Every scene, perturbed; the same for every call.
+    """Every scene (of many, some), perturbed; the same for every call.
 
     Raises:
         DatasetError: if none shows enough points.
@@ -64,12 +67,17 @@ def validation_samples(
     rng = np.random.default_rng([seed, 2**31])
     made = [
         (scene, make_sample(scene, settings=settings, variant=variant, rng=rng))
-        for scene in held_out
+        for scene in _spread_out(held_out)
     ]
     samples = [(scene, sample) for scene, sample in made if sample is not None]
     if not samples:
         raise DatasetError("no held-out frame shows enough points in the image")
     return samples
+
+
+def _spread_out(scenes: Sequence[Scene]) -> list[Scene]:
+    places = np.linspace(0, len(scenes) - 1, min(MAX_SCENES, len(scenes))).round().astype(int)
+    return [scenes[place] for place in places]
 
 
 def pose_error(scene: Scene, sample: Sample, flow_px: NDArray[np.float32]) -> Array | None:
