@@ -71,7 +71,10 @@ DeviceOption = Annotated[
 IterationsOption = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Of each network's recurrent update (default: 12).", rich_help_panel=_CMRNEXT
+        min=1,
+        max=1000,
+        help="Of each network's recurrent update (default: 12).",
+        rich_help_panel=_CMRNEXT,
     ),
 ]
 HalfOption = Annotated[
