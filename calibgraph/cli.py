@@ -14,6 +14,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibgraph.cli_options import (
+    BatchOption,
+    ConfigOption,
+    DatasetArgument,
+    DeviceOption,
+    EstimateOption,
+    FramesOption,
+    HalfOption,
+    IterationsOption,
+    JsonOption,
+    MatcherOption,
+    OcclusionOption,
+    OutOption,
+    PresetOption,
+    RigArgument,
+    RigOption,
+    SeedOption,
+    TermsOption,
+    WeightsOption,
+)
+
 if TYPE_CHECKING:
     from calibgraph.calibration import Calibration
     from calibgraph.config import Config
@@ -29,97 +50,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")]
-DatasetArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/) or KITTI odometry sequence; "
-        "several of one rig form one problem.",
-    ),
-]
-RigOption = Annotated[
-    Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
-]
-MatcherOption = Annotated[
-    str,
-    typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
-]
-_CMRNEXT = "Matcher cmrnext"
-WeightsOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="FILE...",
-        help="Weights of the networks, .tar or .safetensors, in the order in which they are run; "
-        "a file may come again: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-EstimateOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="frame|joint",
-        help="What a network starts from: each frame's own pose by the network before (default), "
-        "or the joint solve over all frames and cameras.",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-DeviceOption = Annotated[
-    str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.", rich_help_panel=_CMRNEXT)
-]
-IterationsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=1000,
-        help="Of each network's recurrent update (default: 12).",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-HalfOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--half-resolution/--full-resolution",
-        help="Halve the images or not (default: as the weights say, else from 1400 px width on).",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-OcclusionOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--occlusion-filter",
-        help="Leave out points seen through something nearer.",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-BatchOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1, help="Images at once (default: 1 on a CPU, 4 on a GPU).", rich_help_panel=_CMRNEXT
-    ),
-]
-FramesOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="A:B:STEP",
-        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.",
-    ),
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")
-]
-PresetOption = Annotated[
-    str | None,
-    typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
-]
-TermsOption = Annotated[
-    str,
-    typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
-]
-OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
-SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -381,42 +311,57 @@ def train(
         ),
     ] = None,
     rotation_deg: Annotated[
-        float, typer.Option(min=0, help="Largest perturbation per axis.")
-    ] = 20.0,
+        float | None, typer.Option(help="Largest perturbation per axis (default: 20).")
+    ] = None,
     translation_m: Annotated[
-        float, typer.Option(min=0, help="Largest perturbation per axis.")
-    ] = 1.5,
-    steps: Annotated[int, typer.Option(min=1, help="Optimizer steps in all.")] = 100_000,
-    batch: Annotated[int, typer.Option(min=1, help="Samples per step.")] = 4,
+        float | None, typer.Option(help="Largest perturbation per axis (default: 1.5).")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Optimizer steps in all (default: 100000).")
+    ] = None,
+    batch: Annotated[int | None, typer.Option(help="Samples per step (default: 4).")] = None,
     width: Annotated[
-        int,
-        typer.Option(min=8, help="Channels of the first layer: 64 as published, 16 for a CPU."),
-    ] = 64,
-    fourier_levels: Annotated[int, typer.Option(help="Of the depth's encoding, -1: none.")] = 12,
+        int | None,
+        typer.Option(help="Channels of the first layer (default: 64, as published)."),
+    ] = None,
+    fourier_levels: Annotated[
+        int | None, typer.Option(help="Of the depth's encoding, -1: none (default: 12).")
+    ] = None,
     reflectance: Annotated[
-        bool, typer.Option("--reflectance", help="Show the network the LiDAR's intensity too.")
-    ] = False,
+        bool | None,
+        typer.Option("--reflectance", help="Show the network the LiDAR's intensity too."),
+    ] = None,
     context: Annotated[
-        str, typer.Option(metavar="lidar|rgb", help="What the context encoder reads.")
-    ] = "lidar",
-    iterations: Annotated[int, typer.Option(min=1, help="Of the recurrent update.")] = 12,
+        str | None,
+        typer.Option(metavar="lidar|rgb", help="What the context encoder reads (default: lidar)."),
+    ] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Of the recurrent update (default: 12).")
+    ] = None,
     crop_px: Annotated[
-        str, typer.Option(metavar="HxW|none", help="Random crops, at full resolution.")
-    ] = "320x960",
+        str | None,
+        typer.Option(
+            metavar="HxW|none", help="Random crops, at full resolution (default: 320x960)."
+        ),
+    ] = None,
     half_resolution: Annotated[
-        bool, typer.Option("--half-resolution", help="Halve the images.")
-    ] = False,
-    learning_rate: Annotated[float, typer.Option(min=0, help="Peak of the one-cycle.")] = 3e-4,
+        bool | None, typer.Option("--half-resolution", help="Halve the images.")
+    ] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option(help="Peak of the one-cycle (default: 3e-4).")
+    ] = None,
     warm_up_share: Annotated[
-        float, typer.Option(min=0.01, max=0.99, help="Of the steps, until that peak.")
-    ] = 0.4,
+        float | None, typer.Option(help="Of the steps, until that peak (default: 0.4).")
+    ] = None,
     correlation_weight: Annotated[
-        float,
-        typer.Option(min=0, help="Of a loss on the correlation itself; 0.1 for short trainings."),
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Of a loss on the correlation itself (default: 0; 0.3 for short trainings)."
+        ),
+    ] = None,
     correlation_steps: Annotated[
-        int, typer.Option(min=0, help="Steps at first with that loss alone.")
-    ] = 0,
+        int | None, typer.Option(help="Steps at first with that loss alone (default: 0).")
+    ] = None,
     validate_every: Annotated[
         int, typer.Option(min=1, help="Steps; the weights are written then.")
     ] = 500,
@@ -434,25 +379,34 @@ def train(
     from calibgraph.load import load_rig
     from calibgraph.tables import print_validation
 
+    settings: dict[str, Any] = {
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+        "steps": steps,
+        "batch": batch,
+        "iterations": iterations,
+        "learning_rate": learning_rate,
+        "warm_up_share": warm_up_share,
+        "correlation_weight": correlation_weight,
+        "correlation_steps": correlation_steps,
+        "crop_px": crop_px,
+        "half_resolution": half_resolution,
+        "width": width,
+        "fourier_levels": fourier_levels,
+        "reflectance": reflectance,
+        "context": context,
+        "seed": seed or None,
+        "from": start,
+    }
+    given = {key: value for key, value in settings.items() if value is not None}
     with _arguments():
-        settings = TrainSettings().changed(
-            rotation_deg=rotation_deg,
-            translation_m=translation_m,
-            steps=steps,
-            batch=batch,
-            iterations=iterations,
-            learning_rate=learning_rate,
-            warm_up_share=warm_up_share,
-            correlation_weight=correlation_weight,
-            correlation_steps=correlation_steps,
-            crop_px=parsed_crop(crop_px),
-            half_resolution=half_resolution,
-            width=width,
-            fourier_levels=fourier_levels,
-            reflectance=reflectance,
-            context=context,
-            seed=seed,
-        )
+        if resume and given:
+            option = next(iter(given)).replace("_", "-")
+            raise ValueError(f"--{option}: --resume goes on with the settings in {out}; leave out")
+        given.pop("from", None)
+        if crop_px is not None:
+            given["crop_px"] = parsed_crop(crop_px)
+        chosen = TrainSettings().changed(**given)
     trusted = load_rig(rig) if rig else None
     data = [trusted_dataset(folder, trusted) for folder in dataset]
     if held_out:
@@ -465,7 +419,7 @@ def train(
             data,
             others,
             out,
-            None if resume else settings,
+            None if resume else chosen,
             device=device,
             validate_every=validate_every,
             start=start,

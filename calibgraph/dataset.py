@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ from calibgraph.clouds import CLOUD_SUFFIXES, load_cloud
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.load import load_rig
 from calibgraph.rig import Camera, Rig
+
+Item = TypeVar("Item")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -102,6 +105,12 @@ def load_dataset(folders: Path | str | Sequence[Path | str], rig: Rig | None = N
     prefix = [f"{path.name}/" if len(paths) > 1 else "" for path in paths for _ in _stems(path)]
     named = (replace(frame, index=i, name=prefix[i] + frame.name) for i, frame in enumerate(frames))
     return Dataset(rig=rigs[0], frames=tuple(named), folders=paths)
+
+
+def spread_out(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of the items, evenly spread over them: neighbours look alike."""
+    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    return [items[place] for place in places]
 
 
 def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:

@@ -21,6 +21,7 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 
 _REFINEMENTS = 2
+_ENOUGH_MATCHES = 4000
 _RANSAC_ITERATIONS = 2000
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _MIN_INLIER_SHARE = 0.1
@@ -70,8 +71,10 @@ def frame_pose(camera: Camera, matches: Correspondences, config: Config) -> Arra
     """(4, 4) T_camera_lidar from one camera's matches in one frame, None if they give none.
 
     MAGSAC on the undistorted plane, then inliers re-selected and refined with the full lens model.
-    No pose, if too few matches agree on one, or if they leave a direction free.
+    No pose, if too few matches agree on one, or if they leave a direction free. Of many matches
+    an even selection is used: it is enough for one frame's pose.
     """
+    matches = matches.select(slice(None, None, -(-len(matches) // _ENOUGH_MATCHES) or None))
     start = _ransac_pnp(camera, matches, config)
     return None if start is None else _refine(camera, matches, start, config)
 

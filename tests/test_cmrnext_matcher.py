@@ -319,7 +319,7 @@ def test_clouds_without_intensity_are_refused_where_it_is_needed() -> None:
     assert lidar_channels(seen, Variant(), 160.0).shape[0] == 1
 
 
-def test_intensities_of_bytes_become_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_intensities_of_bytes_become_unit() -> None:
     camera = make_camera()
     cloud = cloud_before(camera, 100)
     unit = LidarImage.of(cloud, camera.T_camera_lidar, View(camera))

@@ -18,9 +18,9 @@ from calibgraph.cmrnext.samples import Scene, _mirrored, _turned, make_sample, p
 from calibgraph.cmrnext.train_settings import parsed_crop
 from calibgraph.cmrnext.training import one_cycle
 from calibgraph.cmrnext.trusted import split, trusted_dataset
-from calibgraph.cmrnext.validation import MAX_SCENES, _spread_out
+from calibgraph.cmrnext.validation import MAX_SCENES
 from calibgraph.cmrnext.variant import Variant
-from calibgraph.dataset import Dataset
+from calibgraph.dataset import Dataset, spread_out
 from tests.conftest import SAMPLE, Call
 from tests.test_cmrnext_checkpoint import good_content, saved
 
@@ -302,10 +302,10 @@ def test_frames_are_split_at_the_end(trusted: Dataset) -> None:
 
 def test_validation_keeps_few_of_many_scenes(trusted: Dataset) -> None:
     many = [scene(trusted)] * 250 + [scene(trusted, "left")] * 250
-    kept = _spread_out(many)
+    kept = spread_out(many, MAX_SCENES)
     assert len(kept) == MAX_SCENES
     assert sum(s.name == "left" for s in kept) == MAX_SCENES // 2
-    assert _spread_out(many[:3]) == many[:3]
+    assert spread_out(many[:3], MAX_SCENES) == many[:3]
 
 
 def test_crops_are_read() -> None:
@@ -333,6 +333,10 @@ def test_training_runs_on_the_command_line(tmp_path: Path, call: Call) -> None:
     code, _, text = call(*given)
     assert code == 2 and "is there already" in text and text.count("\n") == 1
     code, _, text = call(*given, "--resume")
+    assert code == 2 and "--steps: --resume goes on with the settings in" in text
+    code, _, text = call("train", SAMPLE, "--out", out, "--resume")
     assert code == 2 and "has had all its 1 steps" in text
+    code, _, text = call("train", SAMPLE, "--out", tmp_path / "c.tar", "--width", 12)
+    assert code == 2 and "width 12" in text and text.count("\n") == 1
     code, _, text = call("train", tmp_path / "nothing", "--out", tmp_path / "b.tar")
     assert code == 2 and text.count("\n") == 1

@@ -28,7 +28,7 @@ from calibgraph.cmrnext.network import CELL, CmrNext, torch_device
 from calibgraph.cmrnext.samples import at_full_resolution
 from calibgraph.config import Config
 from calibgraph.correspondences import Correspondences, concatenate
-from calibgraph.dataset import Dataset, Frame
+from calibgraph.dataset import Dataset, Frame, spread_out
 from calibgraph.rig import Camera, Rig, angle_deg
 from calibgraph.stage1 import frame_pose
 
@@ -46,7 +46,6 @@ HALVED_FROM_PX = 1400
 """Images at least this wide are halved unless the weights or the user say otherwise: the networks
 were trained at 1241 pixels, and on larger images halved."""
 
-_PNP_MATCHES = 4000  # at most, of a frame: enough for a pose
 _BATCH = {"cpu": 1, "cuda": 4}
 _PROBED_FRAMES = 5  # per camera
 _BEYOND = 2.0  # times the range of training, corner to corner: no network corrects by more
@@ -162,7 +161,7 @@ class CmrNextMatcher:
             schedule = schedule[round_index : round_index + 1]
         total = len(rig.cameras) * len(dataset.frames)
         found: dict[str, list[_Found]] = {name: [] for name in rig.cameras}
-        probed = _spread_out([frame.index for frame in dataset.frames], _PROBED_FRAMES)
+        probed = {frame.index for frame in spread_out(dataset.frames, _PROBED_FRAMES)}
         done = 0
         for jobs in self._batches(dataset, rig):
             what = f"round {round_index + 1} of {self.rounds}: {jobs[0].frame.name}"
@@ -184,7 +183,7 @@ class CmrNextMatcher:
         for network in schedule:
             results = []
             for i, (job, table) in enumerate(zip(jobs, self._matches(network, jobs), strict=True)):
-                pose = self._pose(job, table)
+                pose = frame_pose(job.camera, table, Config(seed=self.seed))
                 good = pose is not None and _within_range(network.checkpoint, job, pose)
                 failed[i] |= not good
                 results.append(_Found(job, _consistent(job, table, pose), pose, failed[i]))
@@ -240,11 +239,6 @@ class CmrNextMatcher:
             for i, (job, lidar) in enumerate(zip(jobs, seen, strict=True))
         ]
 
-    def _pose(self, job: _Job, table: Correspondences) -> Array | None:
-        """The frame's own pose by PnP, from an even selection of its matches."""
-        step = max(1, -(-len(table) // _PNP_MATCHES))
-        return frame_pose(job.camera, table.select(slice(None, None, step)), Config(seed=self.seed))
-
     def _batches(self, dataset: Dataset, rig: Rig) -> Iterator[list[_Job]]:
         """Jobs of equal image size, frame by frame, loaded when they are asked for."""
         views = {name: View(camera, crop_even=True) for name, camera in rig.cameras.items()}
@@ -299,12 +293,6 @@ def _exact() -> AbstractContextManager[None]:
 def _job(frame: Frame, name: str, camera: Camera, view: View) -> _Job:
     image = view.image(frame.load_image(name, camera))
     return _Job(frame, name, camera, view, image, frame.load_cloud(), camera.T_camera_lidar)
-
-
-def _spread_out(values: Sequence[int], most: int) -> set[int]:
-    """Some of the values, evenly spread over them."""
-    places = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
-    return {values[place] for place in places}
 
 
 def _findings(found: Mapping[str, Sequence[_Found]]) -> dict[str, Any]:

@@ -44,8 +44,6 @@ from calibgraph.files import require_place_for_file, write_atomically
 Array = NDArray[np.float64]
 Report = Callable[[str, int, int], None]
 
-REFERENCE_NAME = "reference.yaml"
-
 _DISCOUNT = 0.8  # of each iteration's loss against the next one's
 _WEIGHT_DECAY = 5e-6
 _START, _END = 0.1, 1e-6  # of the one-cycle learning rate, as shares of its peak
@@ -98,9 +96,7 @@ def train(
     if resume:
         run = _resumed(out, device)
     else:
-        run = _fresh(
-            out, settings or TrainSettings(), device, None if start is None else Path(start)
-        )
+        run = _fresh(out, settings or TrainSettings(), device, start)
     checks = validation_samples(
         others,
         run.settings.samples(augment=False),

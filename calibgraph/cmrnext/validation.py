@@ -14,6 +14,7 @@ from calibgraph.cmrnext.samples import Sample, SampleSettings, Scene, make_sampl
 from calibgraph.cmrnext.variant import Variant
 from calibgraph.config import Config
 from calibgraph.correspondences import Correspondences
+from calibgraph.dataset import spread_out
 from calibgraph.errors import DatasetError
 from calibgraph.stage1 import frame_pose
 
@@ -21,8 +22,6 @@ Array = NDArray[np.float64]
 
 MAX_SCENES = 100
 """Images validated on, spread evenly over those held out: they are kept in memory."""
-
-_PNP_MATCHES = 4000
 
 
 @dataclass(frozen=True)
@@ -67,17 +66,12 @@ def validation_samples(
     rng = np.random.default_rng([seed, 2**31])
     made = [
         (scene, make_sample(scene, settings=settings, variant=variant, rng=rng))
-        for scene in _spread_out(held_out)
+        for scene in spread_out(held_out, MAX_SCENES)
     ]
     samples = [(scene, sample) for scene, sample in made if sample is not None]
     if not samples:
         raise DatasetError("no held-out frame shows enough points in the image")
     return samples
-
-
-def _spread_out(scenes: Sequence[Scene]) -> list[Scene]:
-    places = np.linspace(0, len(scenes) - 1, min(MAX_SCENES, len(scenes))).round().astype(int)
-    return [scenes[place] for place in places]
 
 
 def pose_error(scene: Scene, sample: Sample, flow_px: NDArray[np.float32]) -> Array | None:
@@ -91,8 +85,7 @@ def pose_error(scene: Scene, sample: Sample, flow_px: NDArray[np.float32]) -> Ar
         pixels_px=sample.pixels_px + flow_px,
         points_lidar_m=sample.points_camera_m,
     )
-    step = max(1, -(-len(matches) // _PNP_MATCHES))
-    T = frame_pose(camera, matches.select(slice(None, None, step)), Config())
+    T = frame_pose(camera, matches, Config())
     return None if T is None else _twist(T)
 
 

@@ -1,0 +1,99 @@
+"""Arguments and options that several commands share, and those of the learned matcher."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")]
+DatasetArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="DATASET...",
+        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/) or KITTI odometry sequence; "
+        "several of one rig form one problem.",
+    ),
+]
+RigOption = Annotated[
+    Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
+]
+MatcherOption = Annotated[
+    str,
+    typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
+]
+_CMRNEXT = "Matcher cmrnext"
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="FILE...",
+        help="Weights of the networks, .tar or .safetensors, in the order in which they are run; "
+        "a file may come again: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+EstimateOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="frame|joint",
+        help="What a network starts from: each frame's own pose by the network before (default), "
+        "or the joint solve over all frames and cameras.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+DeviceOption = Annotated[
+    str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.", rich_help_panel=_CMRNEXT)
+]
+IterationsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1000,
+        help="Of each network's recurrent update (default: 12).",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+HalfOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--half-resolution/--full-resolution",
+        help="Halve the images or not (default: as the weights say, else from 1400 px width on).",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+OcclusionOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--occlusion-filter",
+        help="Leave out points seen through something nearer.",
+        rich_help_panel=_CMRNEXT,
+    ),
+]
+BatchOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Images at once (default: 1 on a CPU, 4 on a GPU).", rich_help_panel=_CMRNEXT
+    ),
+]
+FramesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A:B:STEP",
+        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.",
+    ),
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")
+]
+PresetOption = Annotated[
+    str | None,
+    typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
+]
+TermsOption = Annotated[
+    str,
+    typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
+]
+OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
+SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
