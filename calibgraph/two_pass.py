@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.assess import assess
+from calibgraph.assess import Assessment, assess
 from calibgraph.calibration import Calibration
 from calibgraph.config import TERMS, Config, Terms
 from calibgraph.correspondences import Correspondences
@@ -22,7 +22,7 @@ from calibgraph.preprocess import FILTERS, preprocess
 from calibgraph.problem import Poses, Problem, Scales
 from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
-from calibgraph.verdict import rig_verdict, said_by_matcher, with_matching
+from calibgraph.verdict import Matching, rig_verdict, said_by_matcher, with_matching
 
 Array = NDArray[np.float64]
 
@@ -81,12 +81,7 @@ def solve(
             systematic_sigmas=table.systematic_sigmas,
         )
     verdicts = {
-        name: with_matching(
-            verdict,
-            replace(
-                said_by_matcher(table.metadata, name), systematic_sigmas=table.systematic_sigmas
-            ),
-        )
+        name: with_matching(verdict, _matching(table, assessment, name))
         for name, verdict in assessment.verdicts.items()
     }
     return Calibration(
@@ -103,6 +98,14 @@ def solve(
         config=config,
         stage1_T_camera_lidar=stage1.T_camera_lidar,
     )
+
+
+def _matching(table: Correspondences, assessment: Assessment, name: str) -> Matching:
+    """What the table says of a camera's matching; where there is an error bar, it holds part."""
+    said = said_by_matcher(table.metadata, name)
+    if assessment.covariance[name] is not None:
+        return said
+    return replace(said, systematic_sigmas=table.systematic_sigmas)
 
 
 class Clock:

@@ -450,3 +450,14 @@ def test_a_table_carries_what_its_matcher_said(pair: calibgraph.Rig) -> None:
     for nonsense in ({"left": "high"}, {"left": True}, 3, [1]):
         with pytest.raises(calibgraph.CorrespondenceError, match="recall"):
             calibgraph.solve(pair, replace(table, metadata={"recall": nonsense}))
+
+
+def test_a_matchers_own_error_is_judged_once(pair: calibgraph.Rig) -> None:
+    """It is part of the error bar; with too few frames for one it stands alone."""
+    for frames, reason in ((8, "sigma: rotation"), (3, "the matcher's own error: rotation")):
+        table = calibgraph.simulate_correspondences(pair, frames=frames, matches=200)
+        said = replace(table, metadata={"systematic_rotation_rad": 0.02})
+        verdict = calibgraph.solve(pair, said).camera_verdicts["left"]
+        assert verdict.status == "FAIL"
+        rotations = [text for text in verdict.reasons if "rotation" in text]
+        assert len(rotations) == 1 and rotations[0].startswith(reason)
