@@ -67,7 +67,9 @@ class ProjectionBlock:
     sqrt_information: Array | None = None
     loss: str = "cauchy"
     scale: float = 4.0
-    _last: list[tuple[bytes, tuple[Array, Array]]] = field(default_factory=list, repr=False)
+    _last: list[tuple[bytes, tuple[Array, Array]]] = field(
+        default_factory=list, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -257,3 +259,15 @@ def test_bad_blocks_are_refused() -> None:
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), loss="welsch")
     with pytest.raises(ValueError, match="scale"):
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), scale=0.0)
+
+
+def test_a_copy_with_other_matches_does_not_remember_those_of_the_original() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(2, 9, (20, 3))
+    whole = ProjectionBlock(Lens.pinhole(fx=300, fy=300, cx=0, cy=0), points, np.zeros((20, 2)))
+    pose = gtsam.Pose3()
+    before = whole.error_and_jacobian(pose)[1]
+    part = replace(whole, points_lidar_m=points[:10], pixels_px=np.zeros((10, 2)))
+    found, again = part.error_and_jacobian(pose)[1], whole.error_and_jacobian(pose)[1]
+    np.testing.assert_allclose(found.T @ found, part.sums(pose).hessian, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(again, before)
