@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.correspondences import Correspondences
+from calibgraph.correspondences import Correspondences, as_confidence
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_atomically
 
@@ -21,11 +22,14 @@ Array = NDArray[np.float64]
 
 TABLE_FORMAT = "calibgraph-correspondences/1"
 
-_COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
-_INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
-_WHOLE = ("stamp_ns", "point_index")
-_REQUIRED = ("camera", "frame", *_COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", *_WHOLE, *_INFORMATION)
+COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
+INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+
+_OPTIONAL_WHOLE = ("stamp_ns", "point_index")
+_WHOLE = ("frame", *_OPTIONAL_WHOLE)
+_REQUIRED = ("camera", "frame", *COORDINATES)
+_COLUMNS = (*_REQUIRED, "confidence", *_OPTIONAL_WHOLE, *INFORMATION)
+_TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 
 def save_correspondences(table: Correspondences, path: Path) -> None:
@@ -49,14 +53,14 @@ def to_arrow(table: Correspondences) -> pa.Table:
             table.camera_index, pa.array(table.cameras, pa.string())
         ),
         "frame": table.frame,
-        **dict(zip(_COORDINATES[:2], table.pixels_px.T, strict=True)),
-        **dict(zip(_COORDINATES[2:], table.points_lidar_m.T, strict=True)),
+        **dict(zip(COORDINATES[:2], table.pixels_px.T, strict=True)),
+        **dict(zip(COORDINATES[2:], table.points_lidar_m.T, strict=True)),
         "confidence": table.confidence,
     }
-    optional = {name: getattr(table, name) for name in _WHOLE}
+    optional = {name: getattr(table, name) for name in _OPTIONAL_WHOLE}
     columns |= {name: column for name, column in optional.items() if column is not None}
     if table.information_px is not None:
-        columns |= dict(zip(_INFORMATION, table.information_px.T, strict=True))
+        columns |= dict(zip(INFORMATION, table.information_px.T, strict=True))
     metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(table.metadata)}
     return pa.table(columns).replace_schema_metadata(metadata)
 
@@ -65,48 +69,126 @@ def load_correspondences(path: Path | str) -> Correspondences:
     """Read a table from Parquet, or from CSV with the same columns.
 
     Raises:
-        FileError: if the file is missing, truncated, or lacks a column.
-        CorrespondenceError: if a value is wrong.
+        FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
     """
-    import pyarrow as pa
-
     path = require_file(Path(path))
-    table = _read_arrow(path)
-    _check_form(path, table)
+    table = read_arrow(path)
+    require_rows(path, len(table))
     try:
         return from_arrow(table)
     except CorrespondenceError as error:
         raise FileError(path, str(error)) from error
-    except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
-        raise FileError(path, f"a column or the metadata has the wrong type: {error}") from error
 
 
-def _check_form(path: Path, table: pa.Table) -> None:
-    """Whether a file has the columns and the format of a table, and rows."""
-    missing = [name for name in _REQUIRED if name not in table.column_names]
-    unknown = [name for name in table.column_names if name not in _COLUMNS]
-    if missing:
-        raise FileError(path, f"column {missing[0]!r} is missing; found {table.column_names}")
-    if unknown:
-        raise FileError(path, f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
-    if not len(table):
+def read_arrow(path: Path) -> pa.Table:
+    """A whole Parquet or CSV file, whatever its columns.
+
+    Raises:
+        FileError: if it cannot be read.
+    """
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    with arrow_reads(path):
+        if path.suffix == ".csv":
+            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
+            return csv.read_csv(path, convert_options=strings)
+        with parquet.ParquetFile(path) as file:
+            return file.read()
+
+
+@contextmanager
+def arrow_reads(path: Path) -> Iterator[None]:
+    """Whatever Arrow finds wrong with a file in here is a ``FileError``."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (pa.ArrowException, OSError, ValueError) as error:
+        kind = "CSV" if path.suffix == ".csv" else "Parquet"
+        message = f"cannot be read as {kind} ({error}); is it complete? write it again"
+        raise FileError(path, message) from error
+
+
+def require_rows(path: Path, rows: int) -> None:
+    """Whether a file has any.
+
+    Raises:
+        FileError: if not.
+    """
+    if not rows:
         raise FileError(path, "holds no rows; write the correspondences into it")
-    if len(set(table.column_names)) < len(table.column_names):
-        raise FileError(path, f"has a column twice: {table.column_names}; keep one")
-    form = (
-        (table.schema.metadata or {})
-        .get(b"format", TABLE_FORMAT.encode())
-        .decode("utf-8", "replace")
-    )
+
+
+def check_schema(schema: pa.Schema) -> None:
+    """Whether a table has the columns and the format of the file, each column of a right type.
+
+    Raises:
+        CorrespondenceError: with the first thing that is wrong.
+    """
+    try:
+        types = [(field.name, str(field.type)) for field in schema]
+    except UnicodeDecodeError as error:
+        raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
+    names = [name for name, _ in types]
+    missing = [name for name in _REQUIRED if name not in names]
+    unknown = [name for name in names if name not in _COLUMNS]
+    partial = [name for name in INFORMATION if name in names]
+    if missing:
+        raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
+    if unknown:
+        raise CorrespondenceError(f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
+    if len(set(names)) < len(names):
+        raise CorrespondenceError(f"has a column twice: {names}; keep one")
+    if partial and len(partial) < len(INFORMATION):
+        raise CorrespondenceError(f"has only {partial} of the columns {list(INFORMATION)}")
+    form = (schema.metadata or {}).get(b"format", TABLE_FORMAT.encode()).decode("utf-8", "replace")
     if form != TABLE_FORMAT:
-        raise FileError(path, f"has the format {form!r}, expected {TABLE_FORMAT!r}")
-    partial = [name for name in _INFORMATION if name in table.column_names]
-    if partial and len(partial) < len(_INFORMATION):
-        raise FileError(path, f"has only {partial} of the columns {list(_INFORMATION)}")
+        raise CorrespondenceError(f"has the format {form!r}, expected {TABLE_FORMAT!r}")
+    for field in schema:
+        _check_type(field)
+
+
+def _check_type(field: pa.Field) -> None:
+    """Whether a column's type is a plain one, whose size in memory is that of the data.
+
+    Of run-end encoded values, say, a few bytes could stand for any number of rows.
+    """
+    from pyarrow import types
+
+    if types.is_null(field.type):
+        raise CorrespondenceError(f"column {field.name!r} is empty; fill in or drop it")
+    if field.name == "camera":
+        named = field.type.value_type if types.is_dictionary(field.type) else field.type
+        kind, right = "text", str(named) in _TEXT or types.is_integer(named)
+    elif field.name in _WHOLE:
+        kind, right = "whole numbers", types.is_integer(field.type)
+    else:
+        kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
+    if not right:
+        raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")
 
 
 def from_arrow(table: pa.Table) -> Correspondences:
-    """Build correspondences from an Arrow table that has the file format's columns."""
+    """Build correspondences from an Arrow table that has the file format's columns.
+
+    Raises:
+        CorrespondenceError: if a column, a value or the metadata is wrong.
+    """
+    import pyarrow as pa
+
+    check_schema(table.schema)
+    try:
+        # As plain strings: a name that is null may hide in a dictionary.
+        names = table["camera"].cast(pa.string())
+        camera = table.column_names.index("camera")
+        return _from_plain_columns(table.set_column(camera, "camera", names))
+    except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
+        message = f"a column or the metadata has the wrong type: {error}"
+        raise CorrespondenceError(message) from error
+
+
+def _from_plain_columns(table: pa.Table) -> Correspondences:
     import pyarrow as pa
 
     for name in table.column_names:
@@ -114,55 +196,30 @@ def from_arrow(table: pa.Table) -> Correspondences:
             row = table[name].is_null().to_pylist().index(True)
             raise CorrespondenceError(f"row {row}: column {name!r} is empty; fill in or drop it")
 
-    def column(name: str, dtype: type) -> NDArray[Any]:
-        values = np.asarray(table[name].to_numpy())
-        if values.dtype == np.uint64 and len(values) and values.max() < 2**63:
-            values = values.astype(np.int64)
-        if values.dtype.kind not in "iuf" or not np.can_cast(
-            values.dtype, dtype, casting="same_kind" if dtype is not np.int64 else "safe"
-        ):
-            kind = "whole numbers" if dtype is np.int64 else "numbers"
-            raise CorrespondenceError(
-                f"column {name!r} must hold {kind}, found {table[name].type}: {values[:1].tolist()}"
-            )
-        return values.astype(dtype)
-
     def stack(names: Sequence[str]) -> Array:
-        return np.stack([column(name, np.float64) for name in names], axis=1)
+        return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)
 
     given = table.column_names
-    encoded = table["camera"].cast(pa.string()).combine_chunks().dictionary_encode()
+    encoded = table["camera"].combine_chunks().dictionary_encode()
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.combine_chunks()
-    metadata = json.loads((table.schema.metadata or {}).get(b"matcher", b"{}"))
-    if not isinstance(metadata, dict):
-        raise CorrespondenceError("the schema's metadata 'matcher' must be a JSON object")
     return Correspondences(
         cameras=tuple(encoded.dictionary.to_pylist()),
         camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
-        frame=column("frame", np.int64),
-        pixels_px=stack(_COORDINATES[:2]),
-        points_lidar_m=stack(_COORDINATES[2:]),
-        confidence=column("confidence", np.float32)
+        frame=_whole(table, "frame"),
+        pixels_px=stack(COORDINATES[:2]),
+        points_lidar_m=stack(COORDINATES[2:]),
+        confidence=as_confidence(table["confidence"].to_numpy())
         if "confidence" in given
         else np.ones(len(table), np.float32),
-        information_px=stack(_INFORMATION) if _INFORMATION[0] in given else None,
-        **{name: column(name, np.int64) for name in _WHOLE if name in given},
-        metadata=metadata,
+        information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
+        **{name: _whole(table, name) for name in _OPTIONAL_WHOLE if name in given},
+        metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
 
 
-def _read_arrow(path: Path) -> pa.Table:
-    import pyarrow as pa
-    from pyarrow import csv, parquet
-
-    try:
-        if path.suffix == ".csv":
-            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
-            return csv.read_csv(path, convert_options=strings)
-        return parquet.ParquetFile(path).read()
-    except (pa.ArrowException, OSError) as error:
-        kind = "CSV" if path.suffix == ".csv" else "Parquet"
-        raise FileError(
-            path, f"cannot be read as {kind} ({error}); is it complete? write it again"
-        ) from error
+def _whole(table: pa.Table, name: str) -> NDArray[np.int64]:
+    values = table[name].to_numpy()
+    if values.dtype == np.uint64 and (values >= 2**63).any():
+        raise CorrespondenceError(f"column {name!r} holds a number beyond 64 bits")
+    return np.asarray(values, dtype=np.int64)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: nothing that is matched lies farther
 _MAX_WHOLE = 2**63 - 1
-MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e12  # 1/px^2
+MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,7 +39,8 @@ class Correspondences:
         metadata: where the table comes from: the matcher and its settings.
 
     Raises:
-        CorrespondenceError: on wrong shapes or values, naming the first bad row.
+        CorrespondenceError: on wrong shapes or values, naming the first bad row, and if the
+            metadata gives ``systematic_sigmas`` wrongly.
     """
 
     cameras: tuple[str, ...]
@@ -68,6 +69,7 @@ class Correspondences:
             raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
         if not isinstance(self.metadata, dict):
             raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
+        _ = self.systematic_sigmas
         self._check_values()
 
     @staticmethod
@@ -104,7 +106,7 @@ class Correspondences:
             frame=np.array(np.broadcast_to(np.asarray(frame, dtype=np.int64), n)),
             pixels_px=pixels,
             points_lidar_m=np.asarray(points_lidar_m, dtype=np.float64),
-            confidence=np.asarray(given, dtype=np.float32),
+            confidence=as_confidence(given),
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
             point_index=_optional(point_index, np.int64),
@@ -138,16 +140,16 @@ class Correspondences:
         ``systematic_rotation_rad`` and ``systematic_translation_m``; zero where it says nothing.
 
         Raises:
-            CorrespondenceError: if what it says is not a number >= 0.
+            CorrespondenceError: if what it says is not a number from 0 to pi, and to 100.
         """
-        keys = ("systematic_rotation_rad", "systematic_translation_m")
-        rotation, translation = (self.metadata.get(key, 0.0) for key in keys)
-        for key, value in zip(keys, (rotation, translation), strict=True):
-            if not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+        limits = {"systematic_rotation_rad": math.pi, "systematic_translation_m": 100.0}
+        rotation, translation = (_as_float(self.metadata.get(key, 0.0)) for key in limits)
+        for (key, most), value in zip(limits.items(), (rotation, translation), strict=True):
+            if not isinstance(value, float) or not 0 <= value <= most:
                 raise CorrespondenceError(
-                    f"metadata {key!r} must be a number >= 0, found {value!r}"
+                    f"metadata {key!r} must be a number from 0 to {most:.3g}, found {value!r}"
                 )
-        return float(rotation), float(translation)
+        return rotation, translation
 
     def counts(self) -> dict[str, int]:
         """Rows per camera."""
@@ -197,6 +199,20 @@ _WIDTHS = {
     "information_px": 3, "stamp_ns": 1, "point_index": 1,
 }  # fmt: skip
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
+
+
+def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
+    """Confidences in single precision; one beyond it becomes infinite, which a table refuses."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype=np.float32)
+
+
+def _as_float(value: Any) -> Any:
+    """A whole number as a float, infinite if there is none so large; anything else as it is."""
+    try:
+        return float(value) if isinstance(value, int) else value
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _optional(values: ArrayLike | None, dtype: type) -> Any:

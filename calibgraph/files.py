@@ -39,7 +39,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -70,8 +70,8 @@ def require_place_for_folder(folder: Path) -> None:
             raise FileError(part, "is a file, expected a folder to write into; choose another")
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a rename in ``folder`` durable, where the system can."""
+def sync_folder(folder: Path) -> None:
+    """Make the renames in a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -98,11 +98,15 @@ def require_file(path: Path) -> Path:
     """Return ``path`` if it is a file.
 
     Raises:
-        FileError: if it is missing or a folder.
+        FileError: if it is missing or a folder, or its name is none that a file can have.
     """
-    if path.is_dir():
+    try:
+        is_folder, is_file = path.is_dir(), path.is_file()
+    except OSError as error:  # A name that is too long, or a folder above that is closed to us.
+        raise FileError(path, f"cannot be read ({error.strerror}); check the path") from error
+    if is_folder:
         raise FileError(path, "is a folder, expected a file")
-    if not path.is_file():
+    if not is_file:
         raise FileError(path, "no such file; check the path")
     return path
 

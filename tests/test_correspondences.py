@@ -18,7 +18,7 @@ from calibgraph import (
     load_correspondences,
     simulate_correspondences,
 )
-from calibgraph.correspondence_file import to_arrow
+from calibgraph.correspondence_file import from_arrow, to_arrow
 from calibgraph.preprocess import constrained_error_px, preprocess, sqrt_information
 
 
@@ -77,6 +77,7 @@ def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
         ({"confidence": [0.5, 0, 1, 1]}, r"row 1 .*confidence must lie in \(0, 1\]"),
         ({"confidence": [0.5, 1.5, 1, 1]}, "confidence"),
         ({"confidence": [0.5, np.nan, 1, 1]}, "confidence"),
+        ({"confidence": [0.5, 1e300, 1, 1]}, r"row 1 .*confidence must lie in \(0, 1\]"),
         ({"information_px": [[1, 2, 1]] * 4}, "positive semidefinite"),
         ({"information_px": [[0, 0, 0]] * 4}, "not zero"),
         ({"pixels_px": [[1e308, 1]] * 4}, "pixel must be finite and below"),
@@ -84,6 +85,13 @@ def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
         ({"information_px": [[1e-200, 2e-200, 1e-200]] * 4}, "positive semidefinite"),
         ({"frame": [0.5, 1, 1, 1]}, "frame must hold whole numbers"),
         ({"metadata": [1]}, "metadata must be a mapping"),
+        (
+            {"metadata": {"systematic_rotation_rad": 10**400}},
+            "must be a number from 0 to 3.14, found inf",
+        ),
+        ({"metadata": {"systematic_rotation_rad": -(10**400)}}, "found -inf"),
+        ({"metadata": {"systematic_translation_m": np.nan}}, "found nan"),
+        ({"metadata": {"systematic_translation_m": "1"}}, "found '1'"),
         ({"points_lidar_m": [[1, 2]] * 4}, r"shape \(4, 2\), expected \(4, 3\)"),
         ({"confidence": [1.0]}, "shape"),
     ],
@@ -119,6 +127,11 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
         load_correspondences(tmp_path / "missing.parquet")
 
 
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="cannot be read .*name too long.*; check the path"):
+        load_correspondences(tmp_path / ("x" * 300 + ".parquet"))
+
+
 def test_unknown_and_missing_columns_are_named(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
     arrow = to_arrow(table())
@@ -139,7 +152,7 @@ def test_tables_of_another_format_or_kind_are_named(tmp_path: Path) -> None:
             "has the format 'calibgraph-correspondences/9'",
         ),
         ({"matcher": "not JSON"}, "metadata"),
-        ({"matcher": "[1]"}, "must be a JSON object"),
+        ({"matcher": "[1]"}, "metadata must be a mapping"),
         ({"matcher": "[" * 100_000}, "metadata"),
     ):
         parquet.write_table(arrow.replace_schema_metadata(metadata), path)
@@ -157,6 +170,93 @@ def test_tables_of_another_format_or_kind_are_named(tmp_path: Path) -> None:
         with pytest.raises(FileError, match=str(path)) as caught:
             load_correspondences(path)
         assert "\n" not in str(caught.value)
+
+
+def test_a_whole_number_is_a_systematic_error_as_well(tmp_path: Path) -> None:
+    said = {"systematic_rotation_rad": 1, "systematic_translation_m": 0.02}
+    table(metadata=said).save(tmp_path / "table.parquet")
+    assert load_correspondences(tmp_path / "table.parquet").systematic_sigmas == (1.0, 0.02)
+
+
+def changed(name: str, column: pa.Array | pa.ChunkedArray, **metadata: str | bytes) -> pa.Table:
+    """A good Arrow table with one column, or its metadata, replaced."""
+    arrow = to_arrow(table())
+    arrow = arrow.set_column(arrow.column_names.index(name), name, column)
+    return arrow.replace_schema_metadata(metadata)
+
+
+FOUR = [1.0] * 4
+CAMERAS = pa.array([0, 1, 0, 2])
+
+
+@pytest.mark.parametrize(
+    ("arrow", "message"),
+    [
+        (to_arrow(table()).drop_columns(["v_px"]), "column 'v_px' is missing"),
+        (changed("confidence", pa.array([1, 1e300, 1, 1])), r"row 1 .*lie in \(0, 1\]"),
+        (changed("u_px", pa.array([1, None, 1, 1])), "row 1: column 'u_px' is empty"),
+        (changed("u_px", pa.nulls(4)), "column 'u_px' is empty; fill in or drop it"),
+        (changed("camera", pa.array(["a", "b", None, "c"])), "row 2: column 'camera' is empty"),
+        (
+            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, ["a", None, "b"])),
+            "row 1: column 'camera' is empty",
+        ),
+        (
+            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, FOUR)),
+            "'camera' must hold text, found dictionary<values=double",
+        ),
+        (changed("camera", pa.array([b"\xff"] * 4)), "has the wrong type: Invalid UTF8"),
+        (changed("frame", pa.array([2**63] * 4, pa.uint64())), "'frame' .* beyond 64 bits"),
+        (changed("frame", pa.array(FOUR)), "'frame' must hold whole numbers, found double"),
+        (changed("u_px", pa.array(["1"] * 4)), "'u_px' must hold numbers, found string"),
+        (
+            changed("u_px", pa.RunEndEncodedArray.from_arrays([4], [1.0])),
+            "'u_px' must hold numbers, found run_end_encoded",
+        ),
+        (changed("u_px", pa.array([FOUR] * 4)), "'u_px' must hold numbers, found list"),
+        (
+            changed("u_px", pa.array(FOUR).dictionary_encode()),
+            "'u_px' must hold numbers, found dictionary",
+        ),
+        (changed("u_px", pa.array([1] * 4, pa.decimal128(3, 1))), "found decimal"),
+        (changed("u_px", pa.array([1] * 4, pa.timestamp("s"))), "found timestamp"),
+        (
+            changed("u_px", pa.array(FOUR), matcher='{"systematic_rotation_rad": -1}'),
+            "metadata 'systematic_rotation_rad' must be a number from 0 to 3.14, found -1.0",
+        ),
+        (
+            changed("u_px", pa.array(FOUR), matcher=b'{"a": "\xff"}'),
+            "the metadata has the wrong type",
+        ),
+    ],
+)
+def test_wrong_arrow_data_is_named_in_one_line(arrow: pa.Table, message: str) -> None:
+    with pytest.raises(CorrespondenceError, match=message) as caught:
+        from_arrow(arrow)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        pa.array(["left", "left", "right", "left"]).dictionary_encode(),
+        pa.array(["left", "left", "right", "left"], pa.large_string()),
+        pa.array([b"left", b"left", b"right", b"left"]),
+        pa.chunked_array([pa.array(["left", "left"]), pa.array(["right", "left"])]),
+        pa.DictionaryArray.from_arrays([0, 1, 3, 0], ["left", "left", None, "right"]),
+    ],
+)
+def test_names_of_cameras_may_be_any_text(cameras: pa.Array | pa.ChunkedArray) -> None:
+    read = from_arrow(changed("camera", cameras))
+    assert read.counts() == {"left": 3, "right": 1}
+
+
+def test_a_column_whose_name_is_no_utf8_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"camera,fr\xffame,u_px,v_px,x_m,y_m,z_m\nleft,1,1,2,3,4,5\n")
+    with pytest.raises(FileError, match="table.csv: a column's name is not UTF-8") as caught:
+        load_correspondences(path)
+    assert "\n" not in str(caught.value)
 
 
 def test_concatenating_keeps_rows_and_fills_information() -> None:
