@@ -94,7 +94,13 @@ def _joint_covariance(
         return None
     blocks = {name: m.scaled(scales[name]) for name, m in inliers.matches.items()}
     frames = {name: m.frame for name, m in inliers.matches.items()}
-    scatter = cluster_robust_covariance(blocks, frames, inliers.pose_graph, solution.T_camera_lidar)
+    scatter = cluster_robust_covariance(
+        blocks,
+        frames,
+        inliers.pose_graph,
+        solution.T_camera_lidar,
+        gate_hessian=inliers.gate_hessian,
+    )
     if scatter is None:
         return None
     rotation, translation = systematic_sigmas
@@ -130,10 +136,11 @@ def _conflicts(
     start = {name: solution.T_camera_lidar[name] for name in cameras}
     alone = free.minimize(start, scales)
     covariance = _joint_covariance(free, alone, scales, systematic_sigmas)
-    return [_conflict(pair, cameras, alone.T_camera_lidar, covariance) for pair in pairs]
+    found = alone.T_camera_lidar
+    return [relative_pose_conflict(pair, cameras, found, covariance) for pair in pairs]
 
 
-def _conflict(
+def relative_pose_conflict(
     pair: RelativePose, cameras: tuple[str, ...], T: Mapping[str, Array], covariance: Array | None
 ) -> Conflict:
     """The difference of a relative pose from an estimate, and the sigma expected of it."""

@@ -25,6 +25,8 @@ def cluster_robust_covariance(
     frames: Mapping[str, NDArray[np.int64]],
     pose_graph: gtsam.NonlinearFactorGraph,
     T_camera_lidar: Mapping[str, Array],
+    *,
+    gate_hessian: Mapping[str, Array] | None = None,
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T) H^-1 F / (F - 1)``.
 
@@ -37,6 +39,7 @@ def cluster_robust_covariance(
         frames: per camera, the sorted frame number of each of them.
         pose_graph: the priors and relative poses.
         T_camera_lidar: the solution, all cameras.
+        gate_hessian: per camera, what the gate's moving with the solution adds to H.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
@@ -48,11 +51,12 @@ def cluster_robust_covariance(
     if len(numbers) < MIN_FRAMES:
         return None
     size = 6 * len(cameras)
-    hessian = _pose_hessian(pose_graph, cameras, T_camera_lidar)
+    hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     gradients = np.zeros((len(numbers), size))
     for name, block in blocks.items():
         rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
-        hessian[rows, rows] += _block_hessian(block, T_camera_lidar[name])
+        hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
+        hessian[rows, rows] += (gate_hessian or {}).get(name, 0.0)
         own, starts = np.unique(frames[name], return_index=True)
         edges = np.append(starts, len(frames[name]))
         sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
@@ -84,7 +88,7 @@ def data_sigmas(
         infinite where nothing is known.
     """
     cameras = list(T_camera_lidar)
-    hessian = _pose_hessian(pose_graph, cameras, T_camera_lidar)
+    hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     for name, block in blocks.items():
         rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
         sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
@@ -97,7 +101,7 @@ def data_sigmas(
     return np.sqrt(np.where(loose, np.inf, variances)).reshape(-1, 6)
 
 
-def _pose_hessian(
+def pose_hessian(
     graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
 ) -> Array:
     """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
@@ -112,12 +116,15 @@ def _pose_hessian(
     return hessian
 
 
-def _block_hessian(block: ProjectionBlock, T_camera_lidar: Array) -> Array:
+def robust_hessian(block: ProjectionBlock, pose: gtsam.Pose3) -> Array:
     """(6, 6) derivative of the gradient of half the robust cost, by central differences.
 
     Where the robust cost is not convex the reweighted Hessian, which always is, stands in.
+
+    Args:
+        block: correspondences of one camera.
+        pose: ``T_lidar_camera``, in whose tangent the Hessian is.
     """
-    pose = to_T_lidar_camera(T_camera_lidar)
     steps = np.eye(6) * _STEP
     rows = [
         block.sums(pose.retract(step)).gradient - block.sums(pose.retract(-step)).gradient

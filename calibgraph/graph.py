@@ -14,7 +14,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.rig import RelativePose
+from calibgraph.config import Config, Terms
+from calibgraph.rig import RelativePose, Rig
 from factors import (
     ProjectionBlock,
     block_factor,
@@ -116,6 +117,24 @@ def relative_pose_graph(
         )
         for pair in relative_poses
     )
+
+
+def pose_graph(
+    rig: Rig, T_hat: Mapping[str, Array], config: Config, terms: Terms
+) -> gtsam.NonlinearFactorGraph:
+    """Everything that is known of poses apart from correspondences."""
+    cameras = list(rig.cameras)
+    known = relative_pose_graph(cameras, rig.relative_poses)
+    if terms == "reprojection":
+        return known
+    return joined(
+        known,
+        prior_graph(cameras, T_hat, weight=config.prior_weight),
+        relative_prior_graph(
+            cameras, T_hat,
+            weight=config.relative_prior_weight, pairs=config.relative_prior_pairs,
+        ),
+    )  # fmt: skip
 
 
 def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

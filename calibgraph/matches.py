@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,7 +33,10 @@ MIN_SIGMA_PX = 0.05
 """Spread below which `auto` does not shrink: noise-free data would have none."""
 
 _START_QUANTILE, _START_FACTOR = 0.2, 1.762  # that quantile of a Rayleigh law, to its median
+_HALF = 0.5
 _CUT = 4.0  # medians: inliers lie below, in one and in two dimensions
+_GATE_BAND = 0.1  # of the gate, on either side of it
+_IDENTITY = np.array([1.0, 0.0, 1.0])  # entries (0,0), (0,1), (1,1)
 _MEDIAN_NORM = np.array([0.67449, 1.17741])  # of a standard Gaussian error in 1 and 2 dimensions
 
 
@@ -84,7 +88,7 @@ class Matches:
         """The block with its loss, in units of the residuals' sigma."""
         root = self.block.sqrt_information
         if scale.sigma != 1.0:
-            ones = np.tile([1.0, 0.0, 1.0], (len(self.frame), 1))
+            ones = np.tile(_IDENTITY, (len(self.frame), 1))
             root = (ones if root is None else root) / scale.sigma
         return replace(self.block, sqrt_information=root, scale=scale.loss_scale / scale.sigma)
 
@@ -95,21 +99,62 @@ class Matches:
 
     def scale(self, T_camera_lidar: Array, config: Config) -> Scale:
         """The configured scales, or those of the residuals' own spread at a pose."""
-        residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-        sigma_px = self._spread(constrained_error_px(residuals, self.information)[valid], valid)
-        spread = max(self._spread(self._whitened_norm(residuals)[valid], valid), self._floor)
-        fixed = config.loss_scale_px
-        return Scale(
-            sigma=spread if fixed is None else 1.0,
-            loss_scale=CAUCHY_SCALE_SIGMAS * spread if fixed is None else fixed,
-            gate_px=config.gate_px or GATE_SIGMAS * max(sigma_px, MIN_SIGMA_PX),
-            sigma_px=sigma_px,
+        sizes_px, sizes = self.sizes(T_camera_lidar)
+        return scale_from(
+            robust_spread(sizes_px), max(robust_spread(sizes), self.least_spread), config
         )
+
+    def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
+        """How large the residuals of projectable matches are, in medians of a standard Gaussian.
+
+        Returns:
+            (m,) unweighted errors [px]; (m,) whitened errors. The median of Gaussian ones of one
+            standard deviation per axis is that standard deviation.
+        """
+        residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
+        medians = _MEDIAN_NORM[self._constrained_axes[valid] - 1]
+        errors = constrained_error_px(residuals, self.information)[valid]
+        return errors / medians, self._whitened_norm(residuals)[valid] / medians
 
     def gated(self, T_camera_lidar: Array, scale: Scale) -> Matches:
         """Without what lies beyond the gate, or behind the camera (paper, two-pass solver, 2)."""
         errors, valid = self.errors_px(T_camera_lidar)
         return self.select(valid & (errors <= scale.gate_px))
+
+    def gate_hessian(self, T_camera_lidar: Array, scale: Scale) -> Array:
+        """(6, 6) what the gate's moving with the pose adds to the Hessian of the gated matches.
+
+        A step of the pose takes matches over the edge of the gate, out on one side and in on the
+        other, and their pull with them. It is some percent of the Hessian, and negative. Known
+        from the matches near the edge, so this must be called before they are gated.
+        """
+        pose = to_T_lidar_camera(T_camera_lidar)
+        residuals, valid = self.block.residuals(pose)
+        errors = constrained_error_px(residuals, self.information)
+        band = valid & (np.abs(errors - scale.gate_px) < _GATE_BAND * scale.gate_px)
+        across = self._error_gradient(residuals, errors)[band]
+        across *= (self._whitened_norm(residuals)[band] / errors[band])[:, None]
+        root = np.column_stack([across, np.zeros(len(across))])
+        edge = replace(
+            self.block,
+            points_lidar_m=self.block.points_lidar_m[band],
+            pixels_px=self.block.pixels_px[band],
+            sqrt_information=root / scale.sigma,
+            scale=scale.loss_scale / scale.sigma,
+        )
+        added: Array = -edge.sums(pose).hessian / (2 * _GATE_BAND)
+        return added
+
+    def _error_gradient(self, residuals: Array, errors: Array) -> Array:
+        """(n, 2) derivative of the error [px] by the residual."""
+        safe = np.maximum(errors, np.finfo(float).tiny)[:, None]
+        if self.information is None:
+            return np.asarray(residuals / safe)
+        uu, uv, vv = self.information.T
+        largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
+        x, y = residuals.T
+        pulled = np.column_stack([uu * x + uv * y, uv * x + vv * y])
+        return np.asarray(pulled / (largest[:, None] * safe))
 
     def summary(self, T_camera_lidar: Array, scale: Scale) -> Residuals:
         """The residuals of all these correspondences at a pose."""
@@ -117,7 +162,7 @@ class Matches:
         return Residuals(
             median_px=float(np.median(errors)),
             inlier_share=float(np.mean(valid & (errors <= scale.gate_px))),
-            sigma_px=self._spread(errors[valid], valid),
+            sigma_px=robust_spread(self.sizes(T_camera_lidar)[0]),
             loss_scale_px=scale.loss_scale,
             gate_px=scale.gate_px,
         )
@@ -130,7 +175,7 @@ class Matches:
         return np.hypot(first, root[:, 2] * residuals[:, 1])
 
     @cached_property
-    def _floor(self) -> float:
+    def least_spread(self) -> float:
         """MIN_SIGMA_PX as a whitened residual."""
         root = self.block.sqrt_information
         typical = 1.0 if root is None else float(np.median(np.hypot(root[:, 0], root[:, 2])))
@@ -145,11 +190,45 @@ class Matches:
         rank_one = uu * vv - uv**2 <= 1e-3 * (uu + vv) ** 2
         return np.where(rank_one, 1, 2)
 
-    def _spread(self, norms: Array, valid: NDArray[np.bool_]) -> float:
-        """Robust standard deviation per axis from error norms; infinite without any."""
-        if not len(norms):
-            return math.inf
-        return robust_spread(norms / _MEDIAN_NORM[self._constrained_axes[valid] - 1])
+
+def scale_from(sigma_px: float, spread: float, config: Config) -> Scale:
+    """The configured scales, or those of the residuals' spread.
+
+    Args:
+        sigma_px: robust spread of the unweighted residuals.
+        spread: robust spread of the whitened residuals.
+        config: may fix either scale.
+    """
+    fixed = config.loss_scale_px
+    return Scale(
+        sigma=spread if fixed is None else 1.0,
+        loss_scale=CAUCHY_SCALE_SIGMAS * spread if fixed is None else fixed,
+        gate_px=config.gate_px or GATE_SIGMAS * max(sigma_px, MIN_SIGMA_PX),
+        sigma_px=sigma_px,
+    )
+
+
+def merged(parts: Sequence[Matches]) -> Matches:
+    """The matches of one camera's frames under each other, in the order given."""
+    first = parts[0].block
+
+    def joined(columns: Sequence[Array | None], ones: Array) -> Array | None:
+        if all(column is None for column in columns):
+            return None
+        filled = [
+            np.tile(ones, (len(part.frame), 1)) if column is None else column
+            for column, part in zip(columns, parts, strict=True)
+        ]
+        return np.concatenate(filled)
+
+    block = replace(
+        first,
+        points_lidar_m=np.concatenate([part.block.points_lidar_m for part in parts]),
+        pixels_px=np.concatenate([part.block.pixels_px for part in parts]),
+        sqrt_information=joined([p.block.sqrt_information for p in parts], _IDENTITY),
+    )
+    information = joined([part.information for part in parts], _IDENTITY)
+    return Matches(block, information, np.concatenate([part.frame for part in parts]))
 
 
 def robust_spread(values: Array) -> float:
@@ -159,12 +238,28 @@ def robust_spread(values: Array) -> float:
     still: clean values give their median; a broad background, up to three quarters of all, hardly
     moves it; and values without a core give a large spread, since their median then grows.
     """
-    spread = _START_FACTOR * float(np.quantile(values, _START_QUANTILE))
+    if not len(values):
+        return math.inf
+    ordered = np.sort(values)
+
+    def quantile_below(limit: float, share: float) -> float:
+        inside = ordered[: np.searchsorted(ordered, limit, side="right")]
+        return float(np.quantile(inside, share)) if len(inside) else math.nan
+
+    return settled_spread(quantile_below)
+
+
+def settled_spread(quantile_below: Callable[[float, float], float]) -> float:
+    """The iteration of :func:`robust_spread`.
+
+    Args:
+        quantile_below: quantile, of a given share, of the values up to a limit; NaN without any.
+    """
+    spread = _START_FACTOR * quantile_below(math.inf, _START_QUANTILE)
     for _ in range(100):
-        core = values[values <= _CUT * spread]
-        if not len(core):
-            break
-        before, spread = spread, float(np.median(core))
+        before, spread = spread, quantile_below(_CUT * spread, _HALF)
+        if math.isnan(spread):
+            return before
         if abs(spread - before) <= 1e-6 * before:
             break
     return spread

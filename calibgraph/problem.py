@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -28,12 +28,14 @@ class Problem:
         matches: per camera that has enough correspondences.
         pose_graph: the priors and the relative poses.
         terms: which of them are used.
+        gate_hessian: of gated matches, see ``Matches.gate_hessian``; empty before the gate.
     """
 
     cameras: tuple[str, ...]
     matches: dict[str, Matches]
     pose_graph: gtsam.NonlinearFactorGraph
     terms: Terms
+    gate_hessian: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def fits_matches(self) -> bool:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from calibgraph.calibration import Calibration
 from calibgraph.config import TERMS, Config, Terms
 from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError
-from calibgraph.graph import joined, prior_graph, relative_pose_graph, relative_prior_graph
+from calibgraph.graph import pose_graph
 from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
 from calibgraph.preprocess import FILTERS, preprocess
 from calibgraph.problem import Poses, Problem, Scales
@@ -62,8 +61,8 @@ def solve(
     with clock("stage1"):
         stage1 = _stage1(rig, kept.table, config)
         start = _start(rig, matches, stage1.T_camera_lidar, config=config, terms=terms)
-    pose_graph = _pose_graph(rig, stage1.T_camera_lidar, config, terms)
-    problem = Problem(tuple(rig.cameras), matches, pose_graph, terms)
+    known = pose_graph(rig, stage1.T_camera_lidar, config, terms)
+    problem = Problem(tuple(rig.cameras), matches, known, terms)
     with clock("pass1"):
         poses, scales = _fit(problem, start, config)
     with clock("pass2"):
@@ -202,24 +201,6 @@ def _start(
     return {name: start[name] for name in rig.cameras}
 
 
-def _pose_graph(
-    rig: Rig, T_hat: Mapping[str, Array], config: Config, terms: Terms
-) -> gtsam.NonlinearFactorGraph:
-    """Everything that is known of poses apart from correspondences."""
-    cameras = list(rig.cameras)
-    known = relative_pose_graph(cameras, rig.relative_poses)
-    if terms == "reprojection":
-        return known
-    return joined(
-        known,
-        prior_graph(cameras, T_hat, weight=config.prior_weight),
-        relative_prior_graph(
-            cameras, T_hat,
-            weight=config.relative_prior_weight, pairs=config.relative_prior_pairs,
-        ),
-    )  # fmt: skip
-
-
 def _fit(problem: Problem, start: Poses, config: Config) -> tuple[Poses, Scales]:
     """Pass 1. With `auto` scales: fit and re-measure the spread until it stands still."""
     poses, scales = start, _scales(problem, start, config)
@@ -252,7 +233,10 @@ def _gated(problem: Problem, poses: Poses, scales: Scales) -> Problem:
                 "narrow",
                 camera=name,
             )
-    return problem.with_matches(inliers)
+    at_edge = {
+        name: m.gate_hessian(poses[name], scales[name]) for name, m in problem.matches.items()
+    }
+    return replace(problem.with_matches(inliers), gate_hessian=at_edge)
 
 
 def _counts(

@@ -301,9 +301,9 @@ def _centre(T_camera_lidar: Array) -> Array:
 
 
 def _above(what: str, value: float, warn: float, fail: float, unit: str) -> tuple[Status, str]:
-    limit = fail if value > fail else warn
-    text = f"{what} {value:.3g} {unit} is above {limit:g} {unit}"
-    return _grade(value > warn, value > fail), text
+    weak, failed = not value <= warn, not value <= fail  # NaN fails
+    text = f"{what} {value:.3g} {unit} is above {fail if failed else warn:g} {unit}"
+    return _grade(weak, failed), text
 
 
 def _below(what: str, value: float, warn: float, fail: float) -> tuple[Status, str]:
