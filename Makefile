@@ -39,8 +39,9 @@ lint: type ## Check style and types
 type: $(VENV)/test ## Check types
 	$(BIN)/mypy
 
-bench: $(VENV)/test ## Measure the solve and the network against other ways
+bench: $(VENV)/test ## Measure the solve, the updates and the network against other ways
 	$(BIN)/python benchmarks/solve.py
+	$(BIN)/python benchmarks/incremental.py
 	$(BIN)/python benchmarks/cmrnext.py
 
 clean: ## Remove everything that was made

@@ -30,6 +30,7 @@ _HOMES = {
     "calibgraph.simulate": ("MatcherErrors", "simulate_correspondences"),
     "calibgraph.two_pass": ("solve",),
     "calibgraph.structure": ("StructureMatcher",),
+    "calibgraph.tracking": ("DurableCalibrator", "Event", "IncrementalCalibrator", "Update"),
     "factors": (
         "block_factor",
         "camera_prior_factor",

@@ -32,6 +32,10 @@ from calibgraph.rig import Rig as Rig
 from calibgraph.simulate import MatcherErrors as MatcherErrors
 from calibgraph.simulate import simulate_correspondences as simulate_correspondences
 from calibgraph.structure import StructureMatcher as StructureMatcher
+from calibgraph.tracking import DurableCalibrator as DurableCalibrator
+from calibgraph.tracking import Event as Event
+from calibgraph.tracking import IncrementalCalibrator as IncrementalCalibrator
+from calibgraph.tracking import Update as Update
 from calibgraph.two_pass import solve as solve
 from factors import block_factor as block_factor
 from factors import camera_prior_factor as camera_prior_factor

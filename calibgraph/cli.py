@@ -430,6 +430,80 @@ def train(
     console.print(f"{out}: trained", soft_wrap=True, markup=False)
 
 
+@app.command()
+def track(
+    rig: RigArgument,
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
+            "standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher: "
+            "dataset folders or KITTI sequences of one rig, as one drive.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the state, the result and a picture. State that lies there is gone "
+            "on with.",
+        ),
+    ] = Path("tracking"),
+    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame only.")] = 1,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Wait for new files in the folder, until stopped.")
+    ] = False,
+    matcher: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
+    ] = None,
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    seed: SeedOption = 0,
+    weights: WeightsOption = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Keep all cameras calibrated while driving: a frame in, a line of JSON out.
+
+    Each line on standard output is one update: estimates, covariances, verdicts, and events (what
+    moved, since when, how far). It is printed once the update is on disk: after a crash, or kill
+    -9, the same command goes on where it stopped; the last line from before may come again. SIGTERM
+    and Ctrl-C finish the update at hand.
+    """
+    from calibgraph.files import require_place_for_folder
+    from calibgraph.load import load_rig
+    from calibgraph.tracking.command import Tracking, track
+
+    require_place_for_folder(out)
+    with _arguments():
+        settings = _settings(config, preset, seed)
+        chosen = _matcher(matcher, weights, seed=seed, device=device) if matcher else None
+        if chosen is None and weights:
+            raise ValueError("--weights is for --matcher cmrnext only")
+        if chosen is None and len(source) > 1:
+            raise ValueError(f"{len(source)} sources given; several go with --matcher only")
+    console = _console()
+    wanted = Tracking(
+        rig=load_rig(rig),
+        config=settings,
+        out=out,
+        every=every,
+        follow=follow,
+        matcher=chosen,
+    )
+    result, written = track(
+        wanted,
+        source,
+        tell=lambda text: console.print(text, soft_wrap=True, markup=False, highlight=False),
+    )
+    from calibgraph.tables import print_result
+
+    print_result(console, result, written)
+    if result.verdict.status == "FAIL":
+        raise typer.Exit(1)
+
+
 def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError

@@ -20,6 +20,33 @@ Cells = Annotated[int, Field(gt=0, le=100_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
+class Tracking(BaseModel):
+    """Settings of the recalibration while driving.
+
+    Attributes:
+        start_frames: frames with matches before a camera's first estimate.
+        epoch_frames: frames that share one extrinsic.
+        live_epochs: closed epochs that are kept with all their matches, to be gated anew and
+            linearized anew; older ones are merged into a summary of constant size.
+        walk_rotation_deg: standard deviation, per axis, of the random walk that a drifting camera
+            makes from one frame to the next. A camera stands still until the data say otherwise;
+            the walk is then this one, a fifth of it, or five times it, as the data say.
+        walk_translation_m: the same of its position.
+        step_frames: frames at a new place that agree with each other before it is believed.
+        blind_frames: frames without usable matches before a camera is called blind.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start_frames: Annotated[int, Field(ge=5, le=1000)] = 5
+    epoch_frames: Annotated[int, Field(ge=2, le=1000)] = 10
+    live_epochs: Annotated[int, Field(ge=1, le=100)] = 8
+    walk_rotation_deg: Annotated[float, Field(gt=0, le=10)] = 1e-3
+    walk_translation_m: Annotated[float, Field(gt=0, le=1)] = 5e-5
+    step_frames: Annotated[int, Field(ge=2, le=1000)] = 3
+    blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
+
+
 class Config(BaseModel):
     """Settings, with the paper's symbols. The defaults are the preset ``auto``.
 
@@ -40,6 +67,7 @@ class Config(BaseModel):
         aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
         seed: of everything random.
+        tracking: of the recalibration while driving.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -60,6 +88,7 @@ class Config(BaseModel):
     aggregate: Literal["median", "mean", "mode"] = "median"
     pnp_threshold_px: Pixels = 8.0
     seed: Seed = 0
+    tracking: Tracking = Tracking()
 
     def changed(self, **settings: Any) -> Config:
         """A checked copy with some settings changed.

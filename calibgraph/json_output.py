@@ -35,13 +35,13 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
 
 def print_json(content: dict[str, Any]) -> None:
     """Print one JSON document on stdout."""
-    print(json.dumps(_finite(content), indent=2, allow_nan=False))
+    print(json.dumps(finite(content), indent=2, allow_nan=False))
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Replace numbers that JSON does not have by null."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

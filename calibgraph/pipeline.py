@@ -34,6 +34,9 @@ class Matcher(Protocol):
     ``recall``: which share of the way back it finds without the image (0 to 1);
     ``failed_share``: which share of the frames it left out (0 to 1).
 
+    For single frames of a drive, near a good estimate, it may have an attribute
+    ``tracking_rounds``: which of its rounds to go through then; otherwise it is all of them.
+
     Attributes:
         rounds: how many rounds it wants.
         stage1: where the pairwise estimates come from, see ``Config.stage1``.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.rig import Camera, Rig
@@ -13,6 +15,7 @@ from calibgraph.rig import Camera, Rig
 Array = NDArray[np.float64]
 
 _MAX_TRIES = 1000
+_HALF = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +62,55 @@ def simulate_correspondences(
         for name, camera in rig.cameras.items()
     ]
     return concatenate(tables)
+
+
+def simulate_drive(
+    rig_at: Callable[[int], Rig],
+    *,
+    frames: int,
+    matches: int = 500,
+    errors: MatcherErrors | None = None,
+    depth_m: tuple[float, float] = (3.0, 50.0),
+    failed_share: float = 0.0,
+    blind: Mapping[str, range] | None = None,
+    seed: int = 0,
+) -> Iterator[Correspondences]:
+    """Draw the frames of a drive, one table each, in which extrinsics may change.
+
+    Args:
+        rig_at: the true rig at a frame's number.
+        frames: how many.
+        matches: correspondences per camera and frame.
+        errors: the matcher's errors.
+        depth_m: range of depths along the camera's axis.
+        failed_share: share of a camera's frames whose matches are wrong: all random, or all of a
+            pose that is wrong by 1 to 5 deg and 10 to 50 cm, half of them each.
+        blind: per camera, the frames in which it sees nothing.
+        seed: of every draw.
+    """
+    errors = errors or MatcherErrors()
+    rng = np.random.default_rng(seed)
+    nonsense = replace(errors, outlier_share=1.0, informative_confidence=False)
+    for frame in range(frames):
+        tables = []
+        for name, camera in rig_at(frame).cameras.items():
+            if frame in (blind or {}).get(name, ()):
+                continue
+            failed, at_random = rng.random() < failed_share, rng.random() < _HALF
+            seen = _elsewhere(rng, camera) if failed and not at_random else camera
+            made = nonsense if failed and at_random else errors
+            tables.append(_frame(rng, name, seen, frame, matches, made, depth_m))
+        yield concatenate(tables)
+
+
+def _elsewhere(rng: np.random.Generator, camera: Camera) -> Camera:
+    """The camera at a wrong pose."""
+    axis, direction = rng.standard_normal((2, 3))
+    step = np.eye(4)
+    angle = np.radians(rng.uniform(1, 5))
+    step[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    step[:3, 3] = rng.uniform(0.1, 0.5) * direction / np.linalg.norm(direction)
+    return camera.moved_to(step @ camera.T_camera_lidar)
 
 
 def _frame(  # noqa: PLR0913 - private, one call

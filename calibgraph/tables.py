@@ -35,8 +35,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
         "the gate"
     )
-    seconds = sum(result.timings_s.values())
-    console.print(f"{seconds:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
+    time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
+    console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
         console.print(f"  {path}", highlight=False, soft_wrap=True, markup=False)
 

@@ -15,7 +15,7 @@ README = (ROOT / "README.md").read_text()
 
 
 def test_the_python_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    first, own_matcher = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    first, own_matcher, tracker = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"your_matches": true_matches}
@@ -31,6 +31,12 @@ def test_the_python_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert isinstance(result, calibgraph.Calibration)
     for error in calibgraph.evaluate(result.rig, TRUTH).cameras.values():
         assert error.rotation_error_deg < 0.1
+    names["frame_tables"] = [table.select(table.frame == frame) for frame in range(6)]
+    exec(compile(tracker, "README.md", "exec"), names)
+    update = names["update"]
+    assert isinstance(update, calibgraph.Update)
+    assert update.verdicts["left"].status in ("PASS", "WARN")
+    assert calibgraph.IncrementalCalibrator.load("out/tracker").frame == 5
 
 
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import calibgraph
@@ -71,3 +74,43 @@ def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, 
         assert code == 1
         assert "of a displaced start remains" in text
         assert (tmp_path / estimate / "calibration.yaml").is_file()
+
+
+def test_a_camera_that_turns_half_a_degree_while_driving_is_found(
+    realdata: Path, tmp_path: Path, call: Call
+) -> None:
+    """19 frames of four sequences as one drive; the images of image_2 are turned from frame 10 on.
+
+    A pure rotation about the camera's centre is a homography of the image, K R K^-1.
+    """
+    data = calibgraph.load_dataset(sequences(realdata, "05+06+07+08"))
+    camera = data.rig.cameras["image_2"]
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.radians([0.0, 0.5, 0.0]))[0]
+    after = data.rig.moved_to({"image_2": turn @ camera.T_camera_lidar})
+    warp = camera.matrix_px @ turn[:3, :3] @ np.linalg.inv(camera.matrix_px)
+    (tmp_path / "drive" / "lidar").mkdir(parents=True)
+    for number, frame in enumerate(data.frames):
+        cloud = tmp_path / "drive" / "lidar" / f"{number:06d}{frame.cloud_path.suffix}"
+        cloud.symlink_to(frame.cloud_path)
+        for name, path in frame.image_paths.items():
+            image = cv2.imread(str(path))
+            if name == "image_2" and number >= 10:
+                image = cv2.warpPerspective(image, warp, image.shape[1::-1], flags=cv2.INTER_CUBIC)
+            folder = tmp_path / "drive" / "cameras" / name
+            folder.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / f"{number:06d}.png"), image)
+    guess = calibgraph.perturb(data.rig, rotation_deg=1, translation_m=0.1, seed=1)
+    guess.save(tmp_path / "rig.yaml")
+    code, out, _ = call(
+        "track", tmp_path / "rig.yaml", tmp_path / "drive", "--matcher", "structure",
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    updates = [json.loads(line) for line in out.splitlines()]
+    told = [e for update in updates for e in update["events"] if e["kind"] != "started"]
+    assert code == 0 and len(updates) == 19
+    assert [(e["kind"], e["camera"], e["frame"]) for e in told] == [("moved", "image_2", 10)]
+    assert told[0]["detected_frame"] <= 14
+    found = calibgraph.load_calibration(tmp_path / "out")
+    for name, error in calibgraph.evaluate(found.rig, after).cameras.items():
+        assert error.rotation_error_deg < 0.3 and error.translation_error_cm < 8, name

@@ -45,6 +45,7 @@ class StructureMatcher:
     """
 
     stage1: Literal["pnp", "rig"] = "rig"
+    tracking_rounds = (2, 4)  # from errors of up to 0.7 degrees and 20 cm
 
     def __init__(self, *, seed: int = 0, levels: Sequence[Level] = LEVELS) -> None:
         self.seed = seed

@@ -1,0 +1,98 @@
+"""Cameras, or the LiDAR under all of them, that move slowly: followed at once, told when clear.
+
+A drift is noticed by the first camera that shows it. Whose it is shows only later, when the others
+have moved along, or have not: so what was known of all cameras is kept as an anchor, and the way
+from there is judged at every new epoch until it is clear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calibgraph.tracking.change import (
+    CLEARLY,
+    Event,
+    Size,
+    Steps,
+    alarm_limit,
+    cause_of,
+    unexplained,
+)
+from calibgraph.tracking.memory import Memory
+from calibgraph.tracking.state import DriftWatch, State, block_diagonal
+from calibgraph.tracking.sums import inverse, is_determined, posterior
+
+_QUIET = 1000  # frames in which a drift of the same camera is not told again
+_PATIENCE = 300  # frames until it is told in any case
+
+
+def drifting(state: State, camera: int, walk: int) -> State:
+    """The state in which a camera walks, and is watched until it is clear what drifts."""
+    known = state.cameras[camera]
+    said = known.drift_said_at
+    quiet = said >= 0 and state.updates - said < _QUIET
+    if state.drift is None and not quiet:
+        anchors = tuple(one.memory for one in state.cameras)
+        since = _frames_ago(state, known.memory, walk)
+        watch = DriftWatch(camera, state.updates, since, anchors)
+        state = replace(state, drift=watch)
+    if known.memory.walk:
+        return state
+    return state.with_camera(camera, replace(known, memory=known.memory.walking(walk)))
+
+
+def _frames_ago(state: State, memory: Memory, walk: int) -> int:
+    """Number of the frame from which the walking memory still knows something."""
+    oldest = state.live_frames[0].number if state.live_frames else state.frame or 0
+    return max(0, oldest - int(memory.frames[walk]))
+
+
+def told(state: State) -> tuple[State, list[Event]]:
+    """The state after a drift has been told, if it is clear by now what drifts."""
+    watch = state.drift
+    if watch is None:
+        return state, []
+    steps = _steps(state, watch)
+    if watch.camera not in steps.cameras:
+        return replace(state, drift=None), []
+    by_lidar, by_camera = unexplained(steps)
+    waited = state.updates - watch.begun
+    if abs(by_lidar - by_camera) < CLEARLY and waited < _PATIENCE and len(steps.cameras) > 1:
+        return state, []
+    cause = cause_of(steps, sure={watch.camera})
+    if cause.lidar:
+        name, size = None, Size.of(*cause.lidar)
+    else:
+        name = state.names[watch.camera]
+        size = Size.of(*steps.of(steps.cameras.index(watch.camera)))
+    event = Event("drifts", name, watch.frame, state.frame or 0, state.stamp_ns, size)
+    for camera in range(len(state.cameras)) if cause.lidar else (watch.camera,):
+        known = replace(state.cameras[camera], drift_said_at=state.updates)
+        state = state.with_camera(camera, known)
+    return replace(state, drift=None), [event]
+
+
+def _steps(state: State, watch: DriftWatch) -> Steps:
+    """How far each camera has come from where it stood still."""
+    sums = posterior(state)
+    cameras, steps, covariances = [], [], []
+    for camera, anchor in enumerate(watch.anchors):
+        now = sums.step(camera)
+        if now is None or not is_determined(anchor.hessian[0]):
+            continue
+        rows = slice(6 * camera, 6 * camera + 6)
+        pairs = ((anchor.hessian[0], anchor.scatter[0]),
+                 (sums.hessian[camera], sums.scatter[rows, rows]))  # fmt: skip
+        spreads = [inverse(hessian) @ scatter @ inverse(hessian) for hessian, scatter in pairs]
+        cameras.append(camera)
+        steps.append(now - np.linalg.solve(anchor.hessian[0], -anchor.gradient[0]))
+        covariances.append(sum(spreads) * state.inflation(camera))
+    return Steps(
+        tuple(cameras),
+        np.ravel(steps),
+        block_diagonal(np.array(covariances).reshape(-1, 6, 6)),
+        np.array([alarm_limit(state.total_frames[c]) for c in cameras]),
+        tuple(state.references[c] for c in cameras),
+    )

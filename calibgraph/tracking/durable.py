@@ -1,0 +1,153 @@
+"""A tracker whose every update is on disk when it returns: snapshot and journal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import index
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from calibgraph.config import Config
+from calibgraph.correspondences import Correspondences
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.rig import Rig
+from calibgraph.tracking.packing import UnreadableError, packed, unpacked
+from calibgraph.tracking.store import Store
+from calibgraph.tracking.tracker import IncrementalCalibrator, Update
+
+_SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many
+
+
+class DurableCalibrator:
+    """An :class:`IncrementalCalibrator` that survives ``kill -9`` at any moment.
+
+    An update that has returned is on disk. After a restart the next update gives the same numbers
+    as if nothing had happened.
+
+    Attributes:
+        tracker: what is kept.
+        damages: a line for each file that was found damaged.
+        resumed: whether there was a state to go on from.
+        repeated: after a crash the last update, which may or may not have returned before it; None
+            after a :meth:`close`.
+
+    Args:
+        folder: where it keeps its state; one process at a time.
+        rig: cameras with their initial guess.
+        config: settings; the preset ``auto`` if None.
+        begin: gives a better guess than ``rig``; asked only if there is no state to go on from.
+
+    Raises:
+        FileError: if another process has the folder, or the state in it is of another rig or of
+            other settings.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        rig: Rig,
+        config: Config | None = None,
+        *,
+        begin: Callable[[], Rig] | None = None,
+    ) -> None:
+        self._store = Store(Path(folder))
+        try:
+            recovered = self._store.recover()
+            self.damages = recovered.damages
+            self._pending = len(recovered.inputs)
+            if recovered.snapshot is None:
+                self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
+                self._snapshot()
+            else:
+                self.tracker = _restored(Path(folder), recovered.snapshot)
+                _require_same(Path(folder), self.tracker, rig, config or Config())
+            self.repeated: Update | None = None
+            for record in recovered.inputs:
+                frame, table = unpacked(record)
+                self.repeated = self.tracker.update(table, frame=frame)
+        except BaseException:
+            self._store.close()
+            raise
+        self.resumed = self.tracker.frame is not None
+
+    def update(self, table: Correspondences, *, frame: int | None = None) -> Update:
+        """Take in one frame, see :meth:`IncrementalCalibrator.update`; it is on disk then.
+
+        Raises:
+            CorrespondenceError: as there; or if the metadata cannot be written. Nothing has
+                changed then.
+            OSError: if it cannot be written; then close this, and make a new one.
+        """
+        record = _record(table, frame, self.tracker.initial_rig)
+        if self._pending >= _SNAPSHOT_EVERY:
+            self._snapshot()  # before this update: the journal always holds the last one
+        update = self.tracker.update(table, frame=frame)
+        self._store.append(record)
+        self._pending += 1
+        return update
+
+    def close(self) -> None:
+        """Write a last snapshot and let go of the folder."""
+        try:
+            self._snapshot()
+        finally:
+            self._store.close()
+
+    def _snapshot(self) -> None:
+        self._store.snapshot(self.tracker.to_bytes())
+        self._pending = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:  # the journal has every update that has returned, the tracker may have half a one
+            self._store.close()
+
+
+def _record(table: Correspondences, frame: int | None, rig: Rig) -> bytes:
+    number = None if frame is None else index(frame)
+    try:
+        return packed((number, table), rig)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CorrespondenceError(
+            f"the table cannot be kept ({error}); give plain values as metadata", frame=number
+        ) from error
+
+
+def _restored(folder: Path, snapshot: bytes) -> IncrementalCalibrator:
+    try:
+        return IncrementalCalibrator.from_bytes(snapshot)
+    except UnreadableError as error:  # its checksum is right: written so
+        raise FileError(
+            folder, f"holds a state of another version; choose another folder ({error})"
+        ) from error
+
+
+def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config: Config) -> None:
+    """The state in a folder is of the cameras and the settings that are asked for."""
+    if _without_guess(tracker.initial_rig) != _without_guess(rig):
+        raise FileError(
+            folder,
+            "holds the state of another rig (names, lenses, sizes or relative poses differ); "
+            "choose another folder",
+        )
+    if tracker.config != config:
+        raise FileError(
+            folder, "holds a state made with other settings; choose another folder, or those"
+        )
+
+
+def _without_guess(rig: Rig) -> dict[str, object]:
+    content = rig.model_dump(mode="json")
+    for camera in content["cameras"].values():
+        del camera["T_camera_lidar"]
+    return content

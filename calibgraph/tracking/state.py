@@ -1,0 +1,297 @@
+"""What the tracker knows: everything that a restart needs, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.config import Config
+from calibgraph.correspondences import Correspondences
+from calibgraph.matches import Matches, Scale
+from calibgraph.rig import Rig
+from calibgraph.tracking.memory import Memory
+from calibgraph.tracking.repetition import Groups, inflation, none_seen, widening
+from calibgraph.tracking.spread import Spread
+
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
+
+HISTORY = 50
+"""Frames over which the size of the residuals and the share of inliers are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One frame whose matches are still kept.
+
+    Attributes:
+        number: of the frame.
+        raw: per camera (by its place in the rig) that the frame agrees with: all its matches.
+        used: those within the gate.
+        hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
+        gradient: (n, 6) at the cameras' reference poses.
+    """
+
+    number: int
+    raw: dict[int, Matches]
+    used: dict[int, Matches]
+    hessian: Array
+    gradient: Array
+
+    def without(self, camera: int) -> LiveFrame:
+        """The frame as if a camera had not seen it."""
+        hessian, gradient = self.hessian.copy(), self.gradient.copy()
+        hessian[camera], gradient[camera] = 0.0, 0.0
+        raw = {c: m for c, m in self.raw.items() if c != camera}
+        used = {c: m for c, m in self.used.items() if c != camera}
+        return LiveFrame(self.number, raw, used, hessian, gradient)
+
+    def plus(
+        self, camera: int, raw: Matches, used: Matches, sums: tuple[Array, Array]
+    ) -> LiveFrame:
+        """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
+        hessian, gradient = self.hessian.copy(), self.gradient.copy()
+        hessian[camera], gradient[camera] = sums
+        return LiveFrame(
+            self.number, {**self.raw, camera: raw}, {**self.used, camera: used}, hessian, gradient
+        )
+
+    @staticmethod
+    def empty(number: int, cameras: int) -> LiveFrame:
+        """A frame that no camera has seen yet."""
+        return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
+
+
+@dataclass(frozen=True, eq=False)
+class Epoch:
+    """Frames that share one extrinsic per camera.
+
+    Attributes:
+        frames: in order.
+        poses: per camera, the estimate of T_lidar_camera.
+    """
+
+    frames: tuple[LiveFrame, ...]
+    poses: tuple[gtsam.Pose3, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A frame that disagrees with a camera's estimate but has a pose of its own.
+
+    Attributes:
+        number: of the frame.
+        raw: its matches.
+        pose: T_lidar_camera that they say.
+    """
+
+    number: int
+    raw: Matches
+    pose: gtsam.Pose3
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """What is known of one camera.
+
+    Attributes:
+        started: whether it has an estimate of its own.
+        waiting: before that, the frames it may start from.
+        refused: why it has not started from them.
+        spread: of its residuals.
+        scale: that this spread says, as of the last epoch's beginning.
+        recent: (f, 2) of its last absorbed frames: the share of inliers, the median error [px].
+        memory: its past.
+        suspects: its last frames that disagree with the estimate but not with each other, newest
+            last.
+        verdicts: of its last frames, newest last: whether each agreed, with its number.
+        absent: frames since the last usable one.
+        groups: whether neighbouring frames repeat each other's errors.
+        moved_at: how many updates there were when it last moved, or -1.
+        drift_said_at: how many when its drift was last told, or -1.
+        counts: frames and correspondences, by what became of them.
+    """
+
+    started: bool = False
+    waiting: tuple[Correspondences, ...] = ()
+    refused: tuple[str, ...] = ()
+    spread: Spread = field(default_factory=Spread)
+    scale: Scale = Scale(1.0, 1.0, 1.0, 1.0)
+    recent: Array = field(default_factory=lambda: np.empty((0, 2)))
+    memory: Memory = field(default_factory=Memory.empty)
+    suspects: tuple[Suspect, ...] = ()
+    verdicts: tuple[tuple[int, bool], ...] = ()
+    absent: int = 0
+    groups: tuple[Groups, ...] = field(default_factory=none_seen)
+    moved_at: int = -1
+    drift_said_at: int = -1
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def inlier_share(self) -> float:
+        """The usual share of inliers."""
+        return float(np.median(self.recent[:, 0]))
+
+    def counted(self, **more: int) -> CameraState:
+        """With some counts raised."""
+        counts = dict(self.counts)
+        for key, number in more.items():
+            counts[key] = counts.get(key, 0) + number
+        return replace(self, counts=counts)
+
+
+@dataclass(frozen=True, eq=False)
+class DriftWatch:
+    """A drift that has been noticed, and of which it is not clear yet what drifts.
+
+    Attributes:
+        camera: that showed it first.
+        begun: how many updates there were then.
+        frame: number of the frame since which it drifts.
+        anchors: per camera, its memory at the time.
+    """
+
+    camera: int
+    begun: int
+    frame: int
+    anchors: tuple[Memory, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything the tracker knows.
+
+    Attributes:
+        rig: the initial guess.
+        config: settings.
+        cameras: per camera of the rig.
+        references: per camera, T_lidar_camera about which sums are taken.
+        epochs: the live ones; the last is open.
+        cross: (6 n, 6 n) scatter between different cameras in the memories.
+        total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
+        total_hessian: (n, 6, 6) and of Hessians.
+        total_frames: (n,) and of frames.
+        dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has made wrong.
+        drift: that is being watched, or None.
+        systematic_sigmas: rotation [rad] and translation [m] that the matcher says frames share.
+        frame: number of the last frame, or None.
+        stamp_ns: its time, or None.
+        updates: how many there were.
+    """
+
+    rig: Rig
+    config: Config
+    cameras: tuple[CameraState, ...]
+    references: tuple[gtsam.Pose3, ...]
+    epochs: tuple[Epoch, ...]
+    cross: Array
+    total: Array
+    total_hessian: Array
+    total_frames: Array
+    dropped_pairs: tuple[int, ...] = ()
+    drift: DriftWatch | None = None
+    systematic_sigmas: tuple[float, float] = (0.0, 0.0)
+    frame: int | None = None
+    stamp_ns: int | None = None
+    updates: int = 0
+
+    @staticmethod
+    def initial(rig: Rig, config: Config) -> State:
+        """Before the first frame."""
+        n = len(rig.cameras)
+        poses = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
+        return State(
+            rig=rig,
+            config=config,
+            cameras=tuple(CameraState() for _ in range(n)),
+            references=poses,
+            epochs=(Epoch((), poses),),
+            cross=np.zeros((6 * n, 6 * n)),
+            total=np.zeros((6 * n, 6 * n)),
+            total_hessian=np.zeros((n, 6, 6)),
+            total_frames=np.zeros(n),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names."""
+        return tuple(self.rig.cameras)
+
+    @property
+    def poses(self) -> tuple[gtsam.Pose3, ...]:
+        """Per camera, the present estimate of T_lidar_camera."""
+        return self.epochs[-1].poses
+
+    @property
+    def live_frames(self) -> tuple[LiveFrame, ...]:
+        """The frames of all live epochs."""
+        return tuple(frame for epoch in self.epochs for frame in epoch.frames)
+
+    def with_camera(self, index: int, camera: CameraState) -> State:
+        """With one camera's knowledge replaced."""
+        return replace(self, cameras=put(self.cameras, index, camera))
+
+    def walk_variance(self, frames: int) -> Array:
+        """(6,) variance of the configured walk over so many frames: rotation, translation."""
+        tracking = self.config.tracking
+        rotation = np.radians(tracking.walk_rotation_deg) ** 2
+        return np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
+
+    def frame_noise(self, index: int) -> Array | None:
+        """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
+
+        As much larger than that of frames as epochs scatter more than their frames say.
+        """
+        noise = self.scatter_of_frames(index)
+        return None if noise is None else noise * self.inflation(index)
+
+    def inflation(self, index: int) -> float:
+        """How much more a camera's epochs scatter than their frames say, at least 1."""
+        return inflation(self.cameras[index].groups)
+
+    def widened(self, scatter: Array) -> Array:
+        """(6 n, 6 n) scatter of all cameras' gradients, by what groups of frames show."""
+        parts = []
+        for index, camera in enumerate(self.cameras):
+            noise = self.scatter_of_frames(index)
+            parts.append(np.eye(6) if noise is None else widening(camera.groups, noise))
+        by = block_diagonal(np.array(parts))
+        return np.asarray(by @ scatter @ by.T)
+
+    def scatter_of_frames(self, index: int) -> Array | None:
+        """(6, 6) scatter of one frame's gradient, by frames alone; None while it is unknown."""
+        frames = self.total_frames[index]
+        if frames < LEAST_FRAMES:
+            return None
+        rows = slice(6 * index, 6 * index + 6)
+        return np.asarray(self.total[rows, rows] / (frames - 1))
+
+    def overconfidence(self, index: int) -> float:
+        """How much too large a camera's Hessian is as an information, on average."""
+        frames = self.total_frames[index]
+        if frames < LEAST_FRAMES:
+            return 1.0
+        rows = slice(6 * index, 6 * index + 6)
+        share = np.linalg.solve(self.total_hessian[index], self.total[rows, rows])
+        return max(1.0, float(np.trace(share)) / 6)
+
+
+LEAST_FRAMES = 15
+"""Frames from which the scatter of a six-vector can be taken."""
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """(6 n, 6 n) from (n, 6, 6)."""
+    n = len(blocks)
+    matrix = np.zeros((n, 6, n, 6))
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(6 * n, 6 * n)
+
+
+def put(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
+    """The tuple with one item replaced."""
+    return (*items[:index], item, *items[index + 1 :])

@@ -1,0 +1,162 @@
+"""Frames of correspondences from a table: a Parquet or CSV file, or Arrow data in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibgraph.correspondence_file import (
+    arrow_reads,
+    check_schema,
+    from_arrow,
+    read_arrow,
+    require_rows,
+)
+from calibgraph.correspondences import Correspondences
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import require_file
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True)
+class StreamFrame:
+    """The correspondences of one frame, all its cameras.
+
+    Attributes:
+        frame: its number.
+        stamp_ns: its time; where the rows' times differ, the latest; None if none is given.
+        table: rows of this frame alone; there may be none.
+    """
+
+    frame: int
+    stamp_ns: int | None
+    table: Correspondences
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Input that is no frame: one line that says what, where, what was found and what to do."""
+
+    message: str
+
+
+Item = StreamFrame | Refused
+
+
+def refused(where: Path | str, what: str) -> Refused:
+    """The line for what is wrong somewhere in a source."""
+    return Refused(str(FileError(where, what)))
+
+
+def frames_of_table(path: Path) -> Iterator[Item]:
+    """The frames of one Parquet or CSV file, in ascending order.
+
+    Of a Parquet file whose row groups are in the order of their frames, one row group is in memory
+    at a time; any other file is read whole.
+
+    Raises:
+        FileError: wherever the file turns out not to be readable.
+    """
+    for table in _parts_of_file(require_file(path)):
+        yield from frames_in(table, str(path), ascending=True)
+
+
+def _parts_of_file(path: Path) -> Iterator[pa.Table]:
+    """Tables of whole frames, those of later ones ascending, that make up a file."""
+    from pyarrow import parquet
+
+    if path.suffix == ".csv":
+        table = read_arrow(path)
+        require_rows(path, len(table))
+        require_schema(path, table.schema)
+        yield table
+        return
+    with arrow_reads(path), parquet.ParquetFile(path) as file:
+        require_rows(path, file.metadata.num_rows)
+        require_schema(path, file.schema_arrow)
+        spans = _frame_spans(file)
+        yield from [file.read()] if spans is None else _row_groups(file, spans)
+
+
+def _frame_spans(file: Any) -> list[tuple[int, int]] | None:
+    """First and last frame of each row group, if they are in order.
+
+    They are read from the column, not from its statistics: not every file has them, and of a
+    damaged file Arrow cannot read them without ending the process.
+    """
+    spans: list[tuple[int, int]] = []
+    for group in range(file.metadata.num_row_groups):
+        frames = file.read_row_group(group, columns=["frame"])["frame"].drop_null().to_numpy()
+        if not len(frames) or (spans and frames.min() < spans[-1][1]):
+            return None
+        spans.append((int(frames.min()), int(frames.max())))
+    return spans
+
+
+def _row_groups(file: Any, spans: Sequence[tuple[int, int]]) -> Iterator[pa.Table]:
+    """One row group at a time; a frame that goes on in the next one is held until it ends."""
+    import pyarrow as pa
+
+    held: list[pa.Table] = []
+    for group, (_, last) in enumerate(spans):
+        table = pa.concat_tables([*held, file.read_row_group(group)])
+        held = []
+        if group + 1 < len(spans) and spans[group + 1][0] == last:
+            goes_on = table["frame"].to_numpy() == last
+            held = [table.filter(pa.array(goes_on))]
+            table = table.filter(pa.array(~goes_on))
+        yield table
+
+
+def require_schema(where: Path | str, schema: pa.Schema) -> None:
+    """What no row can mend: the columns' names and types, and the metadata.
+
+    Raises:
+        FileError: with the first thing that is wrong.
+    """
+    try:
+        check_schema(schema)
+        from_arrow(schema.empty_table())
+    except CorrespondenceError as error:
+        raise FileError(where, str(error)) from error
+
+
+def frames_in(table: pa.Table, where: str, *, ascending: bool) -> Iterator[Item]:
+    """The frames of a table with a checked schema, ascending or as they first appear."""
+    if table["frame"].null_count:
+        count = table["frame"].null_count
+        yield refused(where, f"column 'frame' is empty in {count} rows; fill in or drop them")
+        table = table.filter(table["frame"].is_valid())
+    for rows in _split_by_frame(table, ascending=ascending):
+        yield _frame_or_refused(rows, where)
+
+
+def _split_by_frame(table: pa.Table, *, ascending: bool) -> Iterator[pa.Table]:
+    if not len(table):
+        return
+    frames = table["frame"].to_numpy()
+    order = np.argsort(frames, kind="stable")
+    frames = frames[order]
+    starts = np.concatenate([[0], np.flatnonzero(frames[1:] != frames[:-1]) + 1])
+    lengths = np.diff(starts, append=len(frames))
+    if (order[1:] < order[:-1]).any():
+        table = table.take(order)
+    for group in range(len(starts)) if ascending else np.argsort(order[starts]):
+        yield table.slice(starts[group], lengths[group])
+
+
+def _frame_or_refused(rows: pa.Table, where: str) -> Item:
+    """One frame from all its rows."""
+    number = rows["frame"][0].as_py()
+    try:
+        table = from_arrow(rows)
+    except CorrespondenceError as error:
+        return refused(where, f"frame {number} is left out; among its rows, {error}")
+    stamp_ns = None if table.stamp_ns is None else int(table.stamp_ns.max())
+    return StreamFrame(number, stamp_ns, table)

@@ -1,0 +1,150 @@
+"""The live epochs as an iSAM2 problem.
+
+A camera that walks has a variable per epoch:
+
+    memory - x(c, 0) - walk - x(c, 1) - walk - ... - x(c, last) - priors, relative poses
+               |                |                      |
+             block            block             one block per frame
+
+One that stands still has a single variable, on which all of its blocks are.
+
+Older epochs are in the memory, a quadratic about a reference pose. What is known of poses apart
+from correspondences stands once, at the last epoch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph import joined, pose_graph, pose_key
+from calibgraph.matches import Matches, merged
+from calibgraph.tracking.memory import STRENGTHS
+from calibgraph.tracking.state import State
+from factors import ProjectionBlock, block_factor
+
+Array = NDArray[np.float64]
+
+_RELINEARIZE = 2e-6  # rad and m: far below any sigma; every epoch begins linearized anew
+
+
+class Window:
+    """iSAM2 over the live epochs of a state, until the next epoch begins."""
+
+    def __init__(self, state: State) -> None:
+        self._names = state.names
+        self._walks = [camera.memory.walk > 0 for camera in state.cameras]
+        self._cameras = len(state.names)
+        self._epochs = len(state.epochs)
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(_RELINEARIZE)
+        parameters.relinearizeSkip = 1
+        parameters.findUnusedFactorSlots = True
+        self._isam = gtsam.ISAM2(parameters)
+        values = gtsam.Values()
+        for place, epoch in enumerate(state.epochs):
+            for camera, pose in enumerate(epoch.poses):
+                if self._walks[camera] or epoch is state.epochs[-1]:
+                    values.insert(self._key(place, camera), pose)
+        graph = joined(self._memory_graph(state), self._walk_graph(state), known_of_poses(state))
+        for camera, known in enumerate(state.cameras):
+            for key, seen in self._by_key(state, camera).items():
+                graph.add(block_factor(key, merged(seen).scaled(known.scale)))
+        self._isam.update(graph, values)
+
+    def add(self, blocks: Mapping[int, ProjectionBlock]) -> list[int]:
+        """Add a frame's blocks to the last epoch; their places, to be replaced by."""
+        graph = gtsam.NonlinearFactorGraph()
+        for camera, block in blocks.items():
+            graph.add(block_factor(self._key_of_last(camera), block))
+        result = self._isam.update(graph, gtsam.Values())
+        return list(result.getNewFactorsIndices())
+
+    def replace(self, places: Sequence[int], blocks: Mapping[int, ProjectionBlock]) -> None:
+        """Put other blocks in the place of those added."""
+        graph = gtsam.NonlinearFactorGraph()
+        for camera, block in blocks.items():
+            graph.add(block_factor(self._key_of_last(camera), block))
+        self._isam.update(graph, gtsam.Values(), list(places))
+
+    def settle(self) -> None:
+        """One more step to the optimum."""
+        self._isam.update()
+
+    def pose(self, camera: int) -> gtsam.Pose3:
+        """The estimate of a camera's T_lidar_camera in the last epoch."""
+        return self._isam.calculateEstimatePose3(self._key_of_last(camera))
+
+    def poses(self) -> list[tuple[gtsam.Pose3, ...]]:
+        """Per epoch and camera, the estimates of T_lidar_camera."""
+        values = self._isam.calculateBestEstimate()
+        return [
+            tuple(values.atPose3(self._key(place, camera)) for camera in range(self._cameras))
+            for place in range(self._epochs)
+        ]
+
+    def _key(self, place: int, camera: int) -> int:
+        """The last epoch's keys are those of a batch, so that its graphs serve here too."""
+        ago = self._epochs - 1 - place if self._walks[camera] else 0
+        return pose_key(self._names, self._names[camera]) + ago * self._cameras
+
+    def _key_of_last(self, camera: int) -> int:
+        return self._key(self._epochs - 1, camera)
+
+    def _by_key(self, state: State, camera: int) -> dict[int, list[Matches]]:
+        """A camera's matches of all frames, by the variable that they are on."""
+        by_key: dict[int, list[Matches]] = {}
+        for place, epoch in enumerate(state.epochs):
+            seen = [frame.used[camera] for frame in epoch.frames if camera in frame.used]
+            if seen:
+                by_key.setdefault(self._key(place, camera), []).extend(seen)
+        return by_key
+
+    def _memory_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
+        """What the marginalised epochs say of the first live one."""
+        graph = gtsam.NonlinearFactorGraph()
+        for camera, known in enumerate(state.cameras):
+            memory = known.memory
+            hessian, gradient = memory.hessian[memory.walk], memory.gradient[memory.walk]
+            if hessian.any():
+                key = self._key(0, camera)
+                reference = gtsam.Values()
+                reference.insert(key, state.references[camera])
+                factor = gtsam.HessianFactor(key, hessian, -gradient, 0.0)
+                graph.add(gtsam.LinearContainerFactor(factor, reference))
+        return graph
+
+    def _walk_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
+        """The random walk from epoch to epoch, by each camera's own strength."""
+        graph = gtsam.NonlinearFactorGraph()
+        for camera, known in enumerate(state.cameras):
+            if not self._walks[camera]:
+                continue
+            strength = STRENGTHS[known.memory.walk] / np.sqrt(state.overconfidence(camera))
+            for place in range(self._epochs - 1):
+                variance = state.walk_variance(len(state.epochs[place].frames))
+                noise = gtsam.noiseModel.Diagonal.Sigmas(strength * np.sqrt(variance))
+                graph.add(
+                    gtsam.BetweenFactorPose3(
+                        self._key(place, camera),
+                        self._key(place + 1, camera),
+                        gtsam.Pose3(),
+                        noise,
+                    )
+                )
+        return graph
+
+
+def known_of_poses(state: State) -> gtsam.NonlinearFactorGraph:
+    """Priors about the references, and the relative poses that no move has made wrong."""
+    pairs = enumerate(state.rig.relative_poses)
+    kept = tuple(pair for place, pair in pairs if place not in state.dropped_pairs)
+    rig = state.rig.model_copy(update={"relative_poses": kept})
+    T_hat = {
+        name: reference.inverse().matrix()
+        for name, reference in zip(state.names, state.references, strict=True)
+    }
+    return pose_graph(rig, T_hat, state.config, "full")
