@@ -6,6 +6,7 @@ import importlib.util
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from types import ModuleType
 from typing import Any
 
@@ -41,7 +42,9 @@ def run(scenario: str, seed: int) -> Any:
 
 
 def outcomes_of(scenario: str, runs: int) -> list[Any]:
-    with ProcessPoolExecutor(2) as pool:
+    """In fresh processes: a fork of one whose libraries run threads may die."""
+    events_module()  # whose outcomes come back
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         return list(pool.map(partial(run, scenario), range(1000, 1000 + runs)))
 
 
