@@ -31,6 +31,7 @@ from calibgraph.simulate import simulate_drive
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.change import Steps, cause_of
 from calibgraph.tracking.memory import STRENGTHS, Memory
+from calibgraph.tracking.moves import Found, shifted
 from calibgraph.tracking.spread import Spread
 from tests.conftest import make_camera, stereo_relative_pose
 
@@ -444,3 +445,11 @@ def test_an_update_that_fails_leaves_nothing_behind(
     for table, expected in zip(tables[19:], whole[19:], strict=True):
         found = tracker.update(table)
         np.testing.assert_array_equal(found.T_camera_lidar["left"], expected.T_camera_lidar["left"])
+
+
+@pytest.mark.parametrize("live_epochs", [1, 2, 8])
+def test_a_change_at_any_live_epoch_can_be_followed(pair: Rig, live_epochs: int) -> None:
+    tracker, _ = tracked(pair, drive(lambda frame: pair, 100), live_epochs=live_epochs)
+    state = tracker._state
+    for epoch in state.epochs[:-1]:  # the last one is open, and empty here
+        shifted(state, Found(epoch.frames[0].number, frozenset([0])))

@@ -45,7 +45,7 @@ _PATIENCE = 5  # frames more, for the other cameras to say whether they moved to
 _OUTVOTE = 2  # suspects per frame that still agrees with the old pose
 _RECENTLY = 300  # frames: a second small move within them is a drift
 _GUESSED_OVERCONFIDENCE = 100.0  # of H, while the frames' scatter is not known
-_OLD = 2  # a change before this one of the live epochs is an old one
+_OLD_SHARE = 0.25  # of the live epochs: a change before their end came slowly
 _FOLLOWING = 2  # the walk by which a change is followed, at least: the configured one
 _LEAST_EPOCHS = 1.0  # remembered, before which nothing is known of how epochs scatter
 _BEFORE = 20.0  # frames that must stand against a small move
@@ -235,7 +235,8 @@ def shifted(state: State, found: Found) -> tuple[State, tuple[Event, ...]]:
     (camera,) = found.sure
     known = state.cameras[camera]
     recently = known.moved_at >= 0 and state.updates - known.moved_at < _RECENTLY
-    if found.since > state.epochs[_OLD].frames[0].number and not recently:
+    old = state.epochs[int(_OLD_SHARE * (len(state.epochs) - 1))]
+    if found.since > old.frames[0].number and not recently:
         return moved(state, found)
     return drifting(state, camera, max(known.memory.best_walk, _FOLLOWING)), ()
 
