@@ -84,6 +84,11 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda temporary: _discard(temporary.write_text(text, "utf-8")))
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a binary file atomically."""
+    write_atomically(path, lambda temporary: _discard(temporary.write_bytes(data)))
+
+
 def _discard(_: object) -> None:
     return None
 

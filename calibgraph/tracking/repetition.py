@@ -20,10 +20,8 @@ Array = NDArray[np.float64]
 SPANS = (1, 8)
 """Epochs of a group."""
 
-LEAST_GROUPS = 6.0
-"""Groups before which it is not known how frames scatter."""
-
 _FREEDOM = 6
+_LEAST_GROUPS = 6.0  # before which it is not known how they scatter, direction by direction
 _KEPT = 0.995  # from group to group
 _CHANCE = 1.25  # times what the largest eigenvalue reaches by chance
 _UNUSUAL = 30.0  # squared sigmas of a six-vector: a group across a move counts for no more
@@ -113,7 +111,7 @@ def widening(groups: Sequence[Groups], noise: Array) -> Array:
     alike = _sure_inflation(groups)
     widest, most = np.eye(_FREEDOM) * np.sqrt(alike), alike ** (_FREEDOM / 2)
     for one in groups:
-        if one.count < LEAST_GROUPS:
+        if one.count < _LEAST_GROUPS:
             continue
         ratio = inverse @ (one.scatter / one.count) @ inverse.T
         values, vectors = np.linalg.eigh((ratio + ratio.T) / 2)

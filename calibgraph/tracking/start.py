@@ -67,7 +67,7 @@ def _begun(state: State, camera: int, pose: gtsam.Pose3) -> State:
     spread = Spread()
     for part in usable:
         spread = spread.plus(part, pose.inverse().matrix())
-    scale = spread.scale(state.config)
+    scale = spread.scale(state.config)  # what `noted` counts inliers by
     known = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for part in usable:
         known = noted(known, part, pose)

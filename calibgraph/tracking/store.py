@@ -25,7 +25,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
+from calibgraph.files import require_place_for_folder, sync_folder, write_bytes
 from calibgraph.tracking.store_format import (
     DIGEST_BYTES,
     HEAD_BYTES,
@@ -149,7 +149,7 @@ class Store:
         tail = self._require_writable()
         generation = tail.generation + 1
         self._start_journal(generation, tail.digest)
-        _write(
+        write_bytes(
             _path(self._folder, "snapshot", generation),
             encode_snapshot(generation, tail.digest, state),
         )
@@ -203,7 +203,7 @@ class Store:
         path = _path(self._folder, "journal", generation)
         head = encode_journal_head(generation, chain)
         try:
-            _write(path, head)
+            write_bytes(path, head)
             self._open_journal(generation, chain, len(head))
         except BaseException:
             # Whether this journal survives is unknown, so inputs could go neither there nor
@@ -343,7 +343,7 @@ def _mend(path: Path, journal: Journal, fault: DamageError) -> str:
     """
     mended = path.with_name(f"{path.name}.mended")
     data = _bytes_of(path)
-    _write(mended, data[: journal.length])
+    write_bytes(mended, data[: journal.length])
     aside = _set_aside(path)
     mended.replace(path)
     good, lost = len(journal.records), len(data) - journal.length
@@ -441,13 +441,6 @@ def _bytes_of(path: Path, most_bytes: int = -1) -> bytes:
     except OSError as error:
         message = f"cannot be read ({error}); it is left as it is, mend that and restart"
         raise FileError(path, message) from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    def fill(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomically(path, fill)
 
 
 def _write_at(descriptor: int, data: bytes, offset: int) -> None:

@@ -13,7 +13,7 @@ from calibgraph.calibration import Calibration, Verdict
 from calibgraph.config import Config
 from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file, write_atomically
+from calibgraph.files import require_file, write_bytes
 from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
 from calibgraph.preprocess import preprocess
 from calibgraph.rig import Rig
@@ -183,7 +183,7 @@ class IncrementalCalibrator:
         """Write the tracker to a file, atomically; :meth:`load` goes on from there."""
         data = self.to_bytes()
         head = _FORMAT + hashlib.sha256(data).digest()
-        write_atomically(Path(path), lambda part: _discard(part.write_bytes(head + data)))
+        write_bytes(Path(path), head + data)
 
     @staticmethod
     def load(path: Path | str) -> IncrementalCalibrator:
@@ -437,7 +437,3 @@ def _with_totals(state: State, frame: LiveFrame) -> State:
         total_hessian=_TOTAL_KEPT * state.total_hessian + frame.hessian,
         total_frames=_TOTAL_KEPT * state.total_frames + seen,
     )
-
-
-def _discard(_: object) -> None:
-    return None
