@@ -11,7 +11,8 @@ from typing import Any
 
 _HOMES = {
     "calibgraph.pipeline": ("Matcher", "calibrate"),
-    "calibgraph.calibration": ("Calibration", "Residuals", "Verdict", "load_calibration"),
+    "calibgraph.calibration": ("Calibration", "Residuals", "load_calibration"),
+    "calibgraph.check": ("Check", "Verdict"),
     "calibgraph.config": ("Config", "load_config", "preset"),
     "calibgraph.correspondence_file": ("load_correspondences",),
     "calibgraph.correspondences": ("Correspondences", "concatenate"),

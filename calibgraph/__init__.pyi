@@ -2,8 +2,9 @@
 
 from calibgraph.calibration import Calibration as Calibration
 from calibgraph.calibration import Residuals as Residuals
-from calibgraph.calibration import Verdict as Verdict
 from calibgraph.calibration import load_calibration as load_calibration
+from calibgraph.check import Check as Check
+from calibgraph.check import Verdict as Verdict
 from calibgraph.config import Config as Config
 from calibgraph.config import load_config as load_config
 from calibgraph.config import preset as preset

@@ -1,4 +1,4 @@
-"""What a solution is worth: its covariance, the agreement of halves of the data, the verdict."""
+"""What a solution is worth: its covariance, what it was tested against, the verdict."""
 
 from __future__ import annotations
 
@@ -9,16 +9,42 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.calibration import Residuals, Verdict
-from calibgraph.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.graph import Optimum, relative_pose_graph
-from calibgraph.matches import MIN_MATCHES
-from calibgraph.problem import Problem, Scales
-from calibgraph.rig import RelativePose, Rig, angle_deg
-from calibgraph.verdict import Conflict, Evidence, camera_verdict
+from calibgraph.bootstrap import bootstrap_check, bootstrap_covariance
+from calibgraph.calibration import Residuals
+from calibgraph.check import Check, Verdict, above
+from calibgraph.conventions import guess_checks, points_check
+from calibgraph.covariance import cluster_robust_covariance, data_sigmas, relative_covariance
+from calibgraph.graph import relative_pose_graph
+from calibgraph.problem import Fit, Poses, Problem, Scales
+from calibgraph.rig import RelativePose, Rig
+from calibgraph.smell import smell_checks
+from calibgraph.trials import (
+    distance,
+    even_frames,
+    halves_of,
+    held_out_check,
+    restart_checks,
+    rival_check,
+)
+from calibgraph.verdict import (
+    Conflict,
+    Evidence,
+    assumed_spread_check,
+    camera_verdict,
+    said_by_matcher,
+    with_matching,
+)
+from calibgraph.weakness import prior_shares, weaknesses
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
+
+Alone = tuple[Poses, Array | None]
+"""Poses without priors and relative poses, and their (6 M, 6 M) covariance."""
+
+PULLED_SIGMAS = 4.0
+PRIOR_WARN = 0.5
+"""Share of a result above which it says more of the priors than of the data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,116 +54,166 @@ class Assessment:
     Attributes:
         covariance: per camera, (6, 6) or None.
         joint_covariance: (6 N, 6 N) or None.
+        bootstrap: per camera (6, 6), if it was asked for.
+        residuals: per camera, of all correspondences, not only the inliers.
+        weaknesses: per camera, in words.
+        prior_share: per camera, of its result.
         verdicts: per camera.
     """
 
     covariance: dict[str, Array | None]
     joint_covariance: Array | None
+    bootstrap: dict[str, Array]
+    residuals: dict[str, Residuals]
+    weaknesses: dict[str, tuple[str, ...]]
+    prior_share: dict[str, float]
     verdicts: dict[str, Verdict]
 
 
-def assess(
-    rig: Rig,
-    inliers: Problem,
-    solution: Optimum,
-    scales: Scales,
-    *,
-    residuals: Mapping[str, Residuals],
-    systematic_sigmas: tuple[float, float],
-) -> Assessment:
-    """Judge a solution.
+def assess(fit: Fit, guess: Rig) -> Assessment:
+    """Judge a solution by everything that its correspondences can tell.
 
     Args:
-        rig: lenses.
-        inliers: what the solution was fitted to.
-        solution: the poses.
-        scales: of the residuals.
-        residuals: of all correspondences, not only the inliers.
-        systematic_sigmas: rotation [rad] and translation [m] that all frames share, per axis: the
-            scatter between frames, which the covariance is made of, cannot show them.
+        fit: the solution.
+        guess: the rig as it was guessed.
     """
-    joint = _joint_covariance(inliers, solution, scales, systematic_sigmas)
-    conflicts = _conflicts(rig, inliers, solution, scales, systematic_sigmas)
-    halves = _halves(inliers, solution, scales)
-    at_best = _data_sigmas(rig, inliers, solution, scales)
-    covariance: dict[str, Array | None] = {}
+    matches, poses = fit.problem.matches, fit.poses
+    residuals = {name: m.summary(poses[name], fit.scales[name]) for name, m in matches.items()}
+    scatter = scatter_covariance(fit.inliers, poses, fit.scales)
+    joint = None if scatter is None else scatter + _shared(fit.systematic_sigmas, len(poses))
+    covariance = {name: _block(joint, place) for place, name in enumerate(poses)}
+    scattered = {name: _block(scatter, place) for place, name in enumerate(poses)}
+    bootstrap = bootstrap_covariance(fit)
+    shares = prior_shares(fit)
+    evidence = _evidence(fit, residuals, covariance)
+    restarts = restart_checks(fit)
     verdicts = {}
-    for index, (name, camera) in enumerate(rig.cameras.items()):
-        rows = slice(6 * index, 6 * index + 6)
-        covariance[name] = None if joint is None else joint[rows, rows]
-        matches = inliers.matches.get(name)
-        evidence = Evidence(
+    for name, camera in fit.rig.cameras.items():
+        said = said_by_matcher(fit.metadata, name)
+        if joint is None:
+            said = replace(said, systematic_sigmas=fit.systematic_sigmas)
+        verdict = camera_verdict(camera, evidence[name]).and_first(_causes(fit, guess, name))
+        verdict = with_matching(verdict, said)
+        verdicts[name] = verdict.and_also(
+            [
+                *_trials(fit, name, evidence[name]),
+                *restarts.get(name, ()),
+                *bootstrap_check(scattered[name], bootstrap.get(name)),
+                above("share of the priors in the result", shares[name], PRIOR_WARN, 1.0, "share"),
+            ]
+        )
+    return Assessment(
+        covariance=covariance,
+        joint_covariance=joint,
+        bootstrap=bootstrap,
+        residuals=residuals,
+        weaknesses={name: weaknesses(fit, name, scattered[name]) for name in poses},
+        prior_share=shares,
+        verdicts=verdicts,
+    )
+
+
+def _block(joint: Array | None, place: int) -> Array | None:
+    return None if joint is None else joint[6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
+
+
+def _shared(systematic_sigmas: tuple[float, float], cameras: int) -> Array:
+    """(6 N, 6 N) covariance of the error that the matcher says its frames share."""
+    rotation, translation = systematic_sigmas
+    sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
+    return np.diag(np.tile(sigmas**2, cameras))
+
+
+def scatter_covariance(inliers: Problem, poses: Poses, scales: Scales) -> Array | None:
+    """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
+    if not inliers.fits_matches:
+        return None
+    return cluster_robust_covariance(
+        {name: m.scaled(scales[name]) for name, m in inliers.matches.items()},
+        {name: m.frame for name, m in inliers.matches.items()},
+        inliers.pose_graph,
+        poses,
+        gate_hessian=inliers.gate_hessian,
+    )
+
+
+def _evidence(
+    fit: Fit, residuals: Mapping[str, Residuals], covariance: Mapping[str, Array | None]
+) -> dict[str, Evidence]:
+    """Per camera what its verdict is made of."""
+    alone = _alone(fit)
+    conflicts = _conflicts(fit, alone)
+    halves = halves_of(fit)
+    at_best = _data_sigmas(fit)
+    evidence = {}
+    for place, name in enumerate(fit.rig.cameras):
+        matches = fit.inliers.matches.get(name)
+        evidence[name] = Evidence(
             residuals=residuals.get(name),
             used=0 if matches is None else len(matches.frame),
             frames=0 if matches is None else len(np.unique(matches.frame)),
             covariance=covariance[name],
-            data_sigmas=None if at_best is None else at_best[index],
+            data_sigmas=None if at_best is None else at_best[place],
             halves=halves.get(name),
             conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
-            turned_deg=_angle_between(camera.T_camera_lidar, solution.T_camera_lidar[name]),
-            converged=solution.converged,
-            terms=inliers.terms,
+            pulled=_pulled(fit, alone, name),
+            converged=fit.optimum.converged,
+            terms=fit.problem.terms,
         )
-        verdicts[name] = camera_verdict(camera, evidence)
-    return Assessment(covariance, joint, verdicts)
+    return evidence
 
 
-def _angle_between(one: Array, two: Array) -> float:
-    return angle_deg(one[:3, :3] @ two[:3, :3].T)
-
-
-def _joint_covariance(
-    inliers: Problem, solution: Optimum, scales: Scales, systematic_sigmas: tuple[float, float]
-) -> Array | None:
-    """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
-    if not inliers.fits_matches:
-        return None
-    blocks = {name: m.scaled(scales[name]) for name, m in inliers.matches.items()}
-    frames = {name: m.frame for name, m in inliers.matches.items()}
-    scatter = cluster_robust_covariance(
-        blocks,
-        frames,
-        inliers.pose_graph,
-        solution.T_camera_lidar,
-        gate_hessian=inliers.gate_hessian,
-    )
-    if scatter is None:
-        return None
-    rotation, translation = systematic_sigmas
-    sigmas = pose_sigmas(rotation_rad=rotation, translation_m=translation)
-    return scatter + np.diag(np.tile(sigmas**2, len(solution.T_camera_lidar)))
-
-
-def _data_sigmas(rig: Rig, inliers: Problem, solution: Optimum, scales: Scales) -> Array | None:
+def _data_sigmas(fit: Fit) -> Array | None:
     """(N, 6) what correspondences and measured relative poses could tell at best."""
-    if not inliers.fits_matches:
+    if not fit.inliers.fits_matches:
         return None
-    blocks = {name: m.scaled(scales[name]) for name, m in inliers.matches.items()}
-    known = relative_pose_graph(inliers.cameras, rig.relative_poses)
-    return data_sigmas(blocks, known, solution.T_camera_lidar)
+    blocks = {name: m.scaled(fit.scales[name]) for name, m in fit.inliers.matches.items()}
+    known = relative_pose_graph(fit.inliers.cameras, fit.rig.relative_poses)
+    return data_sigmas(blocks, known, fit.poses)
 
 
-def _conflicts(
-    rig: Rig,
-    inliers: Problem,
-    solution: Optimum,
-    scales: Scales,
-    systematic_sigmas: tuple[float, float],
-) -> list[Conflict]:
+def _conflicts(fit: Fit, alone: Alone | None) -> list[Conflict]:
     """How the rig's relative poses fit what the correspondences alone say.
 
-    Asked of pairs in which both cameras have correspondences, by a solve without relative poses.
+    Asked of pairs in which both cameras have correspondences.
     """
-    pairs = [p for p in rig.relative_poses if p.a in inliers.matches and p.b in inliers.matches]
-    if not pairs or not inliers.fits_matches:
+    if alone is None:
         return []
-    cameras = tuple(inliers.matches)
-    free = replace(inliers, cameras=cameras, pose_graph=gtsam.NonlinearFactorGraph())
-    start = {name: solution.T_camera_lidar[name] for name in cameras}
-    alone = free.minimize(start, scales)
-    covariance = _joint_covariance(free, alone, scales, systematic_sigmas)
-    found = alone.T_camera_lidar
-    return [relative_pose_conflict(pair, cameras, found, covariance) for pair in pairs]
+    named, (poses, covariance) = tuple(fit.inliers.matches), alone
+    pairs = [p for p in fit.rig.relative_poses if p.a in named and p.b in named]
+    return [relative_pose_conflict(pair, named, poses, covariance) for pair in pairs]
+
+
+def _pulled(fit: Fit, alone: Alone | None, camera: str) -> tuple[float, float] | None:
+    """How far priors and relative poses pull a camera from its own solution: deg, cm.
+
+    None where they do not, or within what that solution leaves open.
+    """
+    if alone is None or camera not in fit.inliers.matches:
+        return None
+    poses, covariance = alone
+    if covariance is not None:
+        place = 6 * tuple(fit.inliers.matches).index(camera)
+        sigmas = np.sqrt(np.diag(covariance))[place : place + 6]
+        step = gtsam.Pose3(fit.poses[camera] @ np.linalg.inv(poses[camera]))
+        if np.abs(gtsam.Pose3.Logmap(step) / sigmas).max() < PULLED_SIGMAS:
+            return None
+    return distance(fit.poses[camera], poses[camera])
+
+
+def _alone(fit: Fit) -> Alone | None:
+    """What the correspondences alone say: every camera for itself, and their covariance.
+
+    None where nothing else has a say.
+    """
+    if not fit.inliers.fits_matches or not fit.inliers.pose_graph.size():
+        return None
+    cameras = tuple(fit.inliers.matches)
+    free = replace(fit.inliers, cameras=cameras, pose_graph=gtsam.NonlinearFactorGraph())
+    alone = free.minimize({name: fit.poses[name] for name in cameras}, fit.scales)
+    scatter = scatter_covariance(free, alone.T_camera_lidar, fit.scales)
+    shared = _shared(fit.systematic_sigmas, len(cameras))
+    return alone.T_camera_lidar, None if scatter is None else scatter + shared
 
 
 def relative_pose_conflict(
@@ -151,25 +227,28 @@ def relative_pose_conflict(
         ** 2
     )
     if covariance is not None:
-        # T_a_b = exp(xi_a) T_a (exp(xi_b) T_b)^-1: in b, the difference is Ad(T_b_a) xi_a - xi_b.
-        i, j = 6 * cameras.index(pair.a), 6 * cameras.index(pair.b)
-        by_poses = np.zeros((6, len(covariance)))
-        by_poses[:, i : i + 6] = gtsam.Pose3(np.linalg.inv(estimated)).AdjointMap()
-        by_poses[:, j : j + 6] -= np.eye(6)
-        variance = variance + np.diag(by_poses @ covariance @ by_poses.T)
+        places = cameras.index(pair.a), cameras.index(pair.b)
+        of_pair = relative_covariance(covariance, *places, np.linalg.inv(estimated))
+        variance = variance + np.diag(of_pair)
     return Conflict(pair, difference, np.sqrt(variance))
 
 
-def _halves(inliers: Problem, solution: Optimum, scales: Scales) -> dict[str, tuple[Array, Array]]:
-    """Per camera the solutions from every other frame and from the frames between, if possible."""
-    if not inliers.fits_matches:
-        return {}
-    numbers = np.unique(np.concatenate([m.frame for m in inliers.matches.values()]))
-    solutions = []
-    for half in (numbers[::2], numbers[1::2]):
-        part = {n: m.select(np.isin(m.frame, half)) for n, m in inliers.matches.items()}
-        if any(len(m.frame) < MIN_MATCHES for m in part.values()):
-            return {}
-        problem = inliers.with_matches(part)
-        solutions.append(problem.minimize(solution.T_camera_lidar, scales).T_camera_lidar)
-    return {name: (solutions[0][name], solutions[1][name]) for name in inliers.matches}
+def _causes(fit: Fit, guess: Rig, camera: str) -> list[Check]:
+    """What names a cause comes first: a guess that was meant otherwise, points in millimetres."""
+    matches = fit.problem.matches.get(camera)
+    checks = guess_checks(guess.T_camera_lidar[camera], fit.poses[camera])
+    return checks if matches is None else [*checks, points_check(matches)]
+
+
+def _trials(fit: Fit, name: str, evidence: Evidence) -> list[Check]:
+    """What is asked of a camera's result beyond its own residuals."""
+    matches, T = fit.problem.matches.get(name), fit.poses[name]
+    camera = fit.rig.cameras[name]
+    if matches is None or not fit.problem.fits_matches:
+        return []
+    checks = [rival_check(fit, name)]
+    if fit.config.loss_scale_px is not None and evidence.residuals is not None:
+        checks.append(assumed_spread_check(evidence.residuals, fit.config.loss_scale_px))
+    if evidence.halves is not None:
+        checks.append(held_out_check(matches, evidence.halves, even_frames(fit.inliers)))
+    return [*checks, *smell_checks(camera, matches, fit.scales[name], T)]

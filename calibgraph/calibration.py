@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
+from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.check import Check, Verdict, rig_verdict
 from calibgraph.config import Config, Terms
 from calibgraph.correspondences import Correspondences
+from calibgraph.covariance import relative_covariance
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml, write_yaml
 from calibgraph.rig import Rig
@@ -29,8 +32,9 @@ TANGENT_SENTENCE = (
     "T_camera_lidar = exp(xi) * estimate, "
     "xi = (rotation [rad], translation [m]) in the camera's axes"
 )
-
-Status = Literal["PASS", "WARN", "FAIL"]
+PAIR_TANGENT_SENTENCE = (
+    "A->B: T_B_A = exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the axes of B"
+)
 
 
 def _versions() -> dict[str, str]:
@@ -42,19 +46,6 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             versions[package] = "not installed as a package"
     return versions
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a result can be used.
-
-    Attributes:
-        status: PASS, WARN or FAIL.
-        reasons: what was checked and found wanting, a sentence each; empty for PASS.
-    """
-
-    status: Status
-    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -88,7 +79,6 @@ class Calibration:
             per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None with too few frames to tell.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
-        verdict: of the rig: the worst of its cameras'.
         camera_verdicts: per camera.
         residuals: per camera that had correspondences.
         counts: per camera, what was left after each filter and gate, and the frames.
@@ -96,6 +86,12 @@ class Calibration:
         terms: which terms of the objective were used.
         config: the resolved settings.
         stage1_T_camera_lidar: the pairwise estimates.
+        weaknesses: per camera, what the data leave loose, in words, the worst first.
+        prior_share: per camera, which share of its result comes from priors, not from data (0-1).
+        bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
+            frames drawn with replacement, like ``covariance``; the check of it.
+        frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
+            ``images``, a file per camera.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         correspondences: of the last round of ``calibrate``.
         inputs: SHA-256 of the input files, by path.
@@ -106,7 +102,6 @@ class Calibration:
     initial_rig: Rig
     covariance: dict[str, Array | None]
     joint_covariance: Array | None
-    verdict: Verdict
     camera_verdicts: dict[str, Verdict]
     residuals: dict[str, Residuals]
     counts: dict[str, dict[str, int]]
@@ -114,10 +109,19 @@ class Calibration:
     terms: Terms
     config: Config
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
+    weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    prior_share: dict[str, float] = field(default_factory=dict)
+    bootstrap: dict[str, Array] = field(default_factory=dict)
+    frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[dict[str, Any], ...] = ()
     correspondences: Correspondences | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=_versions)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the rig: all that was asked of its cameras."""
+        return rig_verdict(self.camera_verdicts)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -125,12 +129,37 @@ class Calibration:
         return self.rig.T_camera_lidar
 
     def sigmas(self, name: str) -> tuple[Array, Array] | None:
-        """A camera's standard deviations: (3,) rotation [deg], (3,) translation [cm], or None."""
-        covariance = self.covariance[name]
-        if covariance is None:
-            return None
-        sigmas = np.sqrt(np.diag(covariance))
-        return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
+        """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
+
+        Returns:
+            (3,) rotation [deg], (3,) translation [cm]; None with too few frames to tell.
+        """
+        covariance = self.covariance.get(name, self.pair_covariance.get(name))
+        return None if covariance is None else degrees_and_centimetres(covariance)
+
+    def judged_further(self, *checks: Mapping[str, Sequence[Check]]) -> Calibration:
+        """The same result with more checks per camera."""
+        verdicts = {
+            name: verdict.and_also(check for more in checks for check in more.get(name, ()))
+            for name, verdict in self.camera_verdicts.items()
+        }
+        return replace(self, camera_verdicts=verdicts)
+
+    @property
+    def pair_covariance(self) -> dict[str, Array]:
+        """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
+
+        Empty with too few frames to tell.
+        """
+        if self.joint_covariance is None:
+            return {}
+        T = self.T_camera_lidar
+        return {
+            f"{a}->{b}": relative_covariance(
+                self.joint_covariance, i, j, T[b] @ np.linalg.inv(T[a])
+            )
+            for (i, a), (j, b) in combinations(enumerate(T), 2)
+        }
 
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
         """The same result, knowing the hashes of the files it came from."""
@@ -142,8 +171,12 @@ class Calibration:
         Each file appears whole or not at all. Returns the path of the YAML file.
         """
         path = Path(folder) / CALIBRATION_FILE
+        table = path.with_name(CORRESPONDENCES_FILE)
         if self.correspondences is not None:
-            self.correspondences.save(path.with_name(CORRESPONDENCES_FILE))
+            marked = {**self.correspondences.metadata, "verdict": self.verdict.status}
+            replace(self.correspondences, metadata=marked).save(table)
+        else:
+            table.unlink(missing_ok=True)  # an older result's
         write_yaml(path, self._to_mapping())
         return path
 
@@ -161,7 +194,12 @@ class Calibration:
         return {
             "format": CALIBRATION_FORMAT,
             "verdict": _verdict_mapping(self.verdict),
-            "camera_verdicts": {k: _verdict_mapping(v) for k, v in self.camera_verdicts.items()},
+            "camera_verdicts": {
+                name: {**_verdict_mapping(verdict), "checks": [vars(c) for c in verdict.checks]}
+                for name, verdict in self.camera_verdicts.items()
+            },
+            "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
+            "prior_share": self.prior_share,
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
@@ -169,8 +207,12 @@ class Calibration:
             "covariance_of": TANGENT_SENTENCE,
             "covariance": dict(self.covariance),
             "joint_covariance": self.joint_covariance,
+            "pair_covariance_of": PAIR_TANGENT_SENTENCE,
+            "pair_covariance": self.pair_covariance,
+            "bootstrap_covariance": self.bootstrap,
             "residuals": {name: vars(value) for name, value in self.residuals.items()},
             "counts": self.counts,
+            "frames_used": list(self.frames),
             "rounds": list(self.rounds),
             "initial_rig": self.initial_rig.model_dump(),
             "stage1_T_camera_lidar": self.stage1_T_camera_lidar,
@@ -182,8 +224,14 @@ class Calibration:
         }
 
 
+def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
+    """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
+    sigmas = np.sqrt(np.diag(covariance))
+    return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
+
+
 def load_calibration(path: Path | str) -> Calibration:
-    """Read a result, from its folder or its file.
+    """Read a result, from its folder or its file, with the correspondences that lie beside it.
 
     Raises:
         FileError: if it is missing or malformed.
@@ -201,22 +249,34 @@ def load_calibration(path: Path | str) -> Calibration:
             initial_rig=checked_model(Rig, content["initial_rig"], path),
             covariance={k: _array(v) for k, v in content["covariance"].items()},
             joint_covariance=_array(content["joint_covariance"]),
-            verdict=_verdict(content["verdict"]),
             camera_verdicts={k: _verdict(v) for k, v in content["camera_verdicts"].items()},
             residuals={k: Residuals(**v) for k, v in content["residuals"].items()},
             stage1_T_camera_lidar={
                 k: np.array(v) for k, v in content["stage1_T_camera_lidar"].items()
             },
             config=checked_model(Config, content["config"], path),
+            weaknesses={k: tuple(v) for k, v in content["weaknesses"].items()},
+            bootstrap={k: np.array(v) for k, v in content["bootstrap_covariance"].items()},
+            frames=tuple(content["frames_used"]),
             rounds=tuple(content["rounds"]),
+            correspondences=_correspondences(path.with_name(CORRESPONDENCES_FILE)),
             **{name: content[name] for name in _PLAIN},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FileError(path, f"is not a complete result ({error!r}); write it again") from error
 
 
-_PLAIN = ("counts", "timings_s", "terms", "inputs", "versions")
+_PLAIN = ("counts", "timings_s", "terms", "prior_share", "inputs", "versions")
 assert {*_PLAIN} <= {f.name for f in fields(Calibration)}
+
+
+def _correspondences(path: Path) -> Correspondences | None:
+    """The table, if there is one."""
+    if not path.is_file():
+        return None
+    from calibgraph.correspondence_file import load_correspondences
+
+    return load_correspondences(path)
 
 
 def is_calibration(content: Mapping[str, Any]) -> bool:
@@ -236,7 +296,7 @@ def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
 
 
 def _verdict(content: Mapping[str, Any]) -> Verdict:
-    return Verdict(content["status"], tuple(content["reasons"]))
+    return Verdict(tuple(Check(**check) for check in content["checks"]))
 
 
 def _array(value: Any) -> Array | None:

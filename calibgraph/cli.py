@@ -16,6 +16,7 @@ import typer
 
 from calibgraph.cli_options import (
     BatchOption,
+    BootstrapOption,
     ConfigOption,
     DatasetArgument,
     DeviceOption,
@@ -84,6 +85,7 @@ def calibrate(
     terms: TermsOption = "full",
     out: OutOption = Path("calibration"),
     seed: SeedOption = 0,
+    bootstrap: BootstrapOption = None,
     as_json: JsonOption = False,
     weights: WeightsOption = None,
     estimate: EstimateOption = None,
@@ -93,14 +95,15 @@ def calibrate(
     occlusion_filter: OcclusionOption = None,
     batch: BatchOption = None,
 ) -> None:
-    """From images and clouds to one calibration of all cameras, with pictures before and after."""
+    """From images and clouds to one calibration of all cameras, with pictures and a report."""
     from calibgraph.files import require_place_for_folder
     from calibgraph.overlay import write_overlays
     from calibgraph.pipeline import calibrate
+    from calibgraph.report import write_report
 
     require_place_for_folder(out)
     with _arguments():
-        settings, checked_terms = _settings(config, preset, seed), _terms(terms)
+        settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
         chosen = _matcher(
             matcher,
             weights,
@@ -119,7 +122,8 @@ def calibrate(
         )
         written = [result.save(out), out / "correspondences.parquet"]
         shown = data.frames[len(data.frames) // 2]
-        written += write_overlays(shown, result.initial_rig, result.rig, out)
+        written += write_overlays(shown, result.initial_rig, result.rig, out, mark=_mark(result))
+        written.append(write_report(result, out / "report.html"))
     _finish(result, written, as_json)
 
 
@@ -144,7 +148,7 @@ def match(
 ) -> None:
     """Find correspondences and write them as a table, without keeping the calibration."""
     from calibgraph.files import require_place_for_file
-    from calibgraph.pipeline import calibrate
+    from calibgraph.pipeline import match_in_rounds
 
     require_place_for_file(out)
     with _arguments():
@@ -163,9 +167,7 @@ def match(
         )
     data = _dataset(dataset, rig, frames)
     with _progress() as progress:
-        result = calibrate(data, matcher=chosen, progress=progress)
-    table = result.correspondences
-    assert table is not None  # calibrate always keeps those of its last round
+        table = match_in_rounds(data, matcher=chosen, progress=progress).table
     table.save(out)
     if as_json:
         from calibgraph.json_output import print_json
@@ -187,21 +189,60 @@ def solve(
     config: ConfigOption = None,
     out: OutOption = Path("calibration"),
     seed: SeedOption = 0,
+    bootstrap: BootstrapOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """From a table of correspondences to one calibration of all cameras."""
+    """From a table of correspondences to one calibration of all cameras, with a report."""
+    from dataclasses import replace
+
     from calibgraph.correspondence_file import load_correspondences
     from calibgraph.files import require_place_for_folder, sha256
     from calibgraph.load import load_rig
+    from calibgraph.report import write_report
     from calibgraph.two_pass import solve
 
     require_place_for_folder(out)
     with _arguments():
-        settings, checked_terms = _settings(config, preset, seed), _terms(terms)
+        settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
     table = load_correspondences(correspondences)
     result = solve(load_rig(rig), table, settings, checked_terms)
     result = result.with_inputs({str(correspondences): sha256(correspondences)})
-    _finish(result, [result.save(out)], as_json)
+    result = replace(result, correspondences=table)
+    written = [result.save(out), write_report(result, out / "report.html")]
+    _finish(result, written, as_json)
+
+
+@app.command()
+def report(
+    result: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Result: its folder, or its calibration.yaml.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Page to write. (default: DIR/report.html)"),
+    ] = None,
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Where the images and clouds are now, if they have moved; may come again: the "
+            "same folders in the same order.",
+        ),
+    ] = None,
+) -> None:
+    """Write what is known of a result as one HTML page that opens without a network."""
+    from calibgraph.calibration import load_calibration
+    from calibgraph.dataset import load_dataset
+    from calibgraph.report import with_files_of, write_report
+
+    loaded = load_calibration(result)
+    if dataset:
+        loaded = with_files_of(loaded, load_dataset(dataset, loaded.rig))
+    folder = result if result.is_dir() else result.parent
+    path = write_report(loaded, out or folder / "report.html")
+    _console().print(
+        f"{path}: written; the verdict is {loaded.verdict.status}", markup=False, soft_wrap=True
+    )
 
 
 @app.command()
@@ -589,13 +630,16 @@ def _matcher(name: str, weights: list[Path] | None, *, seed: int, **options: Any
     return chosen
 
 
-def _settings(config: Path | None, preset_name: str | None, seed: int) -> Config:
+def _settings(
+    config: Path | None, preset_name: str | None, seed: int, bootstrap: int | None = None
+) -> Config:
     from calibgraph.config import load_config, preset
 
     if config is not None and preset_name is not None:
         raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
     settings = load_config(config) if config is not None else preset(preset_name or "auto")
-    return settings.changed(seed=seed) if seed else settings
+    given = {"seed": seed or None, "bootstrap": bootstrap}
+    return settings.changed(**{k: v for k, v in given.items() if v is not None})
 
 
 def _terms(name: str) -> Any:
@@ -626,6 +670,11 @@ def _progress() -> Iterator[Progress]:
         yield lambda what, done, total: bar.update(
             task, description=what, completed=done, total=total
         )
+
+
+def _mark(result: Calibration) -> str:
+    """What every picture of a result that cannot be used says."""
+    return "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
 
 
 def _finish(result: Calibration, written: list[Path], as_json: bool) -> None:

@@ -95,5 +95,13 @@ TermsOption = Annotated[
     typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
 ]
 OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
+BootstrapOption = Annotated[
+    int | None,
+    typer.Option(
+        min=2,
+        max=100_000,
+        help="Check the error bar: solve N times with frames drawn with replacement.",
+    ),
+]
 SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]

@@ -66,6 +66,8 @@ class Config(BaseModel):
             aggregated; or ``rig``, the poses in the rig as they are.
         aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
+        bootstrap: how many times to solve again with frames drawn with replacement, as a check
+            of the covariance; 0 for none.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """
@@ -87,6 +89,7 @@ class Config(BaseModel):
     stage1: Literal["pnp", "rig"] = "pnp"
     aggregate: Literal["median", "mean", "mode"] = "median"
     pnp_threshold_px: Pixels = 8.0
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
     seed: Seed = 0
     tracking: Tracking = Tracking()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -45,6 +45,15 @@ class Frame:
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`load_image`."""
         return load_image(self.image_paths[name], camera)
+
+    def entry(self) -> dict[str, Any]:
+        """Which files the frame's number stands for, as a result keeps it."""
+        return {
+            "frame": self.index,
+            "name": self.name,
+            "cloud": str(self.cloud_path),
+            "images": {name: str(path) for name, path in self.image_paths.items()},
+        }
 
 
 @dataclass(frozen=True)

@@ -14,22 +14,33 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     """A result as plain values: degrees, centimetres and pixels, named in every key."""
     cameras = {}
     for name, T in result.T_camera_lidar.items():
-        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+        residuals = result.residuals.get(name)
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
             "verdict": result.camera_verdicts[name].status,
             "reasons": list(result.camera_verdicts[name].reasons),
-            "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
-            "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
+            **_sigmas(result, name),
             "residuals": None if residuals is None else vars(residuals),
+            "weaknesses": list(result.weaknesses.get(name, ())),
+            "prior_share": result.prior_share.get(name),
             "counts": result.counts[name],
         }
     return {
         "verdict": result.verdict.status,
         "reasons": list(result.verdict.reasons),
         "cameras": cameras,
+        "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,
         "files": [str(path) for path in written],
+    }
+
+
+def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | None]:
+    """Of a camera or a pair: about and along x, y, z."""
+    sigmas = result.sigmas(name)
+    return {
+        "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
+        "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
     }
 
 

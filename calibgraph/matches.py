@@ -84,6 +84,20 @@ class Matches:
         )
         return Matches(block, kept[1], self.frame[rows])
 
+    def as_table(self, *, camera: str) -> Correspondences:
+        """The matches as a table of correspondences, their weights as information."""
+        root, information = self.block.sqrt_information, None
+        if root is not None:  # upper triangular, [[a, b], [0, c]]
+            a, b, c = root.T
+            information = np.column_stack([a * a, a * b, b * b + c * c])
+        return Correspondences.from_arrays(
+            camera=camera,
+            frame=self.frame,
+            pixels_px=self.block.pixels_px,
+            points_lidar_m=self.block.points_lidar_m,
+            information_px=information,
+        )
+
     def scaled(self, scale: Scale) -> ProjectionBlock:
         """The block with its loss, in units of the residuals' sigma."""
         root = self.block.sqrt_information

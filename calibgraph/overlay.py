@@ -23,7 +23,9 @@ _COVERED_SHARE = 0.2  # of the image, by points
 _MAX_DOT_PX = 7
 
 
-def write_overlays(frame: Frame, initial: Rig, final: Rig, folder: Path) -> list[Path]:
+def write_overlays(
+    frame: Frame, initial: Rig, final: Rig, folder: Path, *, mark: str = ""
+) -> list[Path]:
     """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
 
     Args:
@@ -31,6 +33,7 @@ def write_overlays(frame: Frame, initial: Rig, final: Rig, folder: Path) -> list
         initial: the poses before.
         final: the poses after.
         folder: where to write.
+        mark: what to write over the picture of the result, such as that it failed.
     """
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
     paths = []
@@ -39,7 +42,7 @@ def write_overlays(frame: Frame, initial: Rig, final: Rig, folder: Path) -> list
         after = final.cameras[name]
         panels = [
             _titled(overlay(image, cloud, camera), f"{name}, frame {frame.name}: before"),
-            _titled(overlay(image, cloud, after), f"{name}, frame {frame.name}: after"),
+            _titled(overlay(image, cloud, after), f"{mark}{name}, frame {frame.name}: after"),
             _depth_bar(image.shape[1]),
         ]
         paths.append(folder / f"overlay_{name}.png")
@@ -62,7 +65,7 @@ def overlay(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
     order = np.argsort(-np.linalg.norm(points[valid], axis=1))
     points, pixels = points[valid][order], pixels[valid][order]
     column, row = np.rint(pixels).astype(np.intp).T
-    colours = _colours(np.linalg.norm(points, axis=1))
+    colours = depth_colours(np.linalg.norm(points, axis=1))
     drawn = image.copy()
     side = _dot_side(image.shape[0] * image.shape[1], len(points))
     for dy, dx in np.ndindex(side, side):
@@ -93,8 +96,10 @@ def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def _colours(distance_m: Array) -> Image:
+def depth_colours(distance_m: Array) -> Image:
     """(n, 3) BGR: red is near, blue is far, even in the logarithm of the distance."""
+    if not len(distance_m):  # OpenCV has no colours for nothing
+        return np.empty((0, 3), np.uint8)
     low, high = np.log(DEPTH_RANGE_M)
     share = np.clip((np.log(distance_m) - low) / (high - low), 0.0, 1.0)
     levels = np.rint(255 * (1 - share)).astype(np.uint8)
@@ -117,7 +122,7 @@ def _depth_bar(width: int) -> Image:
     scale = max(0.5, width / 1600)
     low, high = np.log(DEPTH_RANGE_M)
     distances = np.exp(np.linspace(low, high, width))
-    bar = np.repeat(_colours(distances)[None], round(_BAR_PX * scale), axis=0)
+    bar = np.repeat(depth_colours(distances)[None], round(_BAR_PX * scale), axis=0)
     for tick in (2, 5, 10, 20, 50):
         x = int((np.log(tick) - low) / (high - low) * (width - 1))
         for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):  # outlined

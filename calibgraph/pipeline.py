@@ -11,14 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.calibration import Calibration
+from calibgraph.check import Check
 from calibgraph.config import Config, Terms
 from calibgraph.correspondence_file import load_correspondences
 from calibgraph.correspondences import Correspondences
 from calibgraph.dataset import Dataset, load_dataset
+from calibgraph.errors import CorrespondenceError
 from calibgraph.files import sha256
+from calibgraph.problem import Clock, Fit
 from calibgraph.rig import Rig, angle_deg
-from calibgraph.two_pass import Clock, solve
-from calibgraph.verdict import Matching, rig_verdict, with_matching
+from calibgraph.second_look import Matched, better_reading, second_look
+from calibgraph.two_pass import fit, judged
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -33,9 +36,12 @@ class Matcher(Protocol):
     ``start_dependence``: which share of a displaced start remains in the matches (0 to 1);
     ``recall``: which share of the way back it finds without the image (0 to 1);
     ``failed_share``: which share of the frames it left out (0 to 1).
+    Two plain numbers say how far from the guess it looks, per axis: ``range_rotation_deg`` and
+    ``range_translation_m``; two more what error its frames share, see ``Correspondences``.
 
-    For single frames of a drive, near a good estimate, it may have an attribute
-    ``tracking_rounds``: which of its rounds to go through then; otherwise it is all of them.
+    It may have an attribute ``tracking_rounds``: which of its rounds to go through near a good
+    estimate. Single frames of a drive go through these (otherwise through all), and a result is
+    tried by matching again with them from a start displaced from it.
 
     Attributes:
         rounds: how many rounds it wants.
@@ -103,34 +109,75 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
+    report = progress or (lambda what, done, total: None)
+    matched = match_in_rounds(dataset, rig, matcher, config, terms, progress=report)
+    data, clock = matched.dataset, matched.clock
+    with clock("hash_inputs"):
+        inputs = _input_hashes(data)
+    with clock("checks"):
+        result = judged(matched.fit, guess=matched.guess)
+        result = result.judged_further(second_look(matched, inputs, report))
+        if result.verdict.status == "FAIL":
+            result = _with_reading(result, better_reading(data, matched.guess))
+    report("done", 1, 1)
+    return replace(
+        result,
+        correspondences=matched.table,
+        frames=tuple(frame.entry() for frame in data.frames),
+        rounds=matched.rounds,
+        inputs=inputs,
+        timings_s=clock.seconds,
+    )
+
+
+def match_in_rounds(
+    dataset: Dataset | Path | str | Sequence[Path | str],
+    rig: Rig | None = None,
+    matcher: Matcher | Correspondences | Path | str = "structure",
+    config: Config | None = None,
+    terms: Terms = "full",
+    *,
+    progress: Progress,
+) -> Matched:
+    """Match, solve, and match again from the estimate, as often as the matcher wants.
+
+    Nothing is judged. Arguments and errors as of :func:`calibrate`.
+    """
     config = config or Config()
     chosen = matcher_named(matcher, seed=config.seed)
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    initial = rig if rig is not None else data.rig
+    guess = rig if rig is not None else data.rig
     if chosen.stage1 == "rig":
         config = config.changed(stage1="rig")
     if chosen.rounds < 1:
         raise ValueError(f"the matcher wants {chosen.rounds} rounds, expected at least 1")
-    report = progress or (lambda what, done, total: None)
-    clock, rounds, estimate = Clock(), list[dict[str, Any]](), initial
+    clock, rounds, estimate = Clock(), list[dict[str, Any]](), guess
     for index in range(chosen.rounds):
         with clock("match"):
-            table = chosen.match(data, estimate, round_index=index, progress=report)
+            table = chosen.match(data, estimate, round_index=index, progress=progress)
         with clock("solve"):
-            result = solve(estimate, table, config, terms)
-        rounds.append(_round(table, estimate, result.rig))
-        estimate = result.rig
-    report("done", chosen.rounds, chosen.rounds)
-    with clock("hash_inputs"):
-        inputs = _input_hashes(data)
-    return replace(
-        _judged_by_rounds(result, rounds, repeated=_repeated_frame(data, inputs)),
-        initial_rig=initial,
-        correspondences=table,
-        rounds=tuple(rounds),
-        inputs=inputs,
-        timings_s=clock.seconds,
-    )
+            found = _fit(data, guess, (estimate, table), config, terms)
+        rounds.append(_round(table, estimate, found.solved_rig))
+        estimate = found.solved_rig
+    return Matched(data, chosen, guess, table, found, tuple(rounds), clock)
+
+
+def _with_reading(result: Calibration, meant: str | None) -> Calibration:
+    """A failed result with what its guess may have meant."""
+    if meant is None:
+        return result
+    text = f"the images fit better if the guess is {meant}: correct it and calibrate again"
+    check = Check("reading of the guess", "FAIL", text)
+    verdicts = {name: v.and_first([check]) for name, v in result.camera_verdicts.items()}
+    return replace(result, camera_verdicts=verdicts)
+
+
+def _input_hashes(dataset: Dataset) -> dict[str, str]:
+    """SHA-256 of every cloud and image, by path."""
+    files = [
+        path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
+    ]
+    return {str(path): sha256(path) for path in files}
 
 
 def matcher_named(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> Matcher:
@@ -179,38 +226,23 @@ def _round(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
     return cameras
 
 
-def _judged_by_rounds(
-    result: Calibration, rounds: Sequence[dict[str, Any]], *, repeated: str | None
-) -> Calibration:
-    """The result with a verdict that knows of all rounds, not only of the last solve."""
-    verdicts = {
-        name: with_matching(
-            verdict,
-            Matching(
-                moved_deg=rounds[-1][name]["moved_deg"] if len(rounds) > 1 else 0.0,
-                moved_cm=rounds[-1][name]["moved_cm"] if len(rounds) > 1 else 0.0,
-                repeated=repeated,
-            ),
-        )
-        for name, verdict in result.camera_verdicts.items()
-    }
-    return replace(result, camera_verdicts=verdicts, verdict=rig_verdict(verdicts))
+def _fit(
+    dataset: Dataset,
+    guess: Rig,
+    matched: tuple[Rig, Correspondences],
+    config: Config,
+    terms: Terms,
+) -> Fit:
+    """The two passes; where there is too little to fit, with what the guess may have meant.
 
-
-def _input_hashes(dataset: Dataset) -> dict[str, str]:
-    """SHA-256 of every cloud and image, by path."""
-    files = [
-        path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
-    ]
-    return {str(path): sha256(path) for path in files}
-
-
-def _repeated_frame(dataset: Dataset, hashes: dict[str, str]) -> str | None:
-    """Two frames with the very same cloud, if there are any: they are no independent evidence."""
-    seen: dict[str, str] = {}
-    for frame in dataset.frames:
-        digest = hashes[str(frame.cloud_path)]
-        if digest in seen:
-            return f"frames {seen[digest]} and {frame.name} have the same cloud"
-        seen[digest] = frame.name
-    return None
+    Raises:
+        CorrespondenceError: if a camera gets too few correspondences.
+    """
+    try:
+        return fit(*matched, config, terms)
+    except CorrespondenceError as error:
+        meant = better_reading(dataset, guess)
+        if meant is None:
+            raise
+        hint = f"{error}; the images fit better if the guess is {meant}"
+        raise CorrespondenceError(hint, camera=error.camera) from error

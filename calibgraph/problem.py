@@ -1,22 +1,30 @@
-"""The optimization problem: matches and what is known of poses, and its minimum."""
+"""The optimization problem: matches and what is known of poses; its minimum, and what it gave."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.config import Terms
+from calibgraph.config import Config, Terms
+from calibgraph.errors import CorrespondenceError
 from calibgraph.graph import Optimum, joined, optimize, projection_graph
-from calibgraph.matches import Matches, Scale
+from calibgraph.matches import MIN_MATCHES, Matches, Scale
+from calibgraph.rig import Rig
 
 Array = NDArray[np.float64]
 Poses = dict[str, Array]
 Scales = dict[str, Scale]
+
+_MAX_RESCALINGS = 10
+_SETTLED = 0.01  # relative change of the spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +63,110 @@ class Problem:
             blocks = {name: m.scaled(scales[name]) for name, m in self.matches.items()}
             graph = joined(projection_graph(self.cameras, blocks), graph)
         return optimize(graph, self.cameras, start)
+
+    def settled(self, start: Poses, config: Config) -> tuple[Poses, Scales]:
+        """Pass 1. With `auto` scales: fit and re-measure the spread until it stands still."""
+        poses, scales = start, self.scales_at(start, config)
+        for _ in range(_MAX_RESCALINGS):
+            poses = self.minimize(poses, scales).T_camera_lidar
+            before, scales = scales, self.scales_at(poses, config)
+            ratios = [scales[name].sigma / before[name].sigma for name in scales]
+            if all(abs(ratio - 1.0) < _SETTLED for ratio in ratios):
+                break
+        return poses, scales
+
+    def scales_at(self, poses: Poses, config: Config) -> Scales:
+        """The configured scales, or those of the residuals' own spread at some poses.
+
+        Raises:
+            CorrespondenceError: if a camera has all its matches behind it.
+        """
+        scales = {name: m.scale(poses[name], config) for name, m in self.matches.items()}
+        for name, scale in scales.items():
+            if not math.isfinite(scale.sigma_px):
+                raise CorrespondenceError(
+                    f"camera {name!r}: all its correspondences are behind it at the estimate; do "
+                    "its guess and the relative_poses hold (p_camera = T_camera_lidar * p_lidar, "
+                    "p_a = T_a_b * p_b), and are the cameras' names right?",
+                    camera=name,
+                )
+        return scales
+
+    def gated(self, poses: Poses, scales: Scales) -> Problem:
+        """The problem without the matches beyond the gate (paper, two-pass solver, 2).
+
+        Raises:
+            CorrespondenceError: if a camera is left with too few.
+        """
+        inliers = {name: m.gated(poses[name], scales[name]) for name, m in self.matches.items()}
+        for name, left in inliers.items():
+            if len(left.frame) < MIN_MATCHES:
+                raise CorrespondenceError(
+                    f"camera {name!r}: only {len(left.frame)} of {len(self.matches[name].frame)} "
+                    f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at "
+                    f"least {MIN_MATCHES} are needed; the matches do not agree on a pose, or the "
+                    "gate is too narrow",
+                    camera=name,
+                )
+        at_edge = {
+            name: m.gate_hessian(poses[name], scales[name]) for name, m in self.matches.items()
+        }
+        return replace(self.with_matches(inliers), gate_hessian=at_edge)
+
+
+class Clock:
+    """Wall time of named stages: ``with clock("stage"): ...``."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the time that the body takes to a stage's."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What the two passes gave.
+
+    Attributes:
+        rig: lenses, and the guess.
+        metadata: of the table of correspondences.
+        systematic_sigmas: rotation [rad] and translation [m] that the matcher says all frames
+            share, per axis: the scatter between frames cannot show them.
+        config: the settings.
+        problem: all correspondences that were usable.
+        inliers: those within the gate, which the solution was fitted to.
+        scales: of the residuals.
+        optimum: the solution.
+        stage1_T_camera_lidar: the pairwise estimates.
+        counts: per camera, what was left after each filter and gate, and the frames.
+        clock: what took how long.
+    """
+
+    rig: Rig
+    metadata: dict[str, Any]
+    systematic_sigmas: tuple[float, float]
+    config: Config
+    problem: Problem
+    inliers: Problem
+    scales: Scales
+    optimum: Optimum
+    stage1_T_camera_lidar: Poses
+    counts: dict[str, dict[str, int]]
+    clock: Clock
+
+    @property
+    def poses(self) -> Poses:
+        """The solution, T_camera_lidar per camera."""
+        return self.optimum.T_camera_lidar
+
+    @property
+    def solved_rig(self) -> Rig:
+        """The rig with the solution's poses."""
+        return self.rig.moved_to(self.poses)

@@ -136,6 +136,13 @@ class Camera(_Model):
         T = rigid_transform(T_camera_lidar)
         return self.model_copy(update={"T_camera_lidar": T})
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with some fields changed, not checked; its lens is that of its own intrinsics."""
+        copy = super().model_copy(update=update, deep=deep)
+        if update and update.keys() - {"T_camera_lidar"}:
+            copy.__dict__.pop("lens", None)
+        return copy
+
     def in_image(self, pixels_px: Array) -> NDArray[np.bool_]:
         """Which of (n, 2) pixels lie on the image."""
         size = np.array([self.width_px, self.height_px])

@@ -11,12 +11,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from calibgraph.calibration import FRAMES_SENTENCE, Calibration
+from calibgraph.calibration import FRAMES_SENTENCE, Array, Calibration, degrees_and_centimetres
 from calibgraph.metrics import Evaluation, PoseError, pose_error
 
 if TYPE_CHECKING:
     from calibgraph.cmrnext.validation import Validation
 
+MOST_REASONS = 16  # the worst come first
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 
@@ -24,16 +25,25 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
     status = result.verdict.status
     console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
-    for reason in result.verdict.reasons:
+    reasons = result.verdict.reasons
+    for reason in reasons[:MOST_REASONS]:
         console.print(f"  {reason}", highlight=False, markup=False, soft_wrap=True)
+    if len(reasons) > MOST_REASONS:
+        more = f"  and {len(reasons) - MOST_REASONS} more: see camera_verdicts in calibration.yaml"
+        console.print(more, highlight=False)
+    for name, words in result.weaknesses.items():
+        if words:
+            text = f"  {name}: {'; '.join(words)}"
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
     console.print(result_table(result))
-    console.print(
-        "sigma: standard deviation, largest axis: scatter between frames, and what the matcher "
-        "says its frames share; wrong intrinsics are not in it"
-    )
     console.print(
         "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
         "the gate"
+    )
+    console.print(error_bar_table(result))
+    console.print(
+        "one standard deviation: scatter between frames, and what the matcher says its frames "
+        "share; wrong intrinsics are not in it; A->B: of the transform from A to B, in B's axes"
     )
     time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
     console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
@@ -69,27 +79,47 @@ def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
     table = _table("Calibration", "camera", "verdict")
     _add_numbers(
-        table,
-        "sigma\ndeg", "sigma\ncm", "moved\ndeg", "moved\ncm",
-        "median\npx", "inliers", "matches", "frames",
-    )  # fmt: skip
+        table, "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior"
+    )
     for name, T in result.T_camera_lidar.items():
         moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
-        sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+        residuals = result.residuals.get(name)
         status = result.camera_verdicts[name].status
         table.add_row(
             escape(name),
             f"[{_COLOURS[status]}]{status}[/]",
-            "-" if sigmas is None else f"{sigmas[0].max():.3f}",
-            "-" if sigmas is None else f"{sigmas[1].max():.2f}",
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",
             "-" if residuals is None else f"{residuals.median_px:.2f}",
             "-" if residuals is None else f"{residuals.inlier_share:.0%}",
             str(result.counts[name]["used"]),
             str(result.counts[name]["frames_used"]),
+            "-" if name not in result.prior_share else f"{result.prior_share[name]:.0%}",
         )
     return table
+
+
+def error_bar_table(result: Calibration) -> Table:
+    """One row per camera and per pair of cameras: a standard deviation per axis."""
+    table = _table("Error bar, along the axes of the camera", "camera")
+    _add_numbers(
+        table,
+        "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
+    )  # fmt: skip
+    for name in (*result.covariance, *result.pair_covariance):
+        sigmas = result.sigmas(name)
+        if sigmas is None:
+            table.add_row(escape(name), "too few", "frames", "to say", "", "", "")
+        else:
+            table.add_row(escape(name), *_sigma_cells(*sigmas))
+    for name, covariance in result.bootstrap.items():
+        sigmas = degrees_and_centimetres(covariance)
+        table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
+    return table
+
+
+def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:
+    return [f"{v:.3f}" for v in rotation_deg] + [f"{v:.2f}" for v in translation_cm]
 
 
 def _table(title: str, *names: str) -> Table:

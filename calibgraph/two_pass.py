@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.assess import Assessment, assess
+from calibgraph.assess import assess
 from calibgraph.calibration import Calibration
 from calibgraph.config import TERMS, Config, Terms
 from calibgraph.correspondences import Correspondences
@@ -18,15 +15,11 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.graph import pose_graph
 from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
 from calibgraph.preprocess import FILTERS, preprocess
-from calibgraph.problem import Poses, Problem, Scales
+from calibgraph.problem import Clock, Fit, Poses, Problem
 from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
-from calibgraph.verdict import Matching, rig_verdict, said_by_matcher, with_matching
 
 Array = NDArray[np.float64]
-
-_MAX_RESCALINGS = 10
-_SETTLED = 0.01  # relative change of the spread
 
 
 def solve(
@@ -50,6 +43,13 @@ def solve(
             and no relative pose that ties it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
+    return judged(fit(rig, table, config, terms))
+
+
+def fit(
+    rig: Rig, table: Correspondences, config: Config | None = None, terms: Terms = "full"
+) -> Fit:
+    """The two passes alone, see :func:`solve`; nothing is judged."""
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config = config or Config()
@@ -64,63 +64,51 @@ def solve(
     known = pose_graph(rig, stage1.T_camera_lidar, config, terms)
     problem = Problem(tuple(rig.cameras), matches, known, terms)
     with clock("pass1"):
-        poses, scales = _fit(problem, start, config)
+        poses, scales = problem.settled(start, config)
     with clock("pass2"):
-        inliers = _gated(problem, poses, scales)
-        solution = inliers.minimize(poses, scales)
-    found = solution.T_camera_lidar
-    with clock("checks"):
-        residuals = {name: m.summary(found[name], scales[name]) for name, m in matches.items()}
-        assessment = assess(
-            rig,
-            inliers,
-            solution,
-            scales,
-            residuals=residuals,
-            systematic_sigmas=table.systematic_sigmas,
-        )
-    verdicts = {
-        name: with_matching(verdict, _matching(table, assessment, name))
-        for name, verdict in assessment.verdicts.items()
-    }
-    return Calibration(
-        rig=rig.moved_to(found),
-        initial_rig=rig,
-        covariance=assessment.covariance,
-        joint_covariance=assessment.joint_covariance,
-        verdict=rig_verdict(verdicts),
-        camera_verdicts=verdicts,
-        residuals=residuals,
-        counts=_counts(kept.counts, problem, inliers, stage1),
-        timings_s=clock.seconds,
-        terms=terms,
+        inliers = problem.gated(poses, scales)
+        optimum = inliers.minimize(poses, scales)
+    return Fit(
+        rig=rig,
+        metadata=table.metadata,
+        systematic_sigmas=table.systematic_sigmas,
         config=config,
+        problem=problem,
+        inliers=inliers,
+        scales=scales,
+        optimum=optimum,
         stage1_T_camera_lidar=stage1.T_camera_lidar,
+        counts=_counts(kept.counts, problem, inliers, stage1),
+        clock=clock,
     )
 
 
-def _matching(table: Correspondences, assessment: Assessment, name: str) -> Matching:
-    """What the table says of a camera's matching; where there is an error bar, it holds part."""
-    said = said_by_matcher(table.metadata, name)
-    if assessment.covariance[name] is not None:
-        return said
-    return replace(said, systematic_sigmas=table.systematic_sigmas)
+def judged(fit: Fit, guess: Rig | None = None) -> Calibration:
+    """A fit as a result: with what it is worth, and the verdict.
 
-
-class Clock:
-    """Wall time of named stages: ``with clock("stage"): ...``."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Add the time that the body takes to a stage's."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+    Args:
+        fit: the solution.
+        guess: the first guess, if the fit started from a better one.
+    """
+    guess = guess or fit.rig
+    with fit.clock("checks"):
+        assessment = assess(fit, guess)
+    return Calibration(
+        rig=fit.solved_rig,
+        initial_rig=guess,
+        covariance=assessment.covariance,
+        joint_covariance=assessment.joint_covariance,
+        camera_verdicts=assessment.verdicts,
+        residuals=assessment.residuals,
+        counts=fit.counts,
+        timings_s=fit.clock.seconds,
+        terms=fit.problem.terms,
+        config=fit.config,
+        stage1_T_camera_lidar=fit.stage1_T_camera_lidar,
+        weaknesses=assessment.weaknesses,
+        prior_share=assessment.prior_share,
+        bootstrap=assessment.bootstrap,
+    )
 
 
 def _require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> None:
@@ -199,44 +187,6 @@ def _start(
             if pair.a in start:
                 start.setdefault(pair.b, np.linalg.inv(pair.T_a_b) @ start[pair.a])
     return {name: start[name] for name in rig.cameras}
-
-
-def _fit(problem: Problem, start: Poses, config: Config) -> tuple[Poses, Scales]:
-    """Pass 1. With `auto` scales: fit and re-measure the spread until it stands still."""
-    poses, scales = start, _scales(problem, start, config)
-    for _ in range(_MAX_RESCALINGS):
-        poses = problem.minimize(poses, scales).T_camera_lidar
-        before, scales = scales, _scales(problem, poses, config)
-        ratios = [scales[name].sigma / before[name].sigma for name in scales]
-        if all(abs(ratio - 1.0) < _SETTLED for ratio in ratios):
-            break
-    return poses, scales
-
-
-def _scales(problem: Problem, poses: Poses, config: Config) -> Scales:
-    return {name: m.scale(poses[name], config) for name, m in problem.matches.items()}
-
-
-def _gated(problem: Problem, poses: Poses, scales: Scales) -> Problem:
-    """The problem without the matches beyond the gate (paper, two-pass solver, 2).
-
-    Raises:
-        CorrespondenceError: if a camera is left with too few.
-    """
-    inliers = {name: m.gated(poses[name], scales[name]) for name, m in problem.matches.items()}
-    for name, left in inliers.items():
-        if len(left.frame) < MIN_MATCHES:
-            raise CorrespondenceError(
-                f"camera {name!r}: only {len(left.frame)} of {len(problem.matches[name].frame)} "
-                f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at least "
-                f"{MIN_MATCHES} are needed; the matches do not agree on a pose, or the gate is too "
-                "narrow",
-                camera=name,
-            )
-    at_edge = {
-        name: m.gate_hessian(poses[name], scales[name]) for name, m in problem.matches.items()
-    }
-    return replace(problem.with_matches(inliers), gate_hessian=at_edge)
 
 
 def _counts(

@@ -6,17 +6,19 @@ The thresholds are in the units of the error that a user would suffer, and the s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.calibration import Residuals, Status, Verdict
+from calibgraph.calibration import Residuals
+from calibgraph.check import Check, Verdict, above, below, grade
 from calibgraph.config import Terms
 from calibgraph.covariance import MIN_FRAMES
 from calibgraph.errors import CorrespondenceError
+from calibgraph.matches import CAUCHY_SCALE_SIGMAS
 from calibgraph.rig import Camera, RelativePose, angle_deg
 
 Array = NDArray[np.float64]
@@ -42,8 +44,13 @@ MOVING_WARN_CM, MOVING_FAIL_CM = 4.0, 12.0
 CONFLICT_WARN_SIGMAS, CONFLICT_FAIL_SIGMAS = 4.0, 8.0
 """How far a relative pose may lie from what the correspondences alone say."""
 
-TURNED_WARN_DEG = 45.0
-"""A result turned further than this from the guess: the guess was of another convention."""
+PULLED_WARN_DEG, PULLED_FAIL_DEG = 0.15, 1.0
+PULLED_WARN_CM, PULLED_FAIL_CM = 5.0, 30.0
+"""How far priors and relative poses may pull a camera from where its matches see it, beyond what
+these leave open."""
+
+SCALE_WARN, SCALE_FAIL = 2.0, 4.0
+"""The residuals' spread, by the one that a configured loss scale stands for."""
 
 CONTRAST_WARN, CONTRAST_FAIL = 15.0, 8.0
 """How many chance spreads a matcher's agreement must stand out by. On recorded data wrong results
@@ -54,8 +61,6 @@ RECALL_WARN, RECALL_FAIL = 0.3, 0.6
 FAILED_WARN, FAILED_FAIL = 0.3, 0.7
 """What a learned matcher may leave of a displaced start, what it may undo of it without the image,
 and which share of the frames may fail."""
-
-_ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +97,8 @@ class Evidence:
             or None.
         halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
         conflicts: the relative poses that name this camera.
-        turned_deg: angle between the result and the guess.
+        pulled: how far priors and relative poses pull it from its own solution [deg, cm]; None if
+            not, or within what that leaves open.
         converged: whether the last pass stopped by its tolerance.
         terms: the terms of the objective.
     """
@@ -104,7 +110,7 @@ class Evidence:
     data_sigmas: Array | None
     halves: tuple[Array, Array] | None
     conflicts: tuple[Conflict, ...]
-    turned_deg: float
+    pulled: tuple[float, float] | None
     converged: bool
     terms: Terms
 
@@ -119,43 +125,29 @@ def camera_verdict(camera: Camera, evidence: Evidence) -> Verdict:
     residuals = evidence.residuals
     if residuals is None:
         few = f"{evidence.used} usable correspondences, too few: known only through relative_poses"
-        return Verdict("WARN", (few,))
+        return Verdict((Check("correspondences", "WARN", few, evidence.used),))
     spread_deg = np.degrees(residuals.sigma_px / camera.intrinsics_px.fx)
     checks = [
-        _above("residual spread", spread_deg, SPREAD_WARN_DEG, SPREAD_FAIL_DEG, "deg"),
-        _below("inlier share", residuals.inlier_share, INLIERS_WARN, INLIERS_FAIL),
+        above("residual spread", spread_deg, SPREAD_WARN_DEG, SPREAD_FAIL_DEG, "deg"),
+        below("inlier share", residuals.inlier_share, INLIERS_WARN, INLIERS_FAIL, "share"),
         *_sigma_checks("sigma", evidence.sigmas),
         *_sigma_checks("what the data alone could tell at best", evidence.data_sigmas),
         *(_conflict_check(conflict) for conflict in evidence.conflicts),
+        *_pulled_checks(evidence.pulled),
     ]
     if evidence.terms in ("stage1", "priors"):
         unchecked = f"the terms {evidence.terms!r} do not fit the correspondences: no error bar"
-        checks.append(("WARN", unchecked))
+        checks.append(Check("terms", "WARN", unchecked))
     else:
         checks += _halves_checks(evidence.halves)
-    if evidence.turned_deg > TURNED_WARN_DEG:
-        turned = (
-            f"turned by {evidence.turned_deg:.0f} deg from the guess: is its T_camera_lidar "
-            "inverted, or of other axes?"
-        )
-        checks.append(("WARN", turned))
-    if evidence.used < MATCHES_WARN:
-        few = f"only {evidence.used} correspondences used, fewer than {MATCHES_WARN}"
-        checks.append(("WARN", few))
-    if evidence.frames < MIN_FRAMES:
-        few = f"only {evidence.frames} frames: too few (under {MIN_FRAMES}) to give an error bar"
-        checks.append(("WARN", few))
+    converged: Check = Check("convergence", "PASS", "the optimizer converged")
     if not evidence.converged:
-        checks.append(("FAIL", "the optimizer did not converge"))
-    return worst_of(checks)
-
-
-def worst_of(checks: Iterable[tuple[Status, str]]) -> Verdict:
-    """The worst status, with the reasons for everything that is not PASS."""
-    failed = [check for check in checks if check[0] != "PASS"]
-    statuses: list[Status] = [status for status, _ in failed]
-    status: Status = max(statuses, key=_ORDER.index, default="PASS")
-    return Verdict(status, tuple(reason for _, reason in failed))
+        converged = Check("convergence", "FAIL", "the optimizer did not converge")
+    enough = [
+        below("correspondences used", evidence.used, MATCHES_WARN, 0, ""),
+        below("frames", evidence.frames, MIN_FRAMES, 0, "", "too few to give an error bar"),
+    ]
+    return Verdict((*checks, *enough, converged))
 
 
 @dataclass(frozen=True)
@@ -163,25 +155,19 @@ class Matching:
     """What is known of one camera from its matching.
 
     Attributes:
-        moved_deg: how far the last of several rounds turned the camera.
-        moved_cm: how far it shifted it.
         contrast: how far the matches' agreement stands out from chance, if the matcher says.
         start_dependence: share of a displaced start that remains in the matches, if it says.
         recall: share of the way back that it finds without the image, if it says.
         failed_share: of the frames.
         systematic_sigmas: what the matcher says of the error that its frames share, per axis:
             rotation [rad], translation [m].
-        repeated: that frames repeat each other, if they do.
     """
 
-    moved_deg: float = 0.0
-    moved_cm: float = 0.0
     contrast: float | None = None
     start_dependence: float | None = None
     recall: float | None = None
     failed_share: float = 0.0
     systematic_sigmas: tuple[float, float] = (0.0, 0.0)
-    repeated: str | None = None
 
 
 def said_by_matcher(metadata: Mapping[str, Any], camera: str) -> Matching:
@@ -206,110 +192,104 @@ def said_by_matcher(metadata: Mapping[str, Any], camera: str) -> Matching:
 
 def with_matching(verdict: Verdict, matching: Matching) -> Verdict:
     """A camera's verdict, given that of the last solve, with what its matcher knows."""
-    what = "matching again still moves it:"
-    checks: list[tuple[Status, str]] = [
-        *((verdict.status, reason) for reason in verdict.reasons),
-        _above(what, matching.moved_deg, MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
-        _above(what, matching.moved_cm, MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
+    checks = [
         *_shares_checks(matching),
         *_sigma_checks("the matcher's own error", np.repeat(matching.systematic_sigmas, 3)),
     ]
-    if matching.repeated is not None:
-        checks.append(("WARN", f"{matching.repeated}: counted as if independent; remove one"))
-    if (contrast := matching.contrast) is not None:
-        weak, failed = not contrast >= CONTRAST_WARN, not contrast >= CONTRAST_FAIL  # NaN fails
-        limit = CONTRAST_FAIL if failed else CONTRAST_WARN
-        text = (
-            f"image and cloud agree only {contrast:.1f} times better than by chance, less than "
-            f"{limit:g}: check the guess (p_camera = T_camera_lidar * p_lidar: its direction, axes "
-            "and units), the intrinsics, and that images and clouds belong together"
+    if matching.contrast is not None:
+        advice = (
+            "image and cloud hardly agree better than by chance; check the guess (p_camera = "
+            "T_camera_lidar * p_lidar: its direction, axes and units), the intrinsics, and that "
+            "images and clouds belong together"
         )
-        checks.append((_grade(weak, failed), text))
-    return worst_of(checks)
+        checks.append(
+            below("contrast of image and cloud", matching.contrast, CONTRAST_WARN, CONTRAST_FAIL,
+                  "chance spreads", advice)
+        )  # fmt: skip
+    return verdict.and_also(checks)
 
 
-def _shares_checks(matching: Matching) -> list[tuple[Status, str]]:
+def _shares_checks(matching: Matching) -> list[Check]:
     """What a learned matcher does with its start, without its image, and with its frames."""
     limits = (
-        (matching.start_dependence, START_WARN, START_FAIL,
+        ("start dependence", matching.start_dependence, START_WARN, START_FAIL,
          "of a displaced start remains in the matches: the network does not measure here"),
-        (matching.recall, RECALL_WARN, RECALL_FAIL,
+        ("recall", matching.recall, RECALL_WARN, RECALL_FAIL,
          "of a displaced start is undone even without the image: the network knows its training's "
          "rig by heart and pulls towards it"),
-        (matching.failed_share, FAILED_WARN, FAILED_FAIL, "of the frames failed to be matched"),
+        ("failed frames", matching.failed_share, FAILED_WARN, FAILED_FAIL,
+         "of the frames failed to be matched"),
     )  # fmt: skip
-    return [
-        (
-            _grade(not share <= warn, not share <= fail),  # NaN fails
-            f"an unknown share {text}" if math.isnan(share) else f"{share:.0%} {text}",
-        )
-        for share, warn, fail, text in limits
-        if share is not None
-    ]
+    checks = []
+    for name, share, warn, fail, text in limits:
+        if share is not None:
+            status = grade(not share <= warn, not share <= fail)  # NaN fails
+            found = "an unknown share" if math.isnan(share) else f"{share:.0%}"
+            checks.append(Check(name, status, f"{found} {text}", share, warn, fail, "share"))
+    return checks
 
 
-def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The worst of the cameras, each reason with its camera's name."""
-    return worst_of(
-        [
-            (verdict.status, f"{name}: {reason}")
-            for name, verdict in cameras.items()
-            for reason in verdict.reasons
-        ]
-    )
-
-
-def _halves_checks(halves: tuple[Array, Array] | None) -> list[tuple[Status, str]]:
+def _halves_checks(halves: tuple[Array, Array] | None) -> list[Check]:
+    name = "difference between even and odd frames"
     if halves is None:
-        return [("WARN", "the frames cannot be split into halves to check against each other")]
+        text = "the frames cannot be split into halves to check against each other"
+        return [Check(name, "WARN", text)]
     one, two = halves
     angle = angle_deg(one[:3, :3] @ two[:3, :3].T)
     distance = 100 * float(np.linalg.norm(_centre(one) - _centre(two)))
-    what = "difference between even and odd frames"
     return [
-        _above(what, angle, HALVES_WARN_DEG, HALVES_FAIL_DEG, "deg"),
-        _above(what, distance, HALVES_WARN_CM, HALVES_FAIL_CM, "cm"),
+        above(name, angle, HALVES_WARN_DEG, HALVES_FAIL_DEG, "deg"),
+        above(name, distance, HALVES_WARN_CM, HALVES_FAIL_CM, "cm"),
     ]
 
 
-def _sigma_checks(what: str, sigmas: Array | None) -> list[tuple[Status, str]]:
+def _sigma_checks(what: str, sigmas: Array | None) -> list[Check]:
     if sigmas is None:
         return []
-    rotation, translation = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
+    rotation, translation = float(np.degrees(sigmas[:3].max())), 100 * float(sigmas[3:].max())
     return [
-        _above(f"{what}: rotation", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
-        _above(f"{what}: translation", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
+        above(f"{what}: rotation", rotation, SIGMA_WARN_DEG, SIGMA_FAIL_DEG, "deg"),
+        above(f"{what}: translation", translation, SIGMA_WARN_CM, SIGMA_FAIL_CM, "cm"),
     ]
 
 
-def _conflict_check(conflict: Conflict) -> tuple[Status, str]:
+def _conflict_check(conflict: Conflict) -> Check:
     pair, sigmas = conflict.pair, conflict.largest
     angle = np.degrees(np.linalg.norm(conflict.difference[:3]))
     distance = 100 * np.linalg.norm(conflict.difference[3:])
     text = (
         f"the relative pose of {pair.a} and {pair.b} differs from what the correspondences say by "
-        f"{angle:.2g} deg, {distance:.2g} cm, {sigmas:.3g} sigma: is it p_a = T_a_b * p_b, and are "
-        "its sigmas right?"
+        f"{angle:.2g} deg, {distance:.2g} cm, {sigmas:.3g} sigma"
     )
-    return _grade(sigmas > CONFLICT_WARN_SIGMAS, sigmas > CONFLICT_FAIL_SIGMAS), text
+    status = grade(sigmas > CONFLICT_WARN_SIGMAS, sigmas > CONFLICT_FAIL_SIGMAS)
+    if status != "PASS":
+        text += ": is it p_a = T_a_b * p_b, are its sigmas right, are two cameras' images swapped?"
+    return Check(
+        f"relative pose of {pair.a} and {pair.b}", status, text,
+        sigmas, CONFLICT_WARN_SIGMAS, CONFLICT_FAIL_SIGMAS, "sigma",
+    )  # fmt: skip
+
+
+def _pulled_checks(pulled: tuple[float, float] | None) -> list[Check]:
+    degrees, centimetres = pulled or (0.0, 0.0)
+    name = "joint solution, from the camera's own"
+    advice = "priors or relative poses pull it; are they right?"
+    return [
+        above(name, degrees, PULLED_WARN_DEG, PULLED_FAIL_DEG, "deg", advice),
+        above(name, centimetres, PULLED_WARN_CM, PULLED_FAIL_CM, "cm", advice),
+    ]
+
+
+def assumed_spread_check(residuals: Residuals, loss_scale_px: float) -> Check:
+    """The residuals' spread, by the one that a configured loss scale stands for."""
+    return above(
+        "residual spread by the assumed one",
+        CAUCHY_SCALE_SIGMAS * residuals.sigma_px / loss_scale_px, SCALE_WARN, SCALE_FAIL, "times",
+        "the matches are worse than loss_scale_px (delta) takes them for",
+    )  # fmt: skip
 
 
 def _centre(T_camera_lidar: Array) -> Array:
     """(3,) the camera's centre in the LiDAR frame."""
     centre: Array = -T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3]
     return centre
-
-
-def _above(what: str, value: float, warn: float, fail: float, unit: str) -> tuple[Status, str]:
-    weak, failed = not value <= warn, not value <= fail  # NaN fails
-    text = f"{what} {value:.3g} {unit} is above {fail if failed else warn:g} {unit}"
-    return _grade(weak, failed), text
-
-
-def _below(what: str, value: float, warn: float, fail: float) -> tuple[Status, str]:
-    limit = fail if value < fail else warn
-    return _grade(value < warn, value < fail), f"{what} {value:.0%} is below {limit:.0%}"
-
-
-def _grade(warn: bool, fail: bool) -> Status:
-    return "FAIL" if fail else "WARN" if warn else "PASS"

@@ -122,7 +122,7 @@ def test_calibrate_from_a_table_writes_pictures(call: Call, tmp_path: Path) -> N
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "calibration.yaml", "correspondences.parquet", "overlay_front_left.png",
-        "overlay_front_right.png", "overlay_left.png",
+        "overlay_front_right.png", "overlay_left.png", "report.html",
     }  # fmt: skip
     assert len(load_calibration(tmp_path / "out").inputs) == 6 * 4
 
@@ -239,12 +239,12 @@ def test_help_imports_nothing_heavy() -> None:
         "from calibgraph.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'gtsam', 'numpy', 'numba', 'cv2', 'scipy', 'pyarrow', 'pydantic'}\n"
+        "heavy = {'gtsam', 'numpy', 'numba', 'cv2', 'scipy', 'pyarrow', 'pydantic', 'jinja2'}\n"
         "sys.exit(str(heavy & set(sys.modules)) if heavy & set(sys.modules) else 0)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for command in ("calibrate", "match", "solve", "evaluate", "perturb"):
+    for command in ("calibrate", "match", "solve", "report", "evaluate", "perturb"):
         assert command in done.stdout
 
 

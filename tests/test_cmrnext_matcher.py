@@ -407,7 +407,7 @@ def test_the_probe_tells_measuring_from_following() -> None:
     ],
 )
 def test_the_verdict_heeds_the_matcher(matching: Matching, status: str) -> None:
-    verdict = with_matching(Verdict("PASS", ()), matching)
+    verdict = with_matching(Verdict(), matching)
     assert verdict.status == status
     assert len(verdict.reasons) == (status != "PASS")
 

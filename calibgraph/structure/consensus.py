@@ -34,33 +34,49 @@ def find_consensus(scores: Scores, level: Level, *, seed: int) -> tuple[Array, f
     Returns:
         (6,) twist (rotation [rad], translation [m]); its summed score in chance spreads.
     """
-    rng = np.random.default_rng(seed)
-    box = np.repeat([level.rotation_rad, level.translation_m], 3)
-    found = [_search_once(scores, box, rng) for _ in range(STARTS)]
-    twist, _ = max(found, key=lambda pair: pair[1])
+    twist = search(scores, np.repeat([level.rotation_rad, level.translation_m], 3), seed=seed)
     contrast = float(summed_score(scores, twist[None])[0]) / (chance_spread(scores) + 1e-12)
     return twist, contrast
 
 
+def search(scores: Scores, box: Array, *, seed: int, prior: float = PRIOR) -> Array:
+    """Maximise the summed score over as many unknowns as the flow has columns.
+
+    Args:
+        scores: the groups of one camera; its flow may have more columns than the six of a twist.
+        box: (k,) half-width of the search, per column.
+        seed: of the search's samples.
+        prior: see ``PRIOR``.
+
+    Returns:
+        (k,) the best unknowns.
+    """
+    rng = np.random.default_rng(seed)
+    found = [_search_once(scores, box, prior, rng) for _ in range(STARTS)]
+    return max(found, key=lambda pair: pair[1])[0]
+
+
 def summed_score(scores: Scores, twists: Array) -> Array:
-    """(n,) sum over groups of the score at the shift that each twist (n, 6) implies."""
+    """(n,) sum over groups of the score at the shift that each row of unknowns (n, k) implies."""
     out = np.zeros(len(twists))
     _sum_scores(scores.grids, scores.flow, np.ascontiguousarray(twists), out)
     return out
 
 
-def _search_once(scores: Scores, box: Array, rng: np.random.Generator) -> tuple[Array, float]:
-    """One cross-entropy search: the twist and its penalised score."""
-    weight = 0.5 * PRIOR * chance_spread(scores)
+def _search_once(
+    scores: Scores, box: Array, prior: float, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """One cross-entropy search: the unknowns and their penalised score."""
+    weight = 0.5 * prior * chance_spread(scores)
 
     def penalised(twists: Array) -> Array:
         return np.asarray(summed_score(scores, twists) - weight * ((twists / box) ** 2).sum(axis=1))
 
-    mean: Array = np.zeros(6)
+    mean: Array = np.zeros(len(box))
     root: Array = np.diag(box * 0.6)
     for step in range(STEPS):
         count = SAMPLES * (4 if step == 0 else 1)
-        twists = np.clip(mean + rng.standard_normal((count, 6)) @ root.T, -box, box)
+        twists = np.clip(mean + rng.standard_normal((count, len(box))) @ root.T, -box, box)
         elite = twists[np.argsort(-penalised(twists))[:ELITES]]
         mean = elite.mean(axis=0)
         spread = WIDENING * np.cov(elite.T) + np.diag((1e-4 * box) ** 2)
@@ -76,7 +92,7 @@ def _sum_scores(grids, flow, twists, out):  # type: ignore[no-untyped-def]
         total = 0.0
         for g in range(grids.shape[0]):
             u = v = float(reach)
-            for k in range(6):
+            for k in range(flow.shape[2]):
                 u += flow[g, 0, k] * twists[i, k]
                 v += flow[g, 1, k] * twists[i, k]
             if u < 0 or v < 0 or u >= 2 * reach or v >= 2 * reach:

@@ -31,6 +31,7 @@ SYSTEMATIC_TRANSLATION_M = 0.02
 """Error per axis that the frames of a scene share: its root mean square over recorded scenes of two
 rigs, each from a few places. One place alone is worse; synthetic scenes are better."""
 
+_NEAR_ROUNDS = (2, 4)
 MAX_WINDOWS = 20_000  # per camera and round, over all frames: bounds the time, not the accuracy
 
 
@@ -45,7 +46,6 @@ class StructureMatcher:
     """
 
     stage1: Literal["pnp", "rig"] = "rig"
-    tracking_rounds = (2, 4)  # from errors of up to 0.7 degrees and 20 cm
 
     def __init__(self, *, seed: int = 0, levels: Sequence[Level] = LEVELS) -> None:
         self.seed = seed
@@ -53,6 +53,11 @@ class StructureMatcher:
         self.rounds = len(levels)
         self._clouds: dict[Path, Cloud] = {}
         self._images: dict[Path, NDArray[np.uint8]] = {}
+
+    @property
+    def tracking_rounds(self) -> tuple[int, ...]:
+        """The rounds for starts that are off by up to 0.7 degrees and 20 cm."""
+        return tuple(index for index in _NEAR_ROUNDS if index < self.rounds)
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
@@ -77,6 +82,8 @@ class StructureMatcher:
             "round": round_index,
             "seed": self.seed,
             "contrast": contrasts,
+            "range_rotation_deg": float(np.degrees(self.levels[0].rotation_rad)),
+            "range_translation_m": self.levels[0].translation_m,
             "systematic_rotation_rad": SYSTEMATIC_ROTATION_RAD,
             "systematic_translation_m": SYSTEMATIC_TRANSLATION_M,
         }

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from calibgraph.augmented import camera_flow
 from calibgraph.rig import Camera
 from calibgraph.structure.level import Level
 from calibgraph.structure.windows import Cloud, build_windows, view_angles
@@ -73,7 +74,7 @@ def score_frame(
     grids -= grids.mean(axis=(1, 2), keepdims=True)
     counts = np.bincount(group, minlength=groups)
     centres = _group_means(windows.points_lidar_m[windows.members[kept, 0]], group, counts)
-    pixels_px, flow_px = _flow(camera, centres @ T[:3, :3].T + T[:3, 3])
+    pixels_px, flow_px = camera_flow(camera, centres)
     return Scores(
         grids=grids,
         flow=flow_px * scale[:, None],
@@ -132,15 +133,6 @@ def _groups(seeds_camera_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32],
 def _group_means(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
     sums = [np.bincount(group, column, minlength=len(counts)) for column in points.T]
     return np.stack(sums, axis=1) / counts[:, None]
-
-
-def _flow(camera: Camera, points_camera_m: Array) -> tuple[Array, Array]:
-    """(n, 2) pixels, and (n, 2, 6) their derivatives by a twist of the camera's side."""
-    pixels, by_point = camera.lens.project_with_jacobian(points_camera_m)
-    x, y, z = points_camera_m.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    return pixels, np.concatenate([by_point @ cross, by_point], axis=2)
 
 
 @njit(cache=True, fastmath=True, nogil=True)

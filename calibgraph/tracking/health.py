@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.assess import relative_pose_conflict
-from calibgraph.calibration import Calibration, Residuals, Status, Verdict
-from calibgraph.covariance import MIN_FRAMES, pose_hessian
-from calibgraph.rig import angle_deg
-from calibgraph.tracking.state import CameraState, State
+from calibgraph.calibration import Calibration, Residuals
+from calibgraph.check import Check, Verdict, above
+from calibgraph.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
+from calibgraph.tracking.state import CameraState, State, block_diagonal
 from calibgraph.tracking.sums import Posterior, is_determined, posterior
 from calibgraph.tracking.window import known_of_poses
-from calibgraph.verdict import Conflict, Evidence, camera_verdict, rig_verdict, worst_of
+from calibgraph.verdict import Conflict, Evidence, camera_verdict
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
@@ -48,7 +48,8 @@ def joint_covariance(state: State, sums: Posterior, known: Array) -> Array:
     ])  # fmt: skip
     usual = np.sqrt(share * sums.frames / np.maximum(state.total_frames, 1.0))
     scatter = _scaled(sums.scatter, np.sqrt(1 - share)) + _scaled(state.total, usual)
-    scatter = state.widened(scatter)
+    hessian = block_diagonal(sums.hessian) + known
+    scatter = with_pseudo_frames(state.widened(scatter), hessian, np.repeat(sums.frames, 6))
     covariance = replace(sums, scatter=scatter).covariance(known)
     rotation, translation = state.systematic_sigmas
     shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
@@ -88,8 +89,6 @@ def _verdict(
         return _not_started(state, one)
     rows = slice(6 * camera, 6 * camera + 6)
     own = covariance[rows, rows]
-    T = state.poses[camera].inverse().matrix()
-    initial = state.rig.cameras[name].T_camera_lidar
     evidence = Evidence(
         residuals=residuals_of(one),
         used=int(one.counts.get("used", 0)),
@@ -98,34 +97,39 @@ def _verdict(
         data_sigmas=_data_sigmas(sums.hessian[camera]),
         halves=_halves(state, camera),
         conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
-        turned_deg=angle_deg(T[:3, :3] @ initial[:3, :3].T),
+        pulled=None,
         converged=True,
         terms="full",
     )
     verdict = camera_verdict(state.rig.cameras[name], evidence)
-    return worst_of([*((verdict.status, r) for r in verdict.reasons), *_now(state, one)])
+    return verdict.and_also(_now(state, one))
 
 
 def _not_started(state: State, one: CameraState) -> Verdict:
-    if one.refused:
-        return Verdict("FAIL", tuple(f"no estimate yet: {reason}" for reason in one.refused))
     needed = state.config.tracking.start_frames
+    waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
     return Verdict(
-        "FAIL", (f"no estimate yet: {len(one.waiting)} of {needed} frames with matches",)
+        tuple(
+            Check("start", "FAIL", f"no estimate yet: {reason}")
+            for reason in one.refused or waiting
+        )
     )
 
 
-def _now(state: State, one: CameraState) -> list[tuple[Status, str]]:
+def _now(state: State, one: CameraState) -> list[Check]:
     """What the last frames say of a camera."""
-    checks: list[tuple[Status, str]] = []
+    checks = []
     if one.absent >= state.config.tracking.blind_frames:
-        checks.append(("WARN", f"no usable matches in the last {one.absent} frames"))
+        text = f"no usable matches in the last {one.absent} frames"
+        checks.append(Check("blind frames", "WARN", text, one.absent))
     if one.memory.walk:
-        checks.append(("WARN", "drifts: the estimate follows, over fewer frames"))
+        text = "drifts: the estimate follows, over fewer frames"
+        checks.append(Check("drift", "WARN", text))
     agreed = [good for _, good in one.verdicts]
-    if agreed and (share := 1 - np.mean(agreed)) > _LEFT_OUT_WARN:
-        text = f"{share:.0%} of the last {len(agreed)} frames disagree with the estimate"
-        checks.append(("WARN", text))
+    if agreed:
+        share = 1 - float(np.mean(agreed))
+        name = f"share of the last {len(agreed)} frames that disagree with the estimate"
+        checks.append(above(name, share, _LEFT_OUT_WARN, 1.0, "share"))
     return checks
 
 
@@ -226,7 +230,6 @@ def calibration_of(state: State) -> Calibration:
         initial_rig=state.rig,
         covariance=covariance_of(health, state.names),
         joint_covariance=None if np.isnan(joint).any() else joint,
-        verdict=rig_verdict(health.verdicts),
         camera_verdicts=health.verdicts,
         residuals={
             name: residuals_of(one)

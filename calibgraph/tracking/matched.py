@@ -15,7 +15,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.pipeline import Matcher, calibrate
 from calibgraph.rig import Rig
 from calibgraph.tracking.stream import Item, Refused, StreamFrame
-from calibgraph.two_pass import solve
+from calibgraph.two_pass import fit
 
 
 def first_frames(dataset: Dataset, matcher: Matcher, config: Config) -> Calibration:
@@ -80,7 +80,7 @@ def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
         own = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
         one = Rig(cameras={name: rig.cameras[name]})
         try:
-            rig = rig.moved_to(solve(one, own, config).T_camera_lidar)
+            rig = rig.moved_to(fit(one, own, config).poses)
         except CorrespondenceError:  # too few matches to move it: the next round starts as this one
             continue
     return rig

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.calibration import Calibration, Verdict
+from calibgraph.calibration import Calibration
+from calibgraph.check import Verdict
 from calibgraph.config import Config
 from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError, FileError

@@ -1,0 +1,130 @@
+"""What a guess may have meant: the usual mistakes of direction, axes and units, undone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.check import Check, above
+from calibgraph.matches import Matches
+from calibgraph.rig import Rig, angle_deg
+
+Array = NDArray[np.float64]
+
+FAR_GUESS_DEG, FAR_GUESS_M = 30.0, 2.0
+"""A result farther than this from the guess: the guess was of another convention."""
+
+SHIFT_WARN_M, SHIFT_FAIL_M = 20.0, 100.0
+RANGE_WARN_M, RANGE_FAIL_M = 200.0, 1000.0
+"""Longer than vehicles, farther than LiDARs see."""
+
+RANGE_USED_WARN, RANGE_USED_FAIL = 1.2, 4.0
+"""How far from the guess a result may lie, in ranges of its matcher."""
+
+_MEANT_DEG, _MEANT_M = 30.0, 2.5  # a reading this near to the result is what was meant
+_NEAR_DEG, _NEAR_M = 15.0, 1.0
+
+OPTICAL_FROM_BODY = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""From axes forward, left, up to a camera's right, down, forward."""
+
+
+def readings(T: Array) -> dict[str, Array]:
+    """What a (4, 4) guess would be, were it meant otherwise: in words, T_camera_lidar."""
+    inverse = np.linalg.inv(T)
+    position, transposed, metres, inverse_metres = T.copy(), T.copy(), T.copy(), inverse.copy()
+    position[:3, 3] = -T[:3, :3] @ T[:3, 3]
+    transposed[:3, :3] = T[:3, :3].T
+    metres[:3, 3] /= 1000.0
+    inverse_metres[:3, 3] /= 1000.0
+    return {
+        "inverted (it is T_lidar_camera)": inverse,
+        "of camera axes forward, left, up, not right, down, forward": OPTICAL_FROM_BODY @ T,
+        "inverted, and of camera axes forward, left, up": OPTICAL_FROM_BODY @ inverse,
+        "the camera's position where the LiDAR's in the camera should be": position,
+        "a transposed rotation": transposed,
+        "a translation in millimetres": metres,
+        "inverted, with its translation in millimetres": inverse_metres,
+    }
+
+
+def guess_checks(guess: Array, result: Array) -> list[Check]:
+    """Whether a camera's result is so far from the guess that the guess was meant otherwise."""
+    degrees, metres = _apart(guess, result)
+    meant = nearest_reading(guess, result)
+    advice = f"it seems to be {meant}" if meant else "is T_camera_lidar inverted, or of other axes?"
+    name, shift_m = "distance from the guess", float(np.linalg.norm(guess[:3, 3]))
+    units = "is the translation of T_camera_lidar in millimetres?"
+    return [
+        above(name, degrees, FAR_GUESS_DEG, 360.0, "deg", advice),
+        above(name, metres, FAR_GUESS_M, np.inf, "m", advice),
+        above("the guess's translation", shift_m, SHIFT_WARN_M, SHIFT_FAIL_M, "m", units),
+    ]
+
+
+def range_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> list[Check]:
+    """Whether a result lies within what its matcher looks at, if it says how far that is.
+
+    Args:
+        guess: (4, 4) from where the matcher started.
+        result: (4, 4) what came out.
+        metadata: of its table; ``range_rotation_deg`` and ``range_translation_m``, per axis.
+    """
+    step = result @ np.linalg.inv(guess)
+    moved = {
+        "range_rotation_deg": np.degrees(Rotation.from_matrix(step[:3, :3]).as_rotvec()),
+        "range_translation_m": result[:3, 3] - guess[:3, 3],
+    }
+    advice = "start again from the result, and see whether it stays"
+    return [
+        above(
+            f"largest {key.split('_')[1]} from the guess, by the matcher's range",
+            float(np.abs(moved[key]).max() / metadata[key]),
+            RANGE_USED_WARN, RANGE_USED_FAIL, "times", advice,
+        )
+        for key in moved
+        if key in metadata
+    ]  # fmt: skip
+
+
+def points_check(matches: Matches) -> Check:
+    """Whether the points can be in metres."""
+    range_m = float(np.median(np.linalg.norm(matches.block.points_lidar_m, axis=1)))
+    name, advice = "median distance of the points", "are the clouds in millimetres?"
+    return above(name, range_m, RANGE_WARN_M, RANGE_FAIL_M, "m", advice)
+
+
+def nearest_reading(guess: Array, result: Array) -> str | None:
+    """Which reading of the guess the result lies near, if any."""
+    distances = {words: _apart(T, result) for words, T in readings(guess).items()}
+    near = {
+        words: (round(degrees), round(metres, 1))  # of alike ones the first, the simplest, is meant
+        for words, (degrees, metres) in distances.items()
+        if degrees < _MEANT_DEG and metres < _MEANT_M
+    }
+    return min(near, key=lambda words: near[words], default=None)
+
+
+def reread(rig: Rig) -> Mapping[str, Rig]:
+    """The rig with all its guesses read otherwise, in words: those that make a difference."""
+    poses = {name: readings(T) for name, T in rig.T_camera_lidar.items()}
+    rigs = {
+        words: rig.moved_to({name: each[words] for name, each in poses.items()})
+        for words in next(iter(poses.values()))
+    }
+    return {words: other for words, other in rigs.items() if _differs(rig, other)}
+
+
+def _differs(one: Rig, two: Rig) -> bool:
+    apart = [_apart(T, two.T_camera_lidar[name]) for name, T in one.T_camera_lidar.items()]
+    return any(degrees > _NEAR_DEG or metres > _NEAR_M for degrees, metres in apart)
+
+
+def _apart(one: Array, two: Array) -> tuple[float, float]:
+    """Between two T_camera_lidar: angle [deg], difference of the translations [m]."""
+    return angle_deg(one[:3, :3] @ two[:3, :3].T), float(np.linalg.norm(one[:3, 3] - two[:3, 3]))

@@ -1,0 +1,195 @@
+"""What only images can tell of a result, and what a hopeless guess may have meant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.check import Check, above
+from calibgraph.conventions import range_checks, reread
+from calibgraph.correspondences import Correspondences
+from calibgraph.dataset import Dataset, spread_out
+from calibgraph.errors import CalibrationError, CorrespondenceError
+from calibgraph.perturbation import perturb
+from calibgraph.problem import Clock, Fit
+from calibgraph.rig import Rig
+from calibgraph.trials import distance
+from calibgraph.two_pass import fit
+from calibgraph.verdict import (
+    CONTRAST_FAIL,
+    MOVING_FAIL_CM,
+    MOVING_FAIL_DEG,
+    MOVING_WARN_CM,
+    MOVING_WARN_DEG,
+)
+
+if TYPE_CHECKING:
+    from calibgraph.pipeline import Matcher, Progress
+
+Array = NDArray[np.float64]
+
+BACK_DEG, BACK_M = 0.5, 0.08
+BACK_WARN_DEG, BACK_FAIL_DEG = 0.15, 0.5
+BACK_WARN_CM, BACK_FAIL_CM = 5.0, 15.0
+"""From where a matcher must find back to its result, and how near."""
+
+_READING_FRAMES = 2
+_CLEARER = 1.3  # times the contrast of the guess as it is
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What matching in rounds gave.
+
+    Attributes:
+        dataset: images and clouds.
+        matcher: what found the correspondences.
+        guess: where the first round started.
+        table: the correspondences of the last round.
+        fit: the solution from them.
+        rounds: per round and camera, how many matches, and how far they moved it.
+        clock: what took how long.
+    """
+
+    dataset: Dataset
+    matcher: Matcher
+    guess: Rig
+    table: Correspondences
+    fit: Fit
+    rounds: tuple[dict[str, Any], ...]
+    clock: Clock
+
+
+def second_look(
+    matched: Matched, hashes: Mapping[str, str], progress: Progress
+) -> dict[str, list[Check]]:
+    """Per camera all checks that need images, clouds, or the matcher.
+
+    Args:
+        matched: what matching gave.
+        hashes: of the files, by path.
+        progress: to be told how far it is.
+    """
+    rig, guess = matched.fit.solved_rig, matched.guess.T_camera_lidar
+    repeated = frames_checks(matched.dataset, hashes)
+    again = return_checks(matched, progress)
+    seen = image_checks_of(matched, progress)
+    return {
+        name: [
+            *last_round_checks(matched.rounds, name),
+            *range_checks(guess[name], T, matched.table.metadata),
+            *repeated,
+            *again.get(name, ()),
+            *seen.get(name, ()),
+        ]
+        for name, T in rig.T_camera_lidar.items()
+    }
+
+
+def last_round_checks(rounds: Sequence[dict[str, Any]], camera: str) -> list[Check]:
+    """Whether the last of several rounds of matching still moved a camera."""
+    if len(rounds) == 1:
+        return []
+    last, what = rounds[-1][camera], "the last round of matching moved it by"
+    return [
+        above(what, last["moved_deg"], MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
+        above(what, last["moved_cm"], MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
+    ]
+
+
+def frames_checks(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
+    """Whether two frames have the very same cloud: they are no independent evidence."""
+    seen: dict[str, str] = {}
+    for frame in dataset.frames:
+        digest = hashes[str(frame.cloud_path)]
+        if digest in seen:
+            text = f"frames {seen[digest]} and {frame.name} have the same cloud: counted as if "
+            return [Check("repeated frames", "WARN", text + "independent; remove one")]
+        seen[digest] = frame.name
+    return []
+
+
+def return_checks(matched: Matched, progress: Progress) -> dict[str, list[Check]]:
+    """Per camera, whether matching comes back to a result from a start displaced from it.
+
+    Asked of matchers that name rounds for near starts, ``tracking_rounds``.
+    """
+    rounds = getattr(matched.matcher, "tracking_rounds", ())
+    if not rounds or not matched.fit.problem.fits_matches:
+        return {}
+    rig, config, terms = matched.fit.solved_rig, matched.fit.config, matched.fit.problem.terms
+    estimate = perturb(rig, rotation_deg=BACK_DEG, translation_m=BACK_M, seed=config.seed)
+    for index in rounds:
+        table = matched.matcher.match(
+            matched.dataset, estimate, round_index=index, progress=progress
+        )
+        try:
+            estimate = fit(estimate, table, config, terms).solved_rig
+        except CorrespondenceError as error:
+            text = f"matching again from {_start()} gave nothing: {error}"
+            return {name: [Check("matching again", "FAIL", text)] for name in rig.cameras}
+    return {
+        name: _apart(T, estimate.T_camera_lidar[name]) for name, T in rig.T_camera_lidar.items()
+    }
+
+
+def _start() -> str:
+    return f"{BACK_DEG:g} deg, {100 * BACK_M:g} cm off"
+
+
+def _apart(result: Array, again: Array) -> list[Check]:
+    degrees, centimetres = distance(result, again)
+    name = f"matching again from {_start()} ends away by"
+    advice = "the images do not pin it down"
+    return [
+        above(name, degrees, BACK_WARN_DEG, BACK_FAIL_DEG, "deg", advice),
+        above(name, centimetres, BACK_WARN_CM, BACK_FAIL_CM, "cm", advice),
+    ]
+
+
+def image_checks_of(matched: Matched, progress: Progress) -> Mapping[str, Sequence[Check]]:
+    """What the images say of a result. Of another matcher's result they can only warn.
+
+    They are asked by the matcher `structure`, which does not see everything that others see.
+    """
+    from calibgraph.image_checks import image_checks
+    from calibgraph.structure import StructureMatcher
+
+    rig = matched.fit.solved_rig
+    try:
+        checks = image_checks(matched.dataset, rig, matched.table, progress=progress)
+    except (CalibrationError, OSError) as error:  # what its matcher did not need to read
+        text = f"the images could not be asked about the result: {error}"
+        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
+    if isinstance(matched.matcher, StructureMatcher):
+        return checks
+    return {
+        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
+        for name, of_camera in checks.items()
+    }
+
+
+def better_reading(dataset: Dataset, guess: Rig) -> str | None:
+    """How a guess that led nowhere may have been meant, by what fits the images; in words.
+
+    Every reading is matched once by the matcher `structure`, coarsely, in a few frames.
+    """
+    from calibgraph.structure import StructureMatcher
+
+    matcher = StructureMatcher()
+    few = replace(dataset, frames=tuple(spread_out(dataset.frames, _READING_FRAMES)))
+    least = max(CONTRAST_FAIL, _CLEARER * _contrast(few, matcher, guess))
+    contrasts = {words: _contrast(few, matcher, rig) for words, rig in reread(guess).items()}
+    best = max(contrasts, key=lambda words: contrasts[words], default=None)
+    return best if best is not None and contrasts[best] > least else None
+
+
+def _contrast(dataset: Dataset, matcher: Matcher, rig: Rig) -> float:
+    """The mean contrast over the cameras; 0 where nothing can be matched."""
+    table = matcher.match(dataset, rig, round_index=0, progress=lambda *_: None)
+    found: Mapping[str, float] = table.metadata.get("contrast", {})
+    return float(np.mean([found.get(name, 0.0) for name in rig.cameras]))
