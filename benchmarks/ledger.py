@@ -1,0 +1,136 @@
+"""Cases that run in processes, a line of JSON each in a file: a stopped run goes on from there."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibgraph import Calibration, CalibrationError, Rig, evaluate
+
+ROOT = Path(__file__).parents[1]
+REALDATA = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))
+"""The real sensor data, unless it is said where they are."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """Which case a line is of."""
+
+    level: str
+    kind: str
+    data: str
+    seed: int
+
+
+Record = dict[str, Any]
+
+
+def read(path: Path) -> list[Record]:
+    """The newest line of every case in a file; none if there is no file."""
+    lines = path.read_text("utf-8").splitlines(keepends=True) if path.is_file() else []
+    records = [json.loads(line) for line in lines if line.endswith("\n")]
+    return list({key_of(record): record for record in records}.values())
+
+
+def key_of(record: Record) -> Key:
+    """Which case a line is of."""
+    return Key(*(record[name] for name in Key.__dataclass_fields__))
+
+
+def run(
+    cases: Iterable[Key], work: Callable[[Key], Record], *, out: Path, jobs: int
+) -> list[Record]:
+    """Run the cases that the file does not have yet (or that crashed); return all its cases.
+
+    Args:
+        cases: what to run.
+        work: runs one case in a process of its own pool; see :func:`guarded`.
+        out: the file, to which a line is added as soon as its case is done.
+        jobs: processes.
+    """
+    done = {key_of(record) for record in read(out) if "crash" not in record}
+    left = [case for case in cases if case not in done]
+    print(f"{len(left)} cases to run, {len(done)} in {out}", flush=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _end_line(out)
+    start, pool = time.perf_counter(), ProcessPoolExecutor(jobs)
+    try:
+        tasks = [pool.submit(guarded, work, case) for case in left]
+        for count, task in enumerate(as_completed(tasks), start=1):
+            with out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(task.result()) + "\n")
+            if count % 20 == 0 or count == len(left):
+                seconds = time.perf_counter() - start
+                print(f"{count} of {len(left)} done, {seconds:.0f} s", flush=True)
+    finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C ends the cases at hand and no more
+    return read(out)
+
+
+def _end_line(out: Path) -> None:
+    """Take away what a stopped run left of its last line."""
+    if out.is_file():
+        data = out.read_bytes()
+        out.write_bytes(data[: data.rfind(b"\n") + 1])
+
+
+def guarded(work: Callable[[Key], Record], case: Key) -> Record:
+    """The line of a case: what ``work`` says, or why there is no result."""
+    cv2.setNumThreads(1)
+    start = time.perf_counter()
+    try:
+        found = work(case)
+    except CalibrationError as error:
+        found = {"refusal": f"{type(error).__name__}: {error}"}
+    except Exception:  # noqa: BLE001 - a fault of the program, to be seen in the summary
+        found = {"crash": traceback.format_exc()}
+    return {**asdict(case), "seconds": round(time.perf_counter() - start, 3), **found}
+
+
+def judged(result: Calibration, truth: Rig) -> Record:
+    """What a result says of itself, and how far off it is, per camera."""
+    errors = evaluate(result.rig, truth).cameras
+    return {"cameras": {name: _camera(result, name, truth, errors[name]) for name in errors}}
+
+
+def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
+    verdict, sigmas, covariance = (
+        result.camera_verdicts[name],
+        result.sigmas(name),
+        result.covariance[name],
+    )
+    xi = components(result.T_camera_lidar[name], truth.T_camera_lidar[name])
+    squared = None if covariance is None else float(xi @ np.linalg.solve(covariance, xi)) / 6
+    return {
+        "status": verdict.status,
+        "reasons": list(verdict.reasons),
+        "error_deg": error.rotation_error_deg,
+        "error_cm": error.translation_error_cm,
+        "xi_deg": np.degrees(xi[:3]).tolist(),
+        "xi_cm": (100 * xi[3:]).tolist(),
+        "sigma_deg": None if sigmas is None else sigmas[0].tolist(),
+        "sigma_cm": None if sigmas is None else sigmas[1].tolist(),
+        "normalised_squared": squared,
+        "checks": [[c.name, c.status, _number(c.value)] for c in verdict.checks],
+    }
+
+
+def components(T_estimate: np.ndarray, T_reference: np.ndarray) -> np.ndarray:
+    """(6,) xi of T_estimate = exp(xi) T_reference: rotation [rad], translation [m]."""
+    import gtsam
+
+    return gtsam.Pose3.Logmap(gtsam.Pose3(T_estimate @ np.linalg.inv(T_reference)))
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)

@@ -1,0 +1,106 @@
+"""Is the error bar right? Many draws of a simulation: errors against reported covariances.
+
+    python benchmarks/uncertainty.py [--draws 200] [--frames 30] [--matches 100]
+
+Errors of the simulated matcher: 1 px independent, 1 px shared by a camera's frame, 15 % outliers.
+NEES is the error squared in the metric of its covariance; its mean over 6 should be 1. The region
+that should hold 95 % of the errors is that of a chi-squared law with 6 degrees of freedom. Beside
+ours: the inverse of the information, (J^T J)^-1, which takes all correspondences for independent.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calibgraph import Camera, Config, Intrinsics, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.covariance import relative_covariance
+from calibgraph.graph import to_T_lidar_camera
+from calibgraph.problem import Fit
+from calibgraph.two_pass import fit, judged
+
+Array = NDArray[np.float64]
+
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def main() -> None:
+    """Draw, solve, and print one table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--matches", type=int, default=100)
+    options = parser.parse_args()
+    found: dict[tuple[str, str], list[float]] = {}
+    for seed in range(options.draws):
+        for what, which, nees in draw(options.frames, options.matches, seed):
+            found.setdefault((what, which), []).append(nees)
+    limit = chi2.ppf(0.95, 6)
+    print(f"{options.draws} draws, {options.frames} frames, {options.matches} matches each")
+    print(f"{'of':16}{'covariance':20}{'mean NEES / 6':>14}{'in the 95 % region':>20}")
+    for (what, which), values in found.items():
+        inside = np.mean(np.array(values) < limit)
+        print(f"{what:16}{which:20}{np.mean(values) / 6:14.2f}{inside:20.1%}")
+
+
+def stereo() -> Rig:
+    """A pair like KITTI's, half a metre apart."""
+    lens = Intrinsics(fx=718.0, fy=718.0, cx=607.0, cy=185.0)
+    cameras = {}
+    for name, y_m in (("left", 0.1), ("right", -0.44)):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = FORWARD, -FORWARD @ [0.3, y_m, -0.1]
+        cameras[name] = Camera(width_px=1241, height_px=376, intrinsics_px=lens, T_camera_lidar=T)
+    return Rig(cameras=cameras)
+
+
+def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float]]:
+    """One draw: of what, by which covariance, the normalised error squared."""
+    rig = stereo()
+    table = simulate_correspondences(rig, frames=frames, matches=matches, errors=ERRORS, seed=seed)
+    solved = fit(rig, table, Config())
+    ours = judged(solved).joint_covariance
+    assert ours is not None
+    errors = np.concatenate(
+        [twist(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]
+    )
+    for which, joint in (("by frames (ours)", ours), ("(J^T J)^-1", independent(solved))):
+        for what, error, covariance in parts(solved, errors, joint):
+            yield what, which, float(error @ np.linalg.solve(covariance, error))
+
+
+def parts(solved: Fit, errors: Array, joint: Array) -> Iterator[tuple[str, Array, Array]]:
+    """Each camera and the pair: its error and covariance."""
+    for place, name in enumerate(solved.poses):
+        rows = slice(6 * place, 6 * place + 6)
+        yield name, errors[rows], joint[rows, rows]
+    left, right = solved.poses.values()
+    T_right_left = right @ np.linalg.inv(left)
+    of_pair = errors[6:] - gtsam.Pose3(T_right_left).AdjointMap() @ errors[:6]
+    yield "left->right", of_pair, relative_covariance(joint, 0, 1, T_right_left)
+
+
+def independent(solved: Fit) -> Array:
+    """(12, 12) inverse of the information of all inliers, as if they were independent."""
+    joint = np.zeros((12, 12))
+    for place, (name, matches) in enumerate(solved.inliers.matches.items()):
+        rows = slice(6 * place, 6 * place + 6)
+        block = matches.scaled(solved.scales[name])
+        sums = block.sums(to_T_lidar_camera(solved.poses[name]))
+        joint[rows, rows] = np.linalg.inv(sums.hessian)
+    return joint
+
+
+def twist(T: Array, reference: Array) -> Array:
+    """(6,) xi in T = exp(xi) reference."""
+    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(reference))))
+
+
+if __name__ == "__main__":
+    main()
