@@ -18,6 +18,9 @@ from calibgraph import (
     Rig,
     StructureMatcher,
 )
+from calibgraph.files import sha256
+from calibgraph.pipeline import match_in_rounds
+from calibgraph.second_look import frames_checks
 from calibgraph.structure.consensus import find_consensus, summed_score
 from calibgraph.structure.level import LEVELS
 from calibgraph.structure.peaks import local_peaks
@@ -188,10 +191,11 @@ def test_the_order_of_the_points_does_not_matter(tmp_path: Path) -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
     quick = LEVELS[:2]
     given, other = (
-        calibgraph.calibrate(d, matcher=StructureMatcher(levels=quick))
+        match_in_rounds(d, matcher=StructureMatcher(levels=quick), progress=lambda *_: None)
         for d in (data, shuffled(data, tmp_path))
     )
-    for error in calibgraph.evaluate(given.rig, other.rig).cameras.values():
+    errors = calibgraph.evaluate(given.fit.solved_rig, other.fit.solved_rig)
+    for error in errors.cameras.values():
         assert error.rotation_error_deg < 0.02
         assert error.translation_error_cm < 0.5
 
@@ -200,8 +204,10 @@ def test_a_frame_given_twice_is_pointed_out() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
     copy = replace(data.frames[0], index=2, name="copy")
     data = replace(data, frames=(*data.frames, copy))
-    result = calibgraph.calibrate(data, matcher=StructureMatcher(levels=LEVELS[:1]))
-    assert any("000000 and copy have the same cloud" in r for r in result.verdict.reasons)
+    hashes = {str(frame.cloud_path): sha256(frame.cloud_path) for frame in data.frames}
+    (check,) = frames_checks(data, hashes)
+    assert check.status == "WARN" and "000000 and copy have the same cloud" in check.text
+    assert frames_checks(replace(data, frames=data.frames[:2]), hashes) == []
 
 
 def test_the_same_seed_gives_the_same_numbers() -> None:

@@ -49,9 +49,9 @@ def test_wrong_tables_do_not_pass_and_good_ones_do_not_fail(tmp_path: Path) -> N
 def test_wrong_recordings_do_not_pass_and_good_ones_do_not_fail(
     tmp_path: Path, realdata: Path
 ) -> None:
-    cameras = cameras_of(tmp_path, "--data", 2, "--kinds", IMAGES, "--realdata", realdata)
+    cameras = cameras_of(tmp_path, "--data", 1, "--kinds", IMAGES, "--realdata", realdata)
     off = [camera for camera in cameras if is_off(camera)]
-    assert len(off) > 15
+    assert len(off) > 8
     assert not [(c["kind"], c["error_deg"], c["error_cm"]) for c in off if c["status"] == "PASS"]
     right = [
         camera["status"]
