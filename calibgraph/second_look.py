@@ -125,7 +125,10 @@ def return_checks(matched: Matched, progress: Progress) -> dict[str, list[Check]
     estimate = perturb(rig, rotation_deg=BACK_DEG, translation_m=BACK_M, seed=config.seed)
     for index in rounds:
         table = matched.matcher.match(
-            matched.dataset, estimate, round_index=index, progress=progress
+            matched.dataset,
+            estimate,
+            round_index=index,
+            progress=lambda what, done, total: progress("checking: matching again", done, total),
         )
         try:
             estimate = fit(estimate, table, config, terms).solved_rig
@@ -176,14 +179,19 @@ def image_checks_of(matched: Matched, progress: Progress) -> Mapping[str, Sequen
 def better_reading(dataset: Dataset, guess: Rig) -> str | None:
     """How a guess that led nowhere may have been meant, by what fits the images; in words.
 
-    Every reading is matched once by the matcher `structure`, coarsely, in a few frames.
+    Every reading is matched once by the matcher `structure`, coarsely, in a few frames. None if
+    no reading is clearly better, or if the images, which another matcher may not need, cannot be
+    read.
     """
     from calibgraph.structure import StructureMatcher
 
     matcher = StructureMatcher()
     few = replace(dataset, frames=tuple(spread_out(dataset.frames, _READING_FRAMES)))
-    least = max(CONTRAST_FAIL, _CLEARER * _contrast(few, matcher, guess))
-    contrasts = {words: _contrast(few, matcher, rig) for words, rig in reread(guess).items()}
+    try:
+        least = max(CONTRAST_FAIL, _CLEARER * _contrast(few, matcher, guess))
+        contrasts = {words: _contrast(few, matcher, rig) for words, rig in reread(guess).items()}
+    except (CalibrationError, OSError):
+        return None
     best = max(contrasts, key=lambda words: contrasts[words], default=None)
     return best if best is not None and contrasts[best] > least else None
 

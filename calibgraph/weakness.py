@@ -34,7 +34,7 @@ def weaknesses(fit: Fit, camera: str, covariance: Array | None) -> tuple[str, ..
     matches = fit.inliers.matches.get(camera)
     if matches is None or not fit.problem.fits_matches:
         return ()
-    how = "weakest direction"
+    how = "weakest direction, by the scatter of the frames"
     if covariance is None:
         covariance = _at_best(matches, fit, camera)
         how = "weakest direction, by the matches as if each were independent"

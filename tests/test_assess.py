@@ -173,7 +173,7 @@ class TestWeakness:
 
     def test_good_data_have_no_empty_parts(self, pair: Rig) -> None:
         (words,) = solve(pair, simulated(pair)).weaknesses["left"]
-        assert words.startswith("weakest direction: ")
+        assert words.startswith("weakest direction, by the scatter of the frames: ")
 
     def test_the_share_of_the_priors_is_what_they_hold(self, pair: Rig) -> None:
         table = simulated(pair)

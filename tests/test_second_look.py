@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,17 @@ def test_an_inverted_guess_is_recognised_by_the_images(truth: Rig) -> None:
     inverted = {name: np.linalg.inv(T) for name, T in truth.T_camera_lidar.items()}
     meant = better_reading(data, truth.moved_to(inverted))
     assert meant == "inverted (it is T_lidar_camera)"
+
+
+def test_images_that_nobody_needed_do_not_cost_the_result(tmp_path: Path, truth: Rig) -> None:
+    """A table of nonsense, and images that cannot be read: FAIL, with a word about the images."""
+    shutil.copytree(SAMPLE, tmp_path / "data")
+    for path in (tmp_path / "data" / "cameras").rglob("*.jpg"):
+        path.write_bytes(path.read_bytes()[:1000])
+    nonsense = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=1.0))
+    result = calibgraph.calibrate(tmp_path / "data", matcher=nonsense)
+    assert result.verdict.status == "FAIL"
+    assert any("the images could not be asked" in reason for reason in result.verdict.reasons)
 
 
 def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, truth: Rig) -> None:

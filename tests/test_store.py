@@ -486,12 +486,17 @@ def stubborn(folder: Path, failing: Failing) -> tuple[bytes, bytes]:
     return done, on_its_way
 
 
+def with_one_input(folder: Path) -> Store:
+    store = Store(folder)
+    store.recover()
+    store.append(b"first")
+    return store
+
+
 def test_an_append_on_a_full_disk_leaves_the_earlier_inputs_and_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Store(tmp_path) as store:
-        store.recover()
-        store.append(b"first")
+    with with_one_input(tmp_path) as store:
         with monkeypatch.context() as patch:
             fill_disk(patch)
             with pytest.raises(OSError, match="No space"):
@@ -504,9 +509,7 @@ def test_an_append_on_a_full_disk_leaves_the_earlier_inputs_and_the_next(
 def test_a_store_that_cannot_be_cut_back_refuses_until_the_restart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Store(tmp_path) as store:
-        store.recover()
-        store.append(b"first")
+    with with_one_input(tmp_path) as store:
         with monkeypatch.context() as patch:
             fill_disk(patch)
             patch.setattr(os, "ftruncate", failing_call)

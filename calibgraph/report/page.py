@@ -177,40 +177,30 @@ def report_html(result: Calibration) -> str:
 
 def _reasons(cameras: Sequence[CameraPage]) -> list[Reason]:
     """What is weak, the worst first; what is true of several cameras is said once."""
-    said: dict[tuple[str, str], list[str]] = {}
+    alike: dict[tuple[str, ...], dict[str, Check]] = {}
+    said: dict[str, list[str]] = {}
     for camera in cameras:
         for check in camera.verdict.checks:
+            measured = check.value is not None and check.warn is not None
+            what = (check.status, check.name, check.unit, "" if measured else check.text)
             if check.status != "PASS":
-                alike = [each for each in cameras if _says(each, check)]
-                text = check.text if len(alike) == 1 else _for_all(check, alike)
-                said.setdefault((check.status, text), []).append(camera.name)
+                alike.setdefault(what, {})[camera.name] = check
         for sentence in camera.weaknesses:
-            said.setdefault(("", sentence), []).append(camera.name)
-    found = [Reason(key[0], ", ".join(dict.fromkeys(who)), key[1]) for key, who in said.items()]
-    return sorted(found, key=lambda reason: ("FAIL", "WARN", "").index(reason.status))
+            said.setdefault(sentence, []).append(camera.name)
+    found = [Reason(key[0], ", ".join(each), _in_one(each)) for key, each in alike.items()]
+    found.sort(key=lambda reason: ("FAIL", "WARN").index(reason.status))
+    return [*found, *(Reason("", ", ".join(who), text) for text, who in said.items())]
 
 
-def _says(camera: CameraPage, check: Check) -> bool:
-    """Whether a camera has a check of the same name, unit and status."""
-    return any(
-        (each.name, each.unit, each.status) == (check.name, check.unit, check.status)
-        for each in camera.verdict.checks
-    )
-
-
-def _for_all(check: Check, cameras: Sequence[CameraPage]) -> str:
-    """What one check found of several cameras, said once, with the same advice."""
-    limit = check.fail if check.status == "FAIL" else check.warn
-    if check.value is None or limit is None:
-        return check.text
-    found = [
-        f"{camera.name} {in_unit(each.value or 0.0, each.unit)}"
-        for camera in cameras
-        for each in camera.verdict.checks
-        if (each.name, each.unit, each.status) == (check.name, check.unit, check.status)
-    ]
-    advice = check.text.removeprefix(check.name).partition(": ")[2]
-    text = f"{check.name}: {', '.join(found)}; limit {in_unit(limit, check.unit)}"
+def _in_one(checks: Mapping[str, Check]) -> str:
+    """What one check found of some cameras, in one sentence, with the advice of the first."""
+    first = next(iter(checks.values()))
+    limit = first.fail if first.status == "FAIL" else first.warn
+    if len({check.text for check in checks.values()}) == 1 or limit is None:
+        return first.text
+    found = [f"{name} {in_unit(c.value or 0.0, c.unit)}" for name, c in checks.items()]
+    advice = first.text.removeprefix(first.name).partition(": ")[2]
+    text = f"{first.name}: {', '.join(found)}; limit {in_unit(limit, first.unit)}"
     return f"{text}: {advice}" if advice else text
 
 

@@ -69,8 +69,6 @@ class ImageEvidence:
         pair_offset: how many frames later the clouds are that fit the images best: -1, 0 or 1.
         pair_margin: by which share of the best the score with the own clouds is above the better
             of both neighbours', negative if it is below; NaN without neighbours.
-        own_pairs: share of the frames whose image fits its own cloud at least as well as its
-            neighbours'; NaN without neighbours.
     """
 
     groups: int
@@ -82,7 +80,6 @@ class ImageEvidence:
     frames_lost: tuple[int, ...] = ()
     pair_offset: int = 0
     pair_margin: float = math.nan
-    own_pairs: float = math.nan
 
 
 def look_again(
@@ -283,7 +280,6 @@ def _pairs(view: _View, images: Sequence[NDArray[np.uint8]], camera: Camera) -> 
     return {
         "pair_offset": 0 if sums[0] >= sums[1] else (-1, 1)[worse],
         "pair_margin": float((sums[0] - sums[1]) / (max(abs(sums[0]), abs(sums[1])) + 1e-12)),
-        "own_pairs": float((own >= np.fmax(before, after)).mean()),
     }
 
 
