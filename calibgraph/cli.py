@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibgraph.cli_learned import train, weights
 from calibgraph.cli_options import (
     BatchOption,
     BootstrapOption,
@@ -35,12 +35,13 @@ from calibgraph.cli_options import (
     TermsOption,
     WeightsOption,
 )
+from calibgraph.cli_support import checked_arguments, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.calibration import Calibration
     from calibgraph.config import Config
     from calibgraph.dataset import Dataset
-    from calibgraph.pipeline import Matcher, Progress
+    from calibgraph.pipeline import Matcher
 
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
@@ -102,7 +103,7 @@ def calibrate(
     from calibgraph.report import write_report
 
     require_place_for_folder(out)
-    with _arguments():
+    with checked_arguments():
         settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
         chosen = _matcher(
             matcher,
@@ -116,7 +117,7 @@ def calibrate(
             batch=batch,
         )
     data = _dataset(dataset, rig, frames)
-    with _progress() as progress:
+    with progress_bar() as progress:
         result = calibrate(
             data, matcher=chosen, config=settings, terms=checked_terms, progress=progress
         )
@@ -151,7 +152,7 @@ def match(
     from calibgraph.pipeline import match_in_rounds
 
     require_place_for_file(out)
-    with _arguments():
+    with checked_arguments():
         if out.suffix not in (".parquet", ".csv"):
             raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
         chosen = _matcher(
@@ -166,7 +167,7 @@ def match(
             batch=batch,
         )
     data = _dataset(dataset, rig, frames)
-    with _progress() as progress:
+    with progress_bar() as progress:
         table = match_in_rounds(data, matcher=chosen, progress=progress).table
     table.save(out)
     if as_json:
@@ -175,7 +176,7 @@ def match(
         print_json({"out": str(out), "matches": table.counts()})
     else:
         counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
-        _console().print(f"{out}: {len(table)} correspondences ({counts})")
+        terminal().print(f"{out}: {len(table)} correspondences ({counts})")
 
 
 @app.command()
@@ -202,7 +203,7 @@ def solve(
     from calibgraph.two_pass import solve
 
     require_place_for_folder(out)
-    with _arguments():
+    with checked_arguments():
         settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
     table = load_correspondences(correspondences)
     result = solve(load_rig(rig), table, settings, checked_terms)
@@ -240,7 +241,7 @@ def report(
         loaded = with_files_of(loaded, load_dataset(dataset, loaded.rig))
     folder = result if result.is_dir() else result.parent
     path = write_report(loaded, out or folder / "report.html")
-    _console().print(
+    terminal().print(
         f"{path}: written; the verdict is {loaded.verdict.status}", markup=False, soft_wrap=True
     )
 
@@ -263,7 +264,7 @@ def evaluate(
     else:
         from calibgraph.tables import print_evaluation
 
-        print_evaluation(_console(), errors, rig_file(estimate), rig_file(reference))
+        print_evaluation(terminal(), errors, rig_file(estimate), rig_file(reference))
 
 
 @app.command()
@@ -284,7 +285,7 @@ def perturb(
     from calibgraph.perturbation import perturb
 
     given = load_rig(rig)
-    with _arguments():
+    with checked_arguments():
         moved = perturb(
             given,
             rotation_deg=rotation_deg,
@@ -293,182 +294,11 @@ def perturb(
             uniform=uniform,
         )
     moved.save(out)
-    _console().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
+    terminal().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
 
 
-@app.command()
-def weights(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Convert to this .safetensors file.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Check a file of CMRNext weights, say what is in it, and convert it to safetensors."""
-    from calibgraph.cmrnext import load_checkpoint
-
-    with _arguments():
-        if out is not None and out.suffix != ".safetensors":
-            raise ValueError(f"--out {out}: the name must end in .safetensors")
-    checkpoint = load_checkpoint(file)
-    if out is not None:
-        checkpoint.save_safetensors(out)
-    if as_json:
-        from calibgraph.json_output import print_json
-
-        print_json(checkpoint.summary())
-    else:
-        from calibgraph.tables import print_weights
-
-        print_weights(_console(), checkpoint.summary(), out)
-
-
-@app.command()
-def train(
-    dataset: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="DATASET...",
-            help="Folders with a trusted extrinsic: KITTI sequences, or datasets with a "
-            "reference.yaml; they may be of different rigs.",
-        ),
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Weights to write.")],
-    held_out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DATASET",
-            help="Folder to validate on (up to 100 images), may come again. "
-            "(default: the last fifth of each DATASET)",
-        ),
-    ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(metavar="RIG", help="Trusted extrinsic, instead of the folders'.")
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", metavar="FILE", help="Fine-tune these weights; the network is theirs."
-        ),
-    ] = None,
-    rotation_deg: Annotated[
-        float | None, typer.Option(help="Largest perturbation per axis (default: 20).")
-    ] = None,
-    translation_m: Annotated[
-        float | None, typer.Option(help="Largest perturbation per axis (default: 1.5).")
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(help="Optimizer steps in all (default: 100000).")
-    ] = None,
-    batch: Annotated[int | None, typer.Option(help="Samples per step (default: 4).")] = None,
-    width: Annotated[
-        int | None,
-        typer.Option(help="Channels of the first layer (default: 64, as published)."),
-    ] = None,
-    fourier_levels: Annotated[
-        int | None, typer.Option(help="Of the depth's encoding, -1: none (default: 12).")
-    ] = None,
-    reflectance: Annotated[
-        bool | None,
-        typer.Option("--reflectance", help="Show the network the LiDAR's intensity too."),
-    ] = None,
-    context: Annotated[
-        str | None,
-        typer.Option(metavar="lidar|rgb", help="What the context encoder reads (default: lidar)."),
-    ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="Of the recurrent update (default: 12).")
-    ] = None,
-    crop_px: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HxW|none", help="Random crops, at full resolution (default: 320x960)."
-        ),
-    ] = None,
-    half_resolution: Annotated[
-        bool | None, typer.Option("--half-resolution", help="Halve the images.")
-    ] = None,
-    learning_rate: Annotated[
-        float | None, typer.Option(help="Peak of the one-cycle (default: 3e-4).")
-    ] = None,
-    warm_up_share: Annotated[
-        float | None, typer.Option(help="Of the steps, until that peak (default: 0.4).")
-    ] = None,
-    correlation_weight: Annotated[
-        float | None,
-        typer.Option(
-            help="Of a loss on the correlation itself (default: 0; 0.3 for short trainings)."
-        ),
-    ] = None,
-    correlation_steps: Annotated[
-        int | None, typer.Option(help="Steps at first with that loss alone (default: 0).")
-    ] = None,
-    validate_every: Annotated[
-        int, typer.Option(min=1, help="Steps; the weights are written then.")
-    ] = 500,
-    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.")] = "auto",
-    seed: SeedOption = 0,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Go on where FILE stopped, with the settings in it."),
-    ] = False,
-) -> None:
-    """Train a CMRNext network by perturbing trusted extrinsics."""
-    from calibgraph.cmrnext import TrainSettings, train
-    from calibgraph.cmrnext.train_settings import parsed_crop
-    from calibgraph.cmrnext.trusted import split, trusted_dataset
-    from calibgraph.load import load_rig
-    from calibgraph.tables import print_validation
-
-    settings: dict[str, Any] = {
-        "rotation_deg": rotation_deg,
-        "translation_m": translation_m,
-        "steps": steps,
-        "batch": batch,
-        "iterations": iterations,
-        "learning_rate": learning_rate,
-        "warm_up_share": warm_up_share,
-        "correlation_weight": correlation_weight,
-        "correlation_steps": correlation_steps,
-        "crop_px": crop_px,
-        "half_resolution": half_resolution,
-        "width": width,
-        "fourier_levels": fourier_levels,
-        "reflectance": reflectance,
-        "context": context,
-        "seed": seed or None,
-        "from": start,
-    }
-    given = {key: value for key, value in settings.items() if value is not None}
-    with _arguments():
-        if resume and given:
-            option = next(iter(given)).replace("_", "-")
-            raise ValueError(f"--{option}: --resume goes on with the settings in {out}; leave out")
-        given.pop("from", None)
-        if crop_px is not None:
-            given["crop_px"] = parsed_crop(crop_px)
-        chosen = TrainSettings().changed(**given)
-    trusted = load_rig(rig) if rig else None
-    data = [trusted_dataset(folder, trusted) for folder in dataset]
-    if held_out:
-        others = [trusted_dataset(folder, trusted) for folder in held_out]
-    else:
-        data, others = split(data)
-    console = _console()
-    with _progress() as progress, _arguments():
-        train(
-            data,
-            others,
-            out,
-            None if resume else chosen,
-            device=device,
-            validate_every=validate_every,
-            start=start,
-            resume=resume,
-            report=lambda validation: print_validation(console, validation),
-            progress=progress,
-        )
-    console.print(f"{out}: trained", soft_wrap=True, markup=False)
+app.command()(weights)
+app.command()(train)
 
 
 @app.command()
@@ -517,14 +347,14 @@ def track(
     from calibgraph.tracking.command import Tracking, track
 
     require_place_for_folder(out)
-    with _arguments():
+    with checked_arguments():
         settings = _settings(config, preset, seed)
         chosen = _matcher(matcher, weights, seed=seed, device=device) if matcher else None
         if chosen is None and weights:
             raise ValueError("--weights is for --matcher cmrnext only")
         if chosen is None and len(source) > 1:
             raise ValueError(f"{len(source)} sources given; several go with --matcher only")
-    console = _console()
+    console = terminal()
     wanted = Tracking(
         rig=load_rig(rig),
         config=settings,
@@ -590,23 +420,12 @@ def _one_line(error: Exception) -> str:
     return " ".join(text.split()).removesuffix(".") + more
 
 
-@contextmanager
-def _arguments() -> Iterator[None]:
-    """Turn a wrong argument, a ``ValueError`` in the library, into the user's one line."""
-    from calibgraph.errors import CalibrationError
-
-    try:
-        yield
-    except ValueError as error:
-        raise CalibrationError(str(error)) from error
-
-
 def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Dataset:
     from calibgraph.dataset import load_dataset
     from calibgraph.load import load_rig
 
     data = load_dataset(folders, load_rig(rig) if rig else None)
-    with _arguments():
+    with checked_arguments():
         return data.select(frames) if frames is not None else data
 
 
@@ -650,28 +469,6 @@ def _terms(name: str) -> Any:
     return name
 
 
-def _console() -> Any:
-    from rich.console import Console
-
-    return Console(stderr=True)
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A progress bar on stderr, that is gone when the work is done."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    console = _console()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("starting", total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
-        )
-
-
 def _mark(result: Calibration) -> str:
     """What every picture of a result that cannot be used says."""
     return "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
@@ -686,6 +483,6 @@ def _finish(result: Calibration, written: list[Path], as_json: bool) -> None:
     else:
         from calibgraph.tables import print_result
 
-        print_result(_console(), result, written)
+        print_result(terminal(), result, written)
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)
