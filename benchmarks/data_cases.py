@@ -60,7 +60,10 @@ class Folders:
         if name.startswith("scene_"):
             folder = _known(self.scenes, "--scenes") / name
             return load_dataset(folder), load_rig(folder / "reference.yaml")
-        sequences = _known(self.realdata, "--realdata") / "kitti_odometry" / "sequences"
+        recorded = _known(self.realdata, "--realdata")
+        if (recorded / name / "reference.yaml").is_file():
+            return load_dataset(recorded / name), load_rig(recorded / name / "reference.yaml")
+        sequences = recorded / "kitti_odometry" / "sequences"
         data = load_dataset([sequences / part for part in name.split("+")])
         return data, data.rig
 

@@ -236,7 +236,7 @@ def relative_pose_conflict(
 def _causes(fit: Fit, guess: Rig, camera: str) -> list[Check]:
     """What names a cause comes first: a guess that was meant otherwise, points in millimetres."""
     matches = fit.problem.matches.get(camera)
-    checks = guess_checks(guess.T_camera_lidar[camera], fit.poses[camera])
+    checks = guess_checks(guess.T_camera_lidar[camera], fit.poses[camera], fit.metadata)
     return checks if matches is None else [*checks, points_check(matches)]
 
 

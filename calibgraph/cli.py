@@ -31,8 +31,11 @@ from calibgraph.cli_options import (
     PresetOption,
     RigArgument,
     RigOption,
+    SearchDegOption,
+    SearchMetresOption,
     SeedOption,
     TermsOption,
+    TimeLimitOption,
     WeightsOption,
 )
 from calibgraph.cli_support import checked_arguments, progress_bar, terminal
@@ -87,7 +90,10 @@ def calibrate(
     out: OutOption = Path("calibration"),
     seed: SeedOption = 0,
     bootstrap: BootstrapOption = None,
+    time_limit_s: TimeLimitOption = None,
     as_json: JsonOption = False,
+    search_deg: SearchDegOption = None,
+    search_m: SearchMetresOption = None,
     weights: WeightsOption = None,
     estimate: EstimateOption = None,
     device: DeviceOption = "auto",
@@ -109,6 +115,8 @@ def calibrate(
             matcher,
             weights,
             seed=seed,
+            search_deg=search_deg,
+            search_m=search_m,
             device=device,
             estimate=estimate,
             iterations=iterations,
@@ -119,7 +127,12 @@ def calibrate(
     data = _dataset(dataset, rig, frames)
     with progress_bar() as progress:
         result = calibrate(
-            data, matcher=chosen, config=settings, terms=checked_terms, progress=progress
+            data,
+            matcher=chosen,
+            config=settings,
+            terms=checked_terms,
+            time_limit_s=time_limit_s,
+            progress=progress,
         )
         written = [result.save(out), out / "correspondences.parquet"]
         shown = data.frames[len(data.frames) // 2]
@@ -138,7 +151,10 @@ def match(
         Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
     ] = Path("correspondences.parquet"),
     seed: SeedOption = 0,
+    time_limit_s: TimeLimitOption = None,
     as_json: JsonOption = False,
+    search_deg: SearchDegOption = None,
+    search_m: SearchMetresOption = None,
     weights: WeightsOption = None,
     estimate: EstimateOption = None,
     device: DeviceOption = "auto",
@@ -159,6 +175,8 @@ def match(
             matcher,
             weights,
             seed=seed,
+            search_deg=search_deg,
+            search_m=search_m,
             device=device,
             estimate=estimate,
             iterations=iterations,
@@ -168,7 +186,9 @@ def match(
         )
     data = _dataset(dataset, rig, frames)
     with progress_bar() as progress:
-        table = match_in_rounds(data, matcher=chosen, progress=progress).table
+        table = match_in_rounds(
+            data, matcher=chosen, time_limit_s=time_limit_s, progress=progress
+        ).table
     table.save(out)
     if as_json:
         from calibgraph.json_output import print_json
@@ -430,23 +450,54 @@ def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Datas
 
 
 def _matcher(name: str, weights: list[Path] | None, *, seed: int, **options: Any) -> Matcher:
-    """The matcher of that name or file; the options are those of cmrnext, None if not given.
+    """The matcher of that name or file.
+
+    Args:
+        name: of the matcher, or a file.
+        weights: of cmrnext.
+        seed: of everything random.
+        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
 
     Raises:
         ValueError: if they do not go together.
     """
     given = {key: value for key, value in options.items() if value is not None}
+    searched = {key: _range_option(key, given.pop(key)) for key in _SEARCH if key in given}
+    if searched and name != "structure":
+        raise ValueError(f"{_flag(next(iter(searched)))} is for --matcher structure only")
     if name == "cmrnext" and weights:
         from calibgraph.cmrnext import CmrNextMatcher
 
         return CmrNextMatcher(weights, seed=seed, **given)
-    from calibgraph.pipeline import matcher_named
-
-    chosen = matcher_named(name, seed=seed)
     for option in ("weights", *(given.keys() - {"device"})):
         if option != "weights" or weights:
-            raise ValueError(f"--{option.replace('_', '-')} is for --matcher cmrnext only")
-    return chosen
+            raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
+    if searched:
+        from calibgraph.structure import StructureMatcher
+
+        none = dict.fromkeys(_SEARCH) if None in searched.values() else {}
+        ranges: dict[str, Any] = {**searched, **none}
+        return StructureMatcher(seed=seed, **ranges)
+    from calibgraph.pipeline import matcher_named
+
+    return matcher_named(name, seed=seed)
+
+
+_SEARCH = ("search_deg", "search_m")
+
+
+def _range_option(name: str, text: str) -> float | None:
+    """The number that was given, None for ``none``."""
+    if text == "none":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{_flag(name)} {text}: give a number, or none") from None
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def _settings(

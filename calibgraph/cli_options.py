@@ -23,6 +23,33 @@ MatcherOption = Annotated[
     str,
     typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
 ]
+_STRUCTURE = "Matcher structure"
+SearchDegOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DEG|none",
+        help="How far the guess may be off, per axis; none: no search, the guess is within about "
+        "2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
+        rich_help_panel=_STRUCTURE,
+    ),
+]
+SearchMetresOption = Annotated[
+    str | None,
+    typer.Option(
+        "--search-m",
+        metavar="M|none",
+        help="The same of the translation. (default: 1.5)",
+        rich_help_panel=_STRUCTURE,
+    ),
+]
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.001,
+        metavar="SECONDS",
+        help="Stop matching when it is over; a result of fewer rounds is said to be partial.",
+    ),
+]
 _CMRNEXT = "Matcher cmrnext"
 WeightsOption = Annotated[
     list[Path] | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +17,8 @@ from calibgraph.rig import Rig, angle_deg
 Array = NDArray[np.float64]
 
 FAR_GUESS_DEG, FAR_GUESS_M = 30.0, 2.0
-"""A result farther than this from the guess: the guess was of another convention."""
+"""A result farther than this from the guess, and than its matcher searches: the guess was of
+another convention."""
 
 SHIFT_WARN_M, SHIFT_FAIL_M = 20.0, 100.0
 RANGE_WARN_M, RANGE_FAIL_M = 200.0, 1000.0
@@ -53,16 +55,24 @@ def readings(T: Array) -> dict[str, Array]:
     }
 
 
-def guess_checks(guess: Array, result: Array) -> list[Check]:
-    """Whether a camera's result is so far from the guess that the guess was meant otherwise."""
+def guess_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> list[Check]:
+    """Whether a camera's result is so far from the guess that the guess was meant otherwise.
+
+    Args:
+        guess: (4, 4) T_camera_lidar.
+        result: (4, 4) what came out.
+        metadata: of the table, see :func:`range_checks`.
+    """
     degrees, metres = _apart(guess, result)
+    far_deg = max(FAR_GUESS_DEG, math.sqrt(3) * metadata.get("range_rotation_deg", 0.0))
+    far_m = max(FAR_GUESS_M, math.sqrt(3) * metadata.get("range_translation_m", 0.0))
     meant = nearest_reading(guess, result)
     advice = f"it seems to be {meant}" if meant else "is T_camera_lidar inverted, or of other axes?"
     name, shift_m = "distance from the guess", float(np.linalg.norm(guess[:3, 3]))
     units = "is the translation of T_camera_lidar in millimetres?"
     return [
-        above(name, degrees, FAR_GUESS_DEG, 360.0, "deg", advice),
-        above(name, metres, FAR_GUESS_M, np.inf, "m", advice),
+        above(name, degrees, far_deg, 360.0, "deg", advice),
+        above(name, metres, far_m, np.inf, "m", advice),
         above("the guess's translation", shift_m, SHIFT_WARN_M, SHIFT_FAIL_M, "m", units),
     ]
 
@@ -78,7 +88,7 @@ def range_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> li
     step = result @ np.linalg.inv(guess)
     moved = {
         "range_rotation_deg": np.degrees(Rotation.from_matrix(step[:3, :3]).as_rotvec()),
-        "range_translation_m": result[:3, 3] - guess[:3, 3],
+        "range_translation_m": step[:3, 3],
     }
     advice = "start again from the result, and see whether it stays"
     return [

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -28,6 +30,23 @@ Progress = Callable[[str, int, int], None]
 """Told of progress: what is being done, how much of it is done, out of how much."""
 
 
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a matcher's rounds begin.
+
+    Attributes:
+        rig: with the poses to begin from.
+        first_round: with which round.
+        checks: per camera, what is to be said of its start.
+        metadata: what the tables of the rounds say besides.
+    """
+
+    rig: Rig
+    first_round: int = 0
+    checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
 class Matcher(Protocol):
     """What finds correspondences. It may want several rounds, each from a better estimate.
 
@@ -42,6 +61,9 @@ class Matcher(Protocol):
     It may have an attribute ``tracking_rounds``: which of its rounds to go through near a good
     estimate. Single frames of a drive go through these (otherwise through all), and a result is
     tried by matching again with them from a start displaced from it.
+
+    It may have a method ``locate(dataset, rig, *, out_of_time, progress)`` that says where the
+    rounds begin, a ``Start``, given the guess and a function that says when to hurry.
 
     Attributes:
         rounds: how many rounds it wants.
@@ -89,6 +111,7 @@ def calibrate(
     config: Config | None = None,
     *,
     terms: Terms = "full",
+    time_limit_s: float | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate all cameras of a rig jointly from images and clouds.
@@ -99,6 +122,7 @@ def calibrate(
         matcher: ``structure``; a matcher of your own; or correspondences, from a file or in memory.
         config: settings of the solve; the preset ``auto`` if None.
         terms: of the objective, see :func:`calibgraph.solve`.
+        time_limit_s: when to stop matching; the result then says that it is partial.
         progress: called as the work goes on.
 
     Returns:
@@ -110,14 +134,16 @@ def calibrate(
         ValueError: if the matcher is unknown.
     """
     report = progress or (lambda what, done, total: None)
-    matched = match_in_rounds(dataset, rig, matcher, config, terms, progress=report)
+    matched = match_in_rounds(
+        dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
+    )
     data, clock = matched.dataset, matched.clock
     with clock("hash_inputs"):
         inputs = _input_hashes(data)
     with clock("checks"):
         result = judged(matched.fit, guess=matched.guess)
         result = result.judged_further(second_look(matched, inputs, report))
-        if result.verdict.status == "FAIL":
+        if result.verdict.status == "FAIL" and not matched.out_of_time:
             result = _with_reading(result, better_reading(data, matched.guess))
     report("done", 1, 1)
     return replace(
@@ -137,6 +163,7 @@ def match_in_rounds(
     config: Config | None = None,
     terms: Terms = "full",
     *,
+    time_limit_s: float | None = None,
     progress: Progress,
 ) -> Matched:
     """Match, solve, and match again from the estimate, as often as the matcher wants.
@@ -151,15 +178,54 @@ def match_in_rounds(
         config = config.changed(stage1="rig")
     if chosen.rounds < 1:
         raise ValueError(f"the matcher wants {chosen.rounds} rounds, expected at least 1")
-    clock, rounds, estimate = Clock(), list[dict[str, Any]](), guess
-    for index in range(chosen.rounds):
+    clock, rounds, out_of_time = Clock(), list[dict[str, Any]](), _after(time_limit_s)
+    with clock("locate"):
+        start = _start(chosen, data, guess, out_of_time, progress)
+    estimate = start.rig
+    for index in range(start.first_round, chosen.rounds):
         with clock("match"):
             table = chosen.match(data, estimate, round_index=index, progress=progress)
+            table = replace(table, metadata={**table.metadata, **start.metadata})
         with clock("solve"):
             found = _fit(data, guess, (estimate, table), config, terms)
         rounds.append(_round(table, estimate, found.solved_rig))
         estimate = found.solved_rig
-    return Matched(data, chosen, guess, table, found, tuple(rounds), clock)
+        if out_of_time():
+            break
+    return Matched(
+        data,
+        chosen,
+        guess,
+        table,
+        found,
+        tuple(rounds),
+        clock,
+        start_checks=start.checks,
+        missed_rounds=chosen.rounds - 1 - index,
+        out_of_time=out_of_time(),
+    )
+
+
+def _after(seconds: float | None) -> Callable[[], bool]:
+    """A function that says whether so many seconds have passed since now."""
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"the time limit must be positive, found {seconds} s")
+    end = math.inf if seconds is None else time.monotonic() + seconds
+    return lambda: time.monotonic() > end
+
+
+def _start(
+    matcher: Matcher,
+    dataset: Dataset,
+    guess: Rig,
+    out_of_time: Callable[[], bool],
+    progress: Progress,
+) -> Start:
+    """Where the rounds begin: at the guess, if the matcher has no say."""
+    if not hasattr(matcher, "locate"):
+        return Start(guess)
+    found: Start = matcher.locate(dataset, guess, out_of_time=out_of_time, progress=progress)
+    return found
 
 
 def _with_reading(result: Calibration, meant: str | None) -> Calibration:

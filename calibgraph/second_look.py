@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from calibgraph.pipeline import Matcher, Progress
 
 Array = NDArray[np.float64]
+Checks = Mapping[str, Sequence[Check]]
 
 BACK_DEG, BACK_M = 0.5, 0.08
 BACK_WARN_DEG, BACK_FAIL_DEG = 0.15, 0.5
@@ -53,6 +54,9 @@ class Matched:
         fit: the solution from them.
         rounds: per round and camera, how many matches, and how far they moved it.
         clock: what took how long.
+        start_checks: per camera, what the matcher says of where the first round began.
+        missed_rounds: how many rounds there was no time for.
+        out_of_time: whether the time limit has passed.
     """
 
     dataset: Dataset
@@ -62,6 +66,9 @@ class Matched:
     fit: Fit
     rounds: tuple[dict[str, Any], ...]
     clock: Clock
+    start_checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
+    missed_rounds: int = 0
+    out_of_time: bool = False
 
 
 def second_look(
@@ -76,10 +83,10 @@ def second_look(
     """
     rig, guess = matched.fit.solved_rig, matched.guess.T_camera_lidar
     repeated = frames_checks(matched.dataset, hashes)
-    again = return_checks(matched, progress)
-    seen = image_checks_of(matched, progress)
+    again, seen = _asked_again(matched, progress)
     return {
         name: [
+            *matched.start_checks.get(name, ()),
             *last_round_checks(matched.rounds, name),
             *range_checks(guess[name], T, matched.table.metadata),
             *repeated,
@@ -88,6 +95,16 @@ def second_look(
         ]
         for name, T in rig.T_camera_lidar.items()
     }
+
+
+def _asked_again(matched: Matched, progress: Progress) -> tuple[Checks, Checks]:
+    """What matching again says, and what the images say; in short, if there is no time for it."""
+    if not matched.out_of_time:
+        return return_checks(matched, progress), image_checks_of(matched, progress)
+    missed = f"{matched.missed_rounds} rounds of matching and " if matched.missed_rounds else ""
+    text = f"partial: there was no time for {missed}a second look at the images"
+    check = Check("time limit", "WARN", text, matched.missed_rounds)
+    return {name: [check] for name in matched.fit.solved_rig.cameras}, {}
 
 
 def last_round_checks(rounds: Sequence[dict[str, Any]], camera: str) -> list[Check]:
@@ -113,7 +130,7 @@ def frames_checks(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
     return []
 
 
-def return_checks(matched: Matched, progress: Progress) -> dict[str, list[Check]]:
+def return_checks(matched: Matched, progress: Progress) -> Checks:
     """Per camera, whether matching comes back to a result from a start displaced from it.
 
     Asked of matchers that name rounds for near starts, ``tracking_rounds``.
@@ -154,7 +171,7 @@ def _apart(result: Array, again: Array) -> list[Check]:
     ]
 
 
-def image_checks_of(matched: Matched, progress: Progress) -> Mapping[str, Sequence[Check]]:
+def image_checks_of(matched: Matched, progress: Progress) -> Checks:
     """What the images say of a result. Of another matcher's result they can only warn.
 
     They are asked by the matcher `structure`, which does not see everything that others see.

@@ -289,7 +289,7 @@ class TestGuess:
     def test_a_near_guess_is_not_questioned(self, pair: Rig) -> None:
         guess = calibgraph.perturb(pair, rotation_deg=10, translation_m=1, seed=1)
         for name, T in pair.T_camera_lidar.items():
-            checks = guess_checks(guess.T_camera_lidar[name], T)
+            checks = guess_checks(guess.T_camera_lidar[name], T, {})
             assert all(check.status == "PASS" for check in checks)
 
     def test_points_in_millimetres_fail(self, pair: Rig) -> None:

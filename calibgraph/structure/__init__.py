@@ -1,9 +1,15 @@
 """The weight-free matcher `structure`: local correlation of clouds and images, pose consensus.
 
-Per round, from the present estimate of the poses:
+First every camera is found, from a guess that may be far off:
 
-1. ``windows``: small neighbourhoods of LiDAR points, as the camera would see them, and what varies
-   in them: inverse range and intensity.
+1. ``responses``: small windows of LiDAR points, and what varies in them, inverse range and
+   intensity; how well the image agrees with them at all its places.
+2. ``search``: the poses at which they agree best together.
+3. ``locate``: which of these, if any, is good enough to begin from; cameras help each other.
+
+Then per round, from the present estimate of the poses:
+
+1. ``windows``: the windows that the camera would see.
 2. ``scores``: how well the image under each window, at every shift of a grid, agrees with it; the
    windows of one direction and depth are one group.
 3. ``consensus``: the pose at which the groups' shifts agree best.

@@ -6,15 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from calibgraph.structure.cross_entropy import maximize
 from calibgraph.structure.level import Level
 from calibgraph.structure.scores import Scores
 
 Array = NDArray[np.float64]
 
-# The cross-entropy search: samples a step (four times that in the first), the best that shape the
-# next step's distribution, steps, and independent starts of which the best wins.
-SAMPLES, ELITES, STEPS, STARTS = 400, 40, 14, 3
-WIDENING = 1.2  # of the elites' covariance, against closing in too early
+SAMPLES, STEPS, STARTS = 400, 14, 3  # of the search; the best of the starts wins
 PRIOR = 6.0  # penalty, in chance spreads of the score, of a twist sqrt(2 / 6) of the box from 0
 
 
@@ -72,16 +70,15 @@ def _search_once(
     def penalised(twists: Array) -> Array:
         return np.asarray(summed_score(scores, twists) - weight * ((twists / box) ** 2).sum(axis=1))
 
-    mean: Array = np.zeros(len(box))
-    root: Array = np.diag(box * 0.6)
-    for step in range(STEPS):
-        count = SAMPLES * (4 if step == 0 else 1)
-        twists = np.clip(mean + rng.standard_normal((count, len(box))) @ root.T, -box, box)
-        elite = twists[np.argsort(-penalised(twists))[:ELITES]]
-        mean = elite.mean(axis=0)
-        spread = WIDENING * np.cov(elite.T) + np.diag((1e-4 * box) ** 2)
-        root = np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
-    return mean, float(penalised(mean[None])[0])
+    return maximize(
+        penalised,
+        start=np.zeros(len(box)),
+        spread=0.6 * box,
+        limit=box,
+        samples=SAMPLES,
+        steps=STEPS,
+        rng=rng,
+    )
 
 
 @njit(cache=True, fastmath=True, nogil=True)

@@ -3,52 +3,70 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.check import Check
 from calibgraph.correspondences import Correspondences, concatenate
-from calibgraph.dataset import Dataset, Frame
+from calibgraph.dataset import Dataset, Frame, spread_out
+from calibgraph.pipeline import Progress, Start
 from calibgraph.rig import Camera, Rig
 from calibgraph.structure.consensus import find_consensus
 from calibgraph.structure.level import LEVELS, Level
+from calibgraph.structure.locate import Found, Range, View, locate
 from calibgraph.structure.peaks import correspondences_at_peaks
 from calibgraph.structure.scores import Scores, joined, score_frame
 from calibgraph.structure.windows import Cloud
 
-if TYPE_CHECKING:
-    from calibgraph.pipeline import Progress
-
-SYSTEMATIC_ROTATION_RAD = float(np.radians(0.07))
+SYSTEMATIC_ROTATION_RAD = float(np.radians(0.09))
 SYSTEMATIC_TRANSLATION_M = 0.02
 """Error per axis that the frames of a scene share: its root mean square over recorded scenes of two
 rigs, each from a few places. One place alone is worse; synthetic scenes are better."""
 
 _NEAR_ROUNDS = (2, 4)
-MAX_WINDOWS = 20_000  # per camera and round, over all frames: bounds the time, not the accuracy
+_AFTER_SEARCH = 2  # the round that goes on where the search ends
+FRAME_WINDOWS = 6_000  # bounds the time of a single frame
+LOCATE_FRAMES = 7
+SEARCH_DEG, SEARCH_M = 20.0, 1.5
+MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
 
 
 class StructureMatcher:
-    """Weight-free matching for initial errors of up to about 2.5 degrees and 25 cm.
+    """Weight-free matching, by a search within a range of the guess and rounds from what it finds.
 
     It remembers the decoded images and clouds of a dataset from round to round.
 
     Args:
-        seed: of the pose search.
+        seed: of the searches.
+        search_deg: how far the guess may be off, per axis; None for no search: the rounds begin at
+            the guess, which may be off by about 2.5 degrees and 25 cm.
+        search_m: the same of the translation.
         levels: the rounds, coarse to fine.
+
+    Raises:
+        ValueError: if only one of the ranges is None, or one is out of bounds.
     """
 
     stage1: Literal["pnp", "rig"] = "rig"
 
-    def __init__(self, *, seed: int = 0, levels: Sequence[Level] = LEVELS) -> None:
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        search_deg: float | None = SEARCH_DEG,
+        search_m: float | None = SEARCH_M,
+        levels: Sequence[Level] = LEVELS,
+    ) -> None:
         self.seed = seed
+        self.search = _range(search_deg, search_m)
         self.levels = levels
         self.rounds = len(levels)
         self._clouds: dict[Path, Cloud] = {}
@@ -59,11 +77,53 @@ class StructureMatcher:
         """The rounds for starts that are off by up to 0.7 degrees and 20 cm."""
         return tuple(index for index in _NEAR_ROUNDS if index < self.rounds)
 
+    def locate(
+        self,
+        dataset: Dataset,
+        rig: Rig,
+        *,
+        out_of_time: Callable[[], bool],
+        progress: Progress,
+    ) -> Start:
+        """Where the rounds begin: at the guess, or where a search finds the cameras."""
+        if self.search is None:
+            return Start(rig)
+        frames = spread_out(dataset.frames, LOCATE_FRAMES)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            clouds = list(pool.map(self._cloud, frames))
+            views = {
+                name: View(
+                    list(pool.map(partial(self._image, name=name, camera=camera), frames)), clouds
+                )
+                for name, camera in rig.cameras.items()
+            }
+            found = locate(
+                rig,
+                views,
+                self.search,
+                seed=self.seed,
+                out_of_time=out_of_time,
+                pool=pool,
+                progress=progress,
+            )
+        poses = {
+            name: (f.camera if f.accepted else rig.cameras[name]).T_camera_lidar
+            for name, f in found.items()
+        }
+        all_found = all(f.accepted for f in found.values())
+        return Start(
+            rig.moved_to(poses),
+            first_round=min(_AFTER_SEARCH, self.rounds - 1) if all_found else 0,
+            checks={name: [_check(f, self.search)] for name, f in found.items()},
+            metadata=_range_metadata(self.search),
+        )
+
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
         """Match every camera in every frame, from the rig's poses."""
         level = self.levels[round_index]
+        most = min(level.max_windows // len(dataset.frames), FRAME_WINDOWS)
         work = len(rig.cameras) * len(dataset.frames)
         tables, contrasts = [], {}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -71,27 +131,26 @@ class StructureMatcher:
                 done = round_index * work + index * len(dataset.frames)
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
                 progress(what, done, self.rounds * work)
-                score = partial(
-                    self._score, name, camera, level, MAX_WINDOWS // len(dataset.frames)
-                )
+                score = partial(self._score, name, camera, level, most)
                 scores = joined(list(pool.map(score, dataset.frames)))
                 twist, contrasts[name] = find_consensus(scores, level, seed=self.seed)
-                tables.append(correspondences_at_peaks(scores, twist, name))
+                least = level.min_quality
+                tables.append(correspondences_at_peaks(scores, twist, name, min_quality=least))
+        near = Range(self.levels[0].rotation_rad, self.levels[0].translation_m)
         settings = {
             "matcher": "structure",
             "round": round_index,
             "seed": self.seed,
             "contrast": contrasts,
-            "range_rotation_deg": float(np.degrees(self.levels[0].rotation_rad)),
-            "range_translation_m": self.levels[0].translation_m,
+            **_range_metadata(near),
             "systematic_rotation_rad": SYSTEMATIC_ROTATION_RAD,
             "systematic_translation_m": SYSTEMATIC_TRANSLATION_M,
         }
         return replace(concatenate(tables), metadata=settings)
 
     def _score(self, name: str, camera: Camera, level: Level, most: int, frame: Frame) -> Scores:
-        gray, cloud = self._image(frame, name, camera), self._cloud(frame)
-        return score_frame(gray, cloud, camera, level, frame=frame.index, most=most)
+        gray = self._image(frame, name, camera)
+        return score_frame(gray, self._cloud(frame), camera, level, frame=frame.index, most=most)
 
     def _cloud(self, frame: Frame) -> Cloud:
         """The frame's cloud, decoded once."""
@@ -106,3 +165,40 @@ class StructureMatcher:
             image = cv2.cvtColor(frame.load_image(name, camera), cv2.COLOR_BGR2GRAY)
             self._images[path] = np.asarray(image, dtype=np.uint8)
         return self._images[path]
+
+
+def _range(search_deg: float | None, search_m: float | None) -> Range | None:
+    """The range of the search, None for no search."""
+    if search_deg is None and search_m is None:
+        return None
+    if search_deg is None or search_m is None:
+        raise ValueError("give both ranges of the search, or None for both")
+    if not (0 < search_deg <= MAX_SEARCH_DEG and 0 < search_m <= MAX_SEARCH_M):
+        raise ValueError(
+            f"the search reaches up to {MAX_SEARCH_DEG:g} deg and {MAX_SEARCH_M:g} m per axis, "
+            f"found {search_deg:g} deg and {search_m:g} m"
+        )
+    return Range(float(np.radians(search_deg)), search_m)
+
+
+def _range_metadata(within: Range) -> dict[str, float]:
+    """How far from the guess a result may lie, for the verdict."""
+    return {
+        "range_rotation_deg": float(np.degrees(within.rotation_rad)),
+        "range_translation_m": within.translation_m,
+    }
+
+
+def _check(found: Found, within: Range) -> Check:
+    """What the verdict says of where a camera was found."""
+    degrees = float(np.degrees(within.rotation_rad))
+    text = f"contrast {found.contrast:.1f} of image and cloud where the rounds began"
+    if found.accepted:
+        return Check("search", "PASS", text, found.contrast)
+    reach = f"within {degrees:g} deg and {within.translation_m:g} m of the guess"
+    missing = (
+        f"no pose {reach} explains the images (best contrast {found.contrast:.1f}): check the "
+        "guess, the intrinsics and the pairing, widen --search-deg and --search-m, or give more "
+        "frames from more places"
+    )
+    return Check("search", "FAIL", missing, found.contrast)

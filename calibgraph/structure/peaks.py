@@ -11,22 +11,24 @@ from calibgraph.structure.scores import Grids, Scores
 Array = NDArray[np.float64]
 
 PEAK_STEPS = 2  # how far from the consensus a group may peak, in grid steps
-MIN_QUALITY = 0.05  # least mean score of a group's windows at its peak, above the grid's mean
+MIN_QUALITY = 0.05  # as of a level; the confidence's unit
 WEAK_DIRECTION = 0.1  # of the larger curvature: below, a direction is not constrained (an edge)
 
 
-def correspondences_at_peaks(scores: Scores, twist: Array, camera: str) -> Correspondences:
+def correspondences_at_peaks(
+    scores: Scores, twist: Array, camera: str, *, min_quality: float = MIN_QUALITY
+) -> Correspondences:
     """One correspondence per group that peaks near the consensus.
 
     The information of a pixel is the curvature of the group's score, of rank one where the group
     is an edge, times the mean score of its windows at the peak, their quality. The confidence is
-    twice the quality, so that the least that is kept is the least that a solve keeps by default.
+    twice the quality: of MIN_QUALITY, the least that a solve keeps by default.
     """
     if not len(scores.counts):  # nothing of the cloud is in view
         return _no_correspondences(camera)
     shift, hessian, peak = local_peaks(scores.grids, scores.flow @ twist)
     quality = np.maximum(peak / scores.counts, 0.0)  # 0: no peak
-    good = quality > MIN_QUALITY
+    good = quality > min_quality
     scale = scores.steps_per_px
     information = (hessian * np.outer(scale, scale)).reshape(-1, 4)[:, [0, 1, 3]]
     information *= quality[:, None]

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from calibgraph.augmented import camera_flow
 from calibgraph.rig import Camera
 from calibgraph.structure.level import Level
-from calibgraph.structure.windows import Cloud, build_windows, view_angles
+from calibgraph.structure.windows import WINDOW_POINTS, Cloud, build_windows, view_angles
 
 Array = NDArray[np.float64]
 Grids = NDArray[np.float32]
 
 GRAY_NOISE = 0.05  # logarithm of gray: below, a window counts as flat in the image
-GROUP_RAD = np.radians(3.8)  # cell of directions in which the shift is nearly one
 OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly one
 MIN_GROUP_WINDOWS = 4
+MISFIT = 0.1  # share of its variance that an image cannot share with a cloud, at its best
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +62,20 @@ def score_frame(
         most: most windows to use.
     """
     T = camera.T_camera_lidar
-    image, scale = _level_image(gray, camera, level)
+    image, scale = small_logarithm(gray, camera, level.step_rad, level.blur_steps)
     windows = build_windows(cloud, camera, level, most)
-    points = windows.points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    kept, group, groups = _groups(points[windows.members[:, 0]])
+    points_lidar_m = windows.rays_m.reshape(-1, 3) + cloud.viewpoint_m(camera)
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    kept, group, groups = _groups(points[::WINDOW_POINTS], level.group_rad)
     pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
-    places = np.rint(pixels).astype(np.int32)[windows.members[kept]]
+    places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    _score_windows(image, places, windows.counts[kept], windows.basis[kept], group, reach, grids)
+    used, basis, first = windows.counts[kept], windows.basis[kept], np.array([-reach, -reach])
+    score_windows(image, places, used, basis, group, first, level.strict, grids)
     grids -= grids.mean(axis=(1, 2), keepdims=True)
     counts = np.bincount(group, minlength=groups)
-    centres = _group_means(windows.points_lidar_m[windows.members[kept, 0]], group, counts)
+    centres = _group_means(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
     pixels_px, flow_px = camera_flow(camera, centres)
     return Scores(
         grids=grids,
@@ -93,24 +95,26 @@ def joined(scores: Sequence[Scores]) -> Scores:
     return Scores(**stacked, steps_per_px=scores[0].steps_per_px)
 
 
-def _level_image(
-    gray: NDArray[np.uint8], camera: Camera, level: Level
+def small_logarithm(
+    gray: NDArray[np.uint8], camera: Camera, step_rad: float, blur_steps: float
 ) -> tuple[NDArray[np.float32], Array]:
     """Logarithm of gray, down-scaled so that a pixel is a step; its (2,) scales of u and v.
 
     A pixel p of the image lies at (p + 0.5) scale - 0.5.
     """
-    factor = min(1.0, 1.0 / (camera.intrinsics_px.fx * level.step_rad))
+    factor = min(1.0, 1.0 / (camera.intrinsics_px.fx * step_rad))
     height, width = gray.shape
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
     logarithm = np.log1p(gray.astype(np.float32))
     small = cv2.resize(logarithm, size, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (0, 0), level.blur_steps)
+    small = cv2.GaussianBlur(small, (0, 0), blur_steps)
     scale = np.array([size[0] / width, size[1] / height])
     return np.ascontiguousarray(small, dtype=np.float32), scale
 
 
-def _groups(seeds_camera_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
+def _groups(
+    seeds_camera_m: Array, cell_rad: float
+) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
     """Group windows by direction and depth.
 
     Returns:
@@ -119,7 +123,7 @@ def _groups(seeds_camera_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32],
     distance = np.linalg.norm(seeds_camera_m, axis=1)
     cells = np.column_stack(
         [
-            np.floor(view_angles(seeds_camera_m) / GROUP_RAD),
+            np.floor(view_angles(seeds_camera_m) / cell_rad),
             np.floor(np.log2(distance) / OCTAVES_PER_BIN),
         ]
     )
@@ -136,26 +140,28 @@ def _group_means(points: Array, group: NDArray[np.int32], counts: NDArray[np.int
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _score_windows(image, places, counts, basis, group, reach, grids):  # type: ignore[no-untyped-def]
+def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
     """Add every window's score at all shifts to its group's grid.
 
-    image: (h, w); places: (n, l, 2) nearest pixels at shift 0; counts: (n,); basis: (n, l, 4);
-    group: (n,); grids: (g, 2 reach + 1, 2 reach + 1). The score is d_D^2 + d_I |d_I|: squared for
-    depth, which has no sign in an image, and signed for intensity; over the image's own variation.
-    Shifts at which a window leaves the image count 0.
+    image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
+    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s). The
+    score is d_D^2 + d_I |d_I|: squared for depth, which has no sign in an image, and signed for
+    intensity; over the image's own variation. It is a share r of explained variance, or
+    (likelihood) the -log(1 - r) of a Gaussian window. Shifts at which a window leaves the image
+    count 0.
     """
     height, width = image.shape
-    side = 2 * reach + 1
-    sums = np.empty((6, side), np.float32)  # depth, intensity, two of trend, total, power
+    rows, columns = grids.shape[1], grids.shape[2]
+    sums = np.empty((6, columns), np.float32)  # depth, intensity, two of trend, total, power
     for w in range(places.shape[0]):
         n = counts[w]
         left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
         top, bottom = places[w, :n, 1].min(), places[w, :n, 1].max()
-        first = max(-reach, -left)
-        size = min(reach, width - 1 - right) - first + 1
+        first = max(origin[0], -left)
+        size = min(origin[0] + columns, width - right) - first
         if size <= 0:
             continue
-        for shift in range(max(-reach, -top), min(reach, height - 1 - bottom) + 1):
+        for shift in range(max(origin[1], -top), min(origin[1] + rows, height - bottom)):
             sums[:, :size] = 0
             for p in range(n):
                 row = image[places[w, p, 1] + shift]
@@ -169,9 +175,13 @@ def _score_windows(image, places, counts, basis, group, reach, grids):  # type: 
                     sums[3, k] += d * value
                     sums[4, k] += value
                     sums[5, k] += value * value
-            grid = grids[group[w], shift + reach]
+            grid = grids[group[w], shift - origin[1]]
             for k in range(size):
                 power = sums[5, k] - sums[4, k] * sums[4, k] / n + n * np.float32(GRAY_NOISE**2)
                 power -= sums[2, k] * sums[2, k] + sums[3, k] * sums[3, k]
                 score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
-                grid[first + reach + k] += score / power
+                share = score / power
+                if likelihood:
+                    left_over = np.float32(1 + MISFIT) - abs(share)
+                    share = np.copysign(np.log(np.float32(1 + MISFIT) / left_over), share)
+                grid[first - origin[0] + k] += share

@@ -1,0 +1,243 @@
+"""The global search of the matcher `structure`: its parts, and the sample from far away."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Dataset, Rig, StructureMatcher
+from calibgraph.pipeline import match_in_rounds
+from calibgraph.structure.cross_entropy import maximize
+from calibgraph.structure.level import LEVELS
+from calibgraph.structure.responses import Responses
+from calibgraph.structure.search import Box, search_box
+from calibgraph.structure.windows import Cloud, cut_windows
+from tests.conftest import SAMPLE, Call, make_camera
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+def far_from(truth: Rig, seed: int, degrees: float = 20.0, metres: float = 1.5) -> Rig:
+    return calibgraph.perturb(
+        truth, rotation_deg=degrees, translation_m=metres, seed=seed, uniform=True
+    )
+
+
+def never() -> bool:
+    return False
+
+
+def silent(what: str, done: int, total: int) -> None:
+    pass
+
+
+class TestParts:
+    def test_cross_entropy_finds_a_tilted_maximum(self) -> None:
+        rng = np.random.default_rng(0)
+        A = rng.standard_normal((6, 6)) + 3 * np.eye(6)
+        top = rng.uniform(-0.5, 0.5, 6)
+        found, value = maximize(
+            lambda points: -(((points - top) @ A) ** 2).sum(axis=1),
+            start=np.zeros(6),
+            spread=np.ones(6),
+            limit=np.full(6, 2.0),
+            samples=200,
+            steps=30,
+            rng=rng,
+        )
+        np.testing.assert_allclose(found, top, atol=0.01)  # 30 steps, each about 0.8 as wide
+        assert value > -0.01
+
+    def test_a_displacement_leads_to_its_pose(self) -> None:
+        box = Box(make_camera((0.3, 0.1, -0.1)).T_camera_lidar, 0.3, 1.5)
+        displacements = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 6))
+        for displacement, T in zip(displacements, box.poses(displacements), strict=True):
+            np.testing.assert_allclose(box.displacement(T), displacement, atol=1e-12)
+        np.testing.assert_array_equal(box.excess(displacements), np.zeros(5))
+        assert box.excess(np.full((1, 6), 0.6)) == pytest.approx(3.0)  # three angles, twice as far
+
+    def test_the_search_finds_where_the_maps_agree(self) -> None:
+        """Groups whose maps have one peak each, where the true pose puts them, and false ones."""
+        rng = np.random.default_rng(1)
+        points = rng.uniform([5, -15, -2], [40, 15, 4], (600, 3))
+        true = make_camera((0.3, 0.1, -0.1)).T_camera_lidar
+        step, origin, shape = np.radians(0.6), np.radians([-41.0, -15.0]), (50, 137)
+        seen = points @ true[:3, :3].T + true[:3, 3]
+        right = np.arctan2(seen[:, 0], seen[:, 2])
+        down = np.arctan2(seen[:, 1], np.hypot(seen[:, 0], seen[:, 2]))
+        place = (np.column_stack([right, down]) - origin) / step
+        wrong = rng.random(600) < 0.5
+        place[wrong] = rng.uniform(0, shape[::-1], (np.count_nonzero(wrong), 2))
+        v, u = np.mgrid[: shape[0], : shape[1]]
+        squares = (u - place[:, 0, None, None]) ** 2 + (v - place[:, 1, None, None]) ** 2
+        maps = np.exp(-0.5 * squares / 2.0**2).astype(np.float32)
+        maps -= maps.mean(axis=(1, 2), keepdims=True)
+        responses = Responses(maps, points, origin, step)
+        guess = Box(true, np.radians(20), 1.5).poses(rng.uniform(-1, 1, (1, 6)) * 0.3)[0]
+        found = search_box(responses, Box(guess, np.radians(20), 1.5), proposals=[], seed=0)
+        off = Box(true, 1.0, 1.0).displacement(found[0])
+        assert np.abs(off[:3]).max() < np.radians(0.6)  # a step of the maps
+        assert np.abs(off[3:]).max() < 0.15  # a step at 15 m
+
+    def test_a_window_behind_a_silhouette_is_drawn_forward(self) -> None:
+        """A post at 5 m before a wall at 20 m: no window has members at both distances."""
+        angles = np.radians(np.arange(-6, 6, 0.2))
+        rays = np.array([[1.0, np.tan(a), np.tan(e)] for a, e in itertools.product(angles, angles)])
+        post = np.abs(rays[:, 1]) < np.tan(np.radians(1.0))
+        rays *= np.where(post, 5.0, 20.0)[:, None]
+        windows = cut_windows(
+            rays,
+            np.ones(len(rays)),
+            spacing_rad=np.radians(0.2),
+            stride_spacings=2.0,
+            most=10_000,
+            keep_linear=False,
+        )
+        at_edge = ~windows.front.all(axis=1)
+        assert np.count_nonzero(at_edge) > 20
+        assert windows.rays_m[at_edge][..., 0].max() < 5.2
+        np.testing.assert_allclose(  # along their own rays
+            windows.rays_m / np.linalg.norm(windows.rays_m, axis=2, keepdims=True),
+            (rays / np.linalg.norm(rays, axis=1, keepdims=True))[windows.members],
+        )
+
+    def test_a_cloud_knows_whether_it_was_seen_from_its_origin(self) -> None:
+        cloud = calibgraph.load_dataset(SAMPLE).frames[0].load_cloud()
+        assert Cloud.of(cloud).from_origin
+        cloud[:, 2] += 2.0  # as in a frame on the ground
+        moved, camera = Cloud.of(cloud), make_camera((1.0, 2.0, 3.0))
+        assert not moved.from_origin
+        np.testing.assert_allclose(moved.viewpoint_m(camera), [1.0, 2.0, 3.0], atol=1e-12)
+
+
+class TestSample:
+    def test_it_is_found_from_far_away(self, truth: Rig) -> None:
+        data = calibgraph.load_dataset(SAMPLE, far_from(truth, seed=1))
+        start = StructureMatcher().locate(data, data.rig, out_of_time=never, progress=silent)
+        assert all(check.status == "PASS" for (check,) in start.checks.values())
+        assert start.first_round == 2
+        for name, error in calibgraph.evaluate(start.rig, truth).cameras.items():
+            assert error.rotation_error_deg < 0.7, name  # what the next round reaches
+            assert error.translation_error_cm < 20, name
+
+    def test_the_same_seed_finds_the_same(self, truth: Rig) -> None:
+        data = calibgraph.load_dataset(SAMPLE, far_from(truth, seed=1)).select("0:2")
+        one, two = (
+            StructureMatcher().locate(data, data.rig, out_of_time=never, progress=silent)
+            for _ in range(2)
+        )
+        for name, T in one.rig.T_camera_lidar.items():
+            np.testing.assert_array_equal(T, two.rig.T_camera_lidar[name])
+
+    def test_a_known_relative_pose_helps_a_camera(self, truth: Rig) -> None:
+        """One camera has its true guess; the other's is beyond the range, its place in it known."""
+        names = ["front_left", "front_right"]
+        poses = {n: truth.cameras[n].T_camera_lidar for n in names}
+        pair = calibgraph.RelativePose(
+            a=names[1],
+            b=names[0],
+            T_a_b=poses[names[1]] @ np.linalg.inv(poses[names[0]]),
+            rotation_sigma_rad=0.001,
+            translation_sigma_m=0.002,
+        )
+        turned = np.eye(4)
+        turned[:3, :3] = cv2.Rodrigues(np.radians([0.0, 60.0, 0.0]))[0]
+        cameras = {n: truth.cameras[n] for n in names}
+        cameras[names[1]] = cameras[names[1]].moved_to(turned @ poses[names[1]])
+        rig = Rig(cameras=cameras, relative_poses=(pair,))
+        data = calibgraph.load_dataset(SAMPLE, rig).select("0:3")
+        start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
+        assert start.checks[names[1]][0].status == "PASS"
+        error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
+        assert error.rotation_error_deg < 0.7
+
+    def test_what_is_not_found_fails(self, truth: Rig, tmp_path: Path) -> None:
+        data = with_noise(calibgraph.load_dataset(SAMPLE, truth).select("0:2"), tmp_path)
+        start = StructureMatcher().locate(data, truth, out_of_time=never, progress=silent)
+        (check,) = start.checks["left"]
+        assert check.status == "FAIL" and "no pose within 20 deg and 1.5 m" in check.text
+        np.testing.assert_allclose(
+            start.rig.T_camera_lidar["left"], truth.T_camera_lidar["left"], atol=1e-12
+        )
+        assert start.first_round == 0
+
+    def test_no_time_makes_it_partial(self, truth: Rig) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        matcher = StructureMatcher(search_deg=None, search_m=None, levels=LEVELS[:3])
+        result = calibgraph.calibrate(data, matcher=matcher, time_limit_s=1e-3)
+        assert len(result.rounds) == 1
+        assert result.verdict.status in ("WARN", "FAIL")
+        assert any(
+            "partial: there was no time for 2 rounds of matching" in reason
+            for reason in result.verdict.reasons
+        )
+
+    def test_with_time_enough_nothing_is_said(self) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        matcher = StructureMatcher(search_deg=None, search_m=None, levels=LEVELS[:1])
+        matched = match_in_rounds(data, matcher=matcher, time_limit_s=600, progress=silent)
+        assert not matched.out_of_time and matched.missed_rounds == 0
+
+
+def with_noise(data: Dataset, folder: Path) -> Dataset:
+    """The dataset with images of one camera that show noise."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for frame in data.frames:
+        path = folder / f"{frame.name}.png"
+        cv2.imwrite(str(path), rng.integers(0, 255, (360, 640, 3), dtype=np.uint8))
+        frames.append(replace(frame, image_paths={**frame.image_paths, "left": path}))
+    return replace(data, frames=tuple(frames))
+
+
+class TestArguments:
+    @pytest.mark.parametrize(
+        ("ranges", "words"),
+        [
+            ({"search_deg": None}, "both ranges"),
+            ({"search_m": None}, "both ranges"),
+            ({"search_deg": 90.0}, "up to 45 deg"),
+            ({"search_m": -1.0}, "found 20 deg and -1 m"),
+            ({"search_m": float("nan")}, "found 20 deg and nan m"),
+        ],
+    )
+    def test_ranges_are_checked(self, ranges: dict[str, float | None], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            StructureMatcher(**ranges)  # type: ignore[arg-type]
+
+    def test_a_time_limit_is_positive(self) -> None:
+        with pytest.raises(ValueError, match="the time limit must be positive, found 0"):
+            calibgraph.calibrate(SAMPLE, time_limit_s=0)
+
+    @pytest.mark.parametrize(
+        ("arguments", "line"),
+        [
+            (("--search-deg", "far"), "--search-deg far: give a number, or none"),
+            (("--search-deg", "100"), "the search reaches up to 45 deg and 5 m per axis"),
+            (("--matcher", "m.csv", "--search-m", "1"), "--search-m is for --matcher structure"),
+            (("--time-limit-s", "-1"), "--time-limit-s"),
+        ],
+    )
+    def test_one_line_on_the_command_line(
+        self, call: Call, tmp_path: Path, arguments: tuple[str, ...], line: str
+    ) -> None:
+        code, _, err = call("calibrate", SAMPLE, "--out", tmp_path / "out", *arguments)
+        assert code == 2
+        assert line in err and len(err.strip().splitlines()) == 1
+
+    def test_none_is_no_search(self, call: Call, tmp_path: Path) -> None:
+        out = tmp_path / "matches.parquet"
+        arguments = ("--frames", "0", "--search-deg", "none", "--time-limit-s", "0.001")
+        code, _, err = call("match", SAMPLE, "--out", out, *arguments)
+        assert code == 0, err
+        metadata = calibgraph.load_correspondences(out).metadata
+        assert metadata["range_rotation_deg"] == pytest.approx(2.5)
