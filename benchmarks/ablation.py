@@ -1,0 +1,184 @@
+"""What each part of the matcher `structure` buys: the same runs, with one part taken out.
+
+    python benchmarks/ablation.py
+
+Rounds: from within 0.3 deg and 6 cm, errors against the reference. Search: cameras found from
+within 20 deg and 1.5 m (success: within 1.5 deg and 25 cm, what the rounds reach), and its time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import ledger
+import numpy as np
+from data_cases import Folders
+from scipy.stats import qmc
+
+from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
+from calibgraph.pipeline import match_in_rounds
+from calibgraph.structure import locate, matcher, scores, search, windows
+from calibgraph.structure.level import LEVELS
+from calibgraph.structure.responses import Responses
+
+REACHED_DEG, REACHED_CM = 1.5, 25.0
+Part = Callable[[], AbstractContextManager[Any]]
+
+
+def main() -> None:
+    """Run both tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
+    parser.add_argument("--rounds", type=words, default=["00", "05+06+07+08"], help="data")
+    parser.add_argument("--search", type=words, default=["05"], help="data")
+    parser.add_argument("--starts", type=int, default=4)
+    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
+    arguments = parser.parse_args()
+    folders = Folders(arguments.realdata, None)
+    for names, parts, measure in (
+        (arguments.rounds, ROUNDS, _rounds),
+        (arguments.search, SEARCH, _search),
+    ):
+        for data in map(folders.load, names):
+            for name, without in parts.items():
+                with without():
+                    print(f"{name:34} {measure(data, arguments.starts)}", flush=True)
+
+
+def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
+    """Errors after the last rounds."""
+    frames, truth = data
+    found, contrasts, begun = [], [], time.perf_counter()
+    for seed in range(starts):
+        guess = perturb(truth, rotation_deg=0.3, translation_m=0.06, seed=seed, uniform=True)
+        rounds = StructureMatcher(search_deg=None, search_m=None, levels=matcher.LEVELS[3:])
+        matched = match_in_rounds(frames, guess, rounds, progress=_silent)
+        contrasts += matched.table.metadata["contrast"].values()
+        found.append(evaluate(matched.fit.solved_rig, truth))
+    cameras = [_error(camera) for one in found for camera in one.cameras.values()]
+    pairs = [_error(pair) for one in found for pair in one.pairs.values()]
+    seconds = (time.perf_counter() - begun) / starts
+    return (
+        "{:.3f} deg {:.2f} cm, ".format(*np.mean(cameras, axis=0))
+        + "between {:.3f} deg {:.2f} cm, ".format(*np.mean(pairs, axis=0))
+        + f"contrast {np.mean(contrasts):.1f}, {seconds:.1f} s"
+    )
+
+
+def _search(data: tuple[Dataset, Rig], starts: int) -> str:
+    """Cameras found, and wrongly accepted."""
+    frames, truth = data
+    right, wrong, begun = 0, 0, time.perf_counter()
+    for seed in range(starts):
+        guess = perturb(truth, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
+        structure = StructureMatcher(seed=seed)
+        start = structure.locate(frames, guess, out_of_time=lambda: False, progress=_silent)
+        errors = evaluate(start.rig, truth).cameras
+        for name in start.metadata["found"]:
+            degrees, centimetres = _error(errors[name])
+            reached = degrees < REACHED_DEG and centimetres < REACHED_CM
+            right, wrong = right + reached, wrong + (not reached)
+    seconds = (time.perf_counter() - begun) / starts
+    of = starts * len(truth.cameras)
+    return f"{right} of {of} cameras found, {wrong} wrongly accepted, {seconds:.1f} s"
+
+
+def _error(error: Any) -> tuple[float, float]:
+    return error.rotation_error_deg, error.translation_error_cm
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    pass
+
+
+def _without_column(column: int) -> Part:
+    """Windows without inverse range (0) or intensity (1)."""
+    basis = windows._basis
+
+    def flat(*arguments: Any) -> Any:
+        values, texture = basis(*arguments)
+        values[..., column] = 0.0
+        return values, texture
+
+    return lambda: patch.object(windows, "_basis", flat)
+
+
+def _changed(module: Any, name: str, **fixed: Any) -> Part:
+    """A function with some of its arguments fixed."""
+    function = getattr(module, name)
+    return lambda: patch.object(module, name, lambda *a, **k: function(*a, **{**k, **fixed}))
+
+
+def _shares(*arguments: Any) -> None:
+    _SCORE_WINDOWS(*arguments[:6], False, arguments[7])
+
+
+_SCORE_WINDOWS = scores.score_windows
+
+
+def _not_forward(ranges: Any) -> tuple[Any, Any]:
+    return np.ones(ranges.shape, np.bool_), ranges
+
+
+def _levels(levels: Sequence[Any]) -> Part:
+    return lambda: patch.object(matcher, "LEVELS", (*LEVELS[:3], *levels))
+
+
+ROUNDS: Mapping[str, Part] = {
+    "all of it": nullcontext,
+    "no intensity": _without_column(1),
+    "no inverse range": _without_column(0),
+    "silhouettes not drawn forward": lambda: patch.object(windows, "_drawn_forward", _not_forward),
+    "windows with hidden points": lambda: patch.object(
+        windows, "unoccluded", lambda angles, *_: np.ones(len(angles), np.bool_)
+    ),
+    "linear parts taken out": _changed(windows, "cut_windows", keep_linear=False),
+    "shares, not likelihoods": lambda: patch.object(scores, "score_windows", _shares),
+    "without round 4": _levels(LEVELS[4:]),
+    "without round 6": _levels(LEVELS[3:5]),
+    "without rounds 5 and 6": _levels(LEVELS[3:4]),
+}
+
+
+def _no_proposals(*_: Any) -> Iterator[Any]:
+    return iter(())
+
+
+def _not_turned(coarse: Responses, box: search.Box, rng: np.random.Generator) -> list[Any]:
+    """Samples of the box, best first, as they are."""
+    unit = qmc.Sobol(6, seed=rng).random(search.SAMPLES)
+    displacements = (2 * unit - 1) * box.half_widths
+    return list(displacements[np.argsort(-coarse.contrasts(box.poses(displacements)))])
+
+
+def _plain_sums() -> AbstractContextManager[Any]:
+    """Sums of scores over the spread of all groups, not of those that are seen."""
+    return patch.multiple(
+        Responses,
+        variances=property(lambda self: np.zeros(len(self.maps))),
+        _least_variance=property(lambda self: float(self.maps.var(axis=(1, 2)).sum())),
+    )
+
+
+SEARCH: Mapping[str, Part] = {
+    "all of it": nullcontext,
+    "cameras do not help each other": lambda: patch.object(locate, "_proposals", _no_proposals),
+    "samples not turned": lambda: patch.object(search, "_turned", _not_turned),
+    "all groups' spread": _plain_sums,
+    "one search per camera": lambda: patch.object(locate, "SEARCHES", 1),
+    "settling once": lambda: patch.object(locate, "PROMISING", np.inf),
+    "no intensity": _without_column(1),
+    "no inverse range": _without_column(0),
+}
+
+
+if __name__ == "__main__":
+    main()
