@@ -190,13 +190,20 @@ def match(
             data, matcher=chosen, time_limit_s=time_limit_s, progress=progress
         ).table
     table.save(out)
+    missed = list(table.metadata.get("missed", ()))
     if as_json:
         from calibgraph.json_output import print_json
 
-        print_json({"out": str(out), "matches": table.counts()})
+        print_json({"out": str(out), "matches": table.counts(), "missed": missed})
     else:
         counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
         terminal().print(f"{out}: {len(table)} correspondences ({counts})")
+    if missed:
+        terminal().print(
+            f"not found: {', '.join(missed)}: what is matched from the guess will FAIL when solved",
+            soft_wrap=True,
+        )
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -94,7 +94,7 @@ def range_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> li
     return [
         above(
             f"largest {key.split('_')[1]} from the guess, by the matcher's range",
-            float(np.abs(moved[key]).max() / metadata[key]),
+            float(np.abs(moved[key]).max() / max(metadata[key], 1e-9)),
             RANGE_USED_WARN, RANGE_USED_FAIL, "times", advice,
         )
         for key in moved

@@ -69,7 +69,7 @@ class Correspondences:
             raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
         if not isinstance(self.metadata, dict):
             raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
-        _ = self.systematic_sigmas
+        _ = self.systematic_sigmas, self.matcher_range
         self._check_values()
 
     @staticmethod
@@ -143,13 +143,31 @@ class Correspondences:
             CorrespondenceError: if what it says is not a number from 0 to pi, and to 100.
         """
         limits = {"systematic_rotation_rad": math.pi, "systematic_translation_m": 100.0}
-        rotation, translation = (_as_float(self.metadata.get(key, 0.0)) for key in limits)
-        for (key, most), value in zip(limits.items(), (rotation, translation), strict=True):
-            if not isinstance(value, float) or not 0 <= value <= most:
-                raise CorrespondenceError(
-                    f"metadata {key!r} must be a number from 0 to {most:.3g}, found {value!r}"
-                )
+        rotation, translation = (self._said(key, 0.0, most) for key, most in limits.items())
         return rotation, translation
+
+    @property
+    def matcher_range(self) -> tuple[float, float]:
+        """How far from its guess the matcher looked, per axis of a camera: [deg], [m].
+
+        From the metadata's keys ``range_rotation_deg`` and ``range_translation_m``; infinite where
+        it says nothing.
+
+        Raises:
+            CorrespondenceError: if what it says is not a number.
+        """
+        limits = {"range_rotation_deg": 180.0, "range_translation_m": 100.0}
+        degrees, metres = (self._said(key, math.inf, most) for key, most in limits.items())
+        return degrees, metres
+
+    def _said(self, key: str, default: float, most: float) -> float:
+        """A number of the metadata."""
+        value = _as_float(self.metadata.get(key, default))
+        if key in self.metadata and not (isinstance(value, float) and 0 <= value <= most):
+            raise CorrespondenceError(
+                f"metadata {key!r} must be a number from 0 to {most:.3g}, found {value!r}"
+            )
+        return float(value)
 
     def counts(self) -> dict[str, int]:
         """Rows per camera."""

@@ -37,13 +37,11 @@ class Start:
     Attributes:
         rig: with the poses to begin from.
         first_round: with which round.
-        checks: per camera, what is to be said of its start.
         metadata: what the tables of the rounds say besides.
     """
 
     rig: Rig
     first_round: int = 0
-    checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -54,7 +52,9 @@ class Matcher(Protocol):
     ``contrast``: by how many chance spreads the matches' agreement stands out;
     ``start_dependence``: which share of a displaced start remains in the matches (0 to 1);
     ``recall``: which share of the way back it finds without the image (0 to 1);
-    ``failed_share``: which share of the frames it left out (0 to 1).
+    ``failed_share``: which share of the frames it left out (0 to 1);
+    ``found``, ``missed``: by how many chance spreads image and cloud agree where its search found
+    a camera, or at best where it did not: such a camera fails.
     Two plain numbers say how far from the guess it looks, per axis: ``range_rotation_deg`` and
     ``range_translation_m``; two more what error its frames share, see ``Correspondences``.
 
@@ -200,7 +200,6 @@ def match_in_rounds(
         found,
         tuple(rounds),
         clock,
-        start_checks=start.checks,
         missed_rounds=chosen.rounds - 1 - index,
         out_of_time=out_of_time(),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,7 +54,6 @@ class Matched:
         fit: the solution from them.
         rounds: per round and camera, how many matches, and how far they moved it.
         clock: what took how long.
-        start_checks: per camera, what the matcher says of where the first round began.
         missed_rounds: how many rounds there was no time for.
         out_of_time: whether the time limit has passed.
     """
@@ -66,7 +65,6 @@ class Matched:
     fit: Fit
     rounds: tuple[dict[str, Any], ...]
     clock: Clock
-    start_checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
     missed_rounds: int = 0
     out_of_time: bool = False
 
@@ -86,7 +84,6 @@ def second_look(
     again, seen = _asked_again(matched, progress)
     return {
         name: [
-            *matched.start_checks.get(name, ()),
             *last_round_checks(matched.rounds, name),
             *range_checks(guess[name], T, matched.table.metadata),
             *repeated,

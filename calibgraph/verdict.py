@@ -159,6 +159,8 @@ class Matching:
         start_dependence: share of a displaced start that remains in the matches, if it says.
         recall: share of the way back that it finds without the image, if it says.
         failed_share: of the frames.
+        found: the agreement at the pose where its search found the camera, if it searched.
+        missed: the best agreement that its search met, if it did not find the camera.
         systematic_sigmas: what the matcher says of the error that its frames share, per axis:
             rotation [rad], translation [m].
     """
@@ -167,6 +169,8 @@ class Matching:
     start_dependence: float | None = None
     recall: float | None = None
     failed_share: float = 0.0
+    found: float | None = None
+    missed: float | None = None
     systematic_sigmas: tuple[float, float] = (0.0, 0.0)
 
 
@@ -177,7 +181,7 @@ def said_by_matcher(metadata: Mapping[str, Any], camera: str) -> Matching:
         CorrespondenceError: if it is no number.
     """
     said: dict[str, Any] = {}
-    for key in ("contrast", "start_dependence", "recall", "failed_share"):
+    for key in ("contrast", "start_dependence", "recall", "failed_share", "found", "missed"):
         of_cameras = metadata.get(key) or {}
         value = of_cameras.get(camera, 0.0) if isinstance(of_cameras, dict) else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -193,6 +197,7 @@ def said_by_matcher(metadata: Mapping[str, Any], camera: str) -> Matching:
 def with_matching(verdict: Verdict, matching: Matching) -> Verdict:
     """A camera's verdict, given that of the last solve, with what its matcher knows."""
     checks = [
+        *_search_checks(matching),
         *_shares_checks(matching),
         *_sigma_checks("the matcher's own error", np.repeat(matching.systematic_sigmas, 3)),
     ]
@@ -207,6 +212,22 @@ def with_matching(verdict: Verdict, matching: Matching) -> Verdict:
                   "chance spreads", advice)
         )  # fmt: skip
     return verdict.and_also(checks)
+
+
+def _search_checks(matching: Matching) -> list[Check]:
+    """Whether a matcher's search found the camera, if it searched."""
+    name, words = "search", "contrast {:.1f} of image and cloud"
+    if matching.missed is not None:
+        text = (
+            f"no pose within the matcher's range explains the images (best {words}): check the "
+            "guess, the intrinsics and the pairing, widen --search-deg and --search-m, or give "
+            "more frames from more places"
+        )
+        return [Check(name, "FAIL", text.format(matching.missed), matching.missed)]
+    if matching.found is not None:
+        text = f"{words} where the rounds began"
+        return [Check(name, "PASS", text.format(matching.found), matching.found)]
+    return []
 
 
 def _shares_checks(matching: Matching) -> list[Check]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,8 @@ def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
             "must be a number from 0 to 3.14, found inf",
         ),
         ({"metadata": {"systematic_rotation_rad": -(10**400)}}, "found -inf"),
+        ({"metadata": {"range_rotation_deg": "20"}}, "'range_rotation_deg' must be a number from"),
+        ({"metadata": {"range_translation_m": math.nan}}, "from 0 to 100, found nan"),
         ({"metadata": {"systematic_translation_m": np.nan}}, "found nan"),
         ({"metadata": {"systematic_translation_m": "1"}}, "found '1'"),
         ({"points_lidar_m": [[1, 2]] * 4}, r"shape \(4, 2\), expected \(4, 3\)"),

@@ -32,7 +32,7 @@ def start_and_reference(folders: list[Path], seed: int) -> tuple[Rig, Rig]:
 
 @pytest.mark.parametrize("names", ["00", "05", "06+07+08"])
 def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) -> None:
-    seeds = range(10) if names in ("00", "05") else range(3)
+    seeds = range(3)  # benchmarks/search.py has more
     good = 0
     for seed in seeds:
         folders = sequences(realdata, names)
@@ -40,7 +40,7 @@ def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) ->
         matched = match_in_rounds(folders, start, progress=lambda *_: None)
         errors = calibgraph.evaluate(matched.fit.solved_rig, reference).cameras.values()
         good += all(e.rotation_error_deg < 0.3 and e.translation_error_cm < 8 for e in errors)
-    assert good >= 0.9 * len(seeds)
+    assert good == len(seeds)
 
 
 @pytest.mark.parametrize("names", ["01", "08"])
@@ -48,7 +48,8 @@ def test_poor_scenes_are_not_passed(realdata: Path, names: str) -> None:
     """A motorway with 3 frames, and one place with 4: results that are off do not say PASS."""
     for seed in range(3):
         start, reference = start_and_reference(sequences(realdata, names), seed)
-        result = calibgraph.calibrate(sequences(realdata, names), start)
+        matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)  # quick
+        result = calibgraph.calibrate(sequences(realdata, names), start, matcher)
         errors = calibgraph.evaluate(result.rig, reference).cameras
         for name, error in errors.items():
             if error.rotation_error_deg > 0.3 or error.translation_error_cm > 8:

@@ -167,7 +167,7 @@ def test_the_sample_is_calibrated(result: Calibration, truth: Rig) -> None:
         assert error.rotation_error_deg < 0.12, name  # 1 px is 0.12 deg
         assert error.translation_error_cm < 3, name
     assert result.verdict.status == "PASS", result.verdict.reasons
-    assert len(result.rounds) == len(LEVELS) - 2  # the search has done the first
+    assert len(result.rounds) == len(LEVELS) - 3  # the search has done the first
     assert result.correspondences is not None
 
 

@@ -12,7 +12,7 @@ from calibgraph.structure.scores import Scores
 
 Array = NDArray[np.float64]
 
-SAMPLES, STEPS, STARTS = 400, 14, 3  # of the search; the best of the starts wins
+SAMPLES, STEPS = 400, 14  # of a search
 PRIOR = 6.0  # penalty, in chance spreads of the score, of a twist sqrt(2 / 6) of the box from 0
 
 
@@ -32,25 +32,27 @@ def find_consensus(scores: Scores, level: Level, *, seed: int) -> tuple[Array, f
     Returns:
         (6,) twist (rotation [rad], translation [m]); its summed score in chance spreads.
     """
-    twist = search(scores, np.repeat([level.rotation_rad, level.translation_m], 3), seed=seed)
+    box = np.repeat([level.rotation_rad, level.translation_m], 3)
+    twist = search(scores, box, seed=seed, times=level.searches)
     contrast = float(summed_score(scores, twist[None])[0]) / (chance_spread(scores) + 1e-12)
     return twist, contrast
 
 
-def search(scores: Scores, box: Array, *, seed: int, prior: float = PRIOR) -> Array:
+def search(scores: Scores, box: Array, *, seed: int, times: int = 3, prior: float = PRIOR) -> Array:
     """Maximise the summed score over as many unknowns as the flow has columns.
 
     Args:
         scores: the groups of one camera; its flow may have more columns than the six of a twist.
         box: (k,) half-width of the search, per column.
         seed: of the search's samples.
+        times: how often to search; the best counts.
         prior: see ``PRIOR``.
 
     Returns:
         (k,) the best unknowns.
     """
     rng = np.random.default_rng(seed)
-    found = [_search_once(scores, box, prior, rng) for _ in range(STARTS)]
+    found = [_search_once(scores, box, prior, rng) for _ in range(times)]
     return max(found, key=lambda pair: pair[1])[0]
 
 

@@ -25,6 +25,8 @@ class Level:
         group_rad: cell of directions in which the shift is nearly one.
         max_windows: per camera, over all frames: bounds the time. More of them average more of the
             image; what one place shows cannot be averaged out.
+        searches: how often the pose is searched; the best counts. Once is enough where one
+            maximum is in reach.
         min_quality: least mean score of a group's windows at its peak, above the grid's mean.
     """
 
@@ -38,6 +40,7 @@ class Level:
     blur_steps: float = 1.0
     group_rad: float = np.radians(3.8)
     max_windows: int = 20_000
+    searches: int = 3
     min_quality: float = 0.05
 
 
@@ -56,12 +59,13 @@ def _level(
         translation_m=translation_m,
         spacing_rad=np.radians(spacing_deg),
         strict=strict,
+        searches=1 if strict else 3,
     )
 
 
 def _final(level: Level) -> Level:
     """More windows, in smaller groups, of which only clear ones count."""
-    return replace(level, group_rad=np.radians(2.0), max_windows=60_000, min_quality=0.1)
+    return replace(level, group_rad=np.radians(2.0), max_windows=30_000, min_quality=0.1)
 
 
 LEVELS = (

@@ -2,13 +2,14 @@
 
 A pose is accepted when image and cloud agree at it far better than by chance. Each camera is tried
 at the guess first, then wherever the cameras found so far put it, then all over the range, as often
-as is useful. What is not accepted is not found: the best of the bad is never good enough.
+as is useful; what one finds helps the others at once. What is not accepted is not found: the best
+of the bad is never good enough.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,6 +21,7 @@ from calibgraph.augmented import moved_by
 from calibgraph.rig import Camera, Rig, angle_deg
 from calibgraph.structure.consensus import find_consensus
 from calibgraph.structure.level import LEVELS
+from calibgraph.structure.overlap import overlap_pose
 from calibgraph.structure.responses import respond
 from calibgraph.structure.scores import joined, score_frame
 from calibgraph.structure.search import Box, search_box
@@ -32,13 +34,14 @@ ACCEPTED = 16.0
 """Least contrast after the last of the levels. On recorded scenes within 20 deg and 1.5 m of the
 guess, wrong poses had up to 15, right ones mostly from 17 on."""
 
-ACCEPTED_NEAR, CLEARER = 8.0, 1.3
-"""Least contrast near the guess, if the search finds only the same, or nothing near it in
-contrast."""
+ACCEPTED_NEAR = ((11.0, 1.0), (8.0, 1.3))
+"""Contrasts near the guess, and by how often they must be as high as all that a search finds: that
+it is the guess, of all places tried, which wrongly agrees best is unlikely."""
 
 SAME_DEG, SAME_M = 0.5, 0.15
 
 HOPELESS = 7.5  # of any level: no right pose had less than 11 after the first
+PROMISING, GAIN = 11.0, 1.05  # contrast from which to go on, and by how much it must grow
 SETTLING = (
     (replace(LEVELS[0], translation_m=0.5), 6_000),
     (replace(LEVELS[1], translation_m=0.5), 20_000),
@@ -47,8 +50,13 @@ SETTLING = (
 """Levels, and how many windows they take, per camera over all frames. They look farther than the
 rounds: a search is good to about a degree and some decimetres."""
 
-SEARCH_WINDOWS = 300  # per frame
-SEARCHES = 3
+LENGTH_STEP_M = 0.5  # of unknown translations: settling reaches half of it
+OUTSIDE = 0.2  # of a range's half-width: how far outside of it a proposal may be
+
+SEARCH_WINDOWS = 2100  # of the first search, per camera over all frames
+SEARCHES = 2  # per camera
+WIDER = 3  # times the windows and candidates of the search that follows one which found nothing
+SIDE_BY_SIDE = 4  # cameras; then those that were found propose for the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,24 +117,46 @@ def locate(
         progress: to be told how far it is.
     """
     names = list(rig.cameras)
-    progress("trying the guess", 0, SEARCHES + 1)
+    progress("trying the guess", 0, SEARCHES * len(names))
     tried = pool.map(lambda name: settle(views[name], rig.cameras[name]), names)
     near = dict(zip(names, tried, strict=True))
     far: dict[str, Found] = {}
-    for attempt in range(SEARCHES):
-        accepted = {n: f for found in (near, far) for n, f in found.items() if f.accepted}
-        missing = [name for name in names if name not in accepted]
+    asked: set[str] = set()  # the accepted cameras that the others were proposed from
+    searches = dict.fromkeys(names, 0)
+    while True:
+        best = {n: _judged(near[n], far.get(n), searched=searches[n] > 0) for n in names}
+        missing = [name for name in names if not best[name].accepted]
+        news = {n: f for n, f in best.items() if f.accepted and n not in asked}
+        if news:
+            asked |= news.keys()
+            work = partial(_propose, rig, views, news, within, seed)
+        else:
+            missing = [name for name in missing if searches[name] < SEARCHES]
+            missing = sorted(missing, key=searches.__getitem__)[:SIDE_BY_SIDE]
+            searches |= {name: searches[name] + 1 for name in missing}
+            work = partial(_search, rig, views, within, dict(searches), seed)
+            done = sum(searches.values()) - len(missing)
+            what = f"searching: {', '.join(missing)}"
+            progress(what, done, SEARCHES * len(names))
         if not missing or out_of_time():
-            break
-        progress(f"searching: {', '.join(missing)}", attempt + 1, SEARCHES + 1)
-        one = partial(_search, rig, views, accepted, within, seed=seed + 1000 * attempt)
-        for name, found in zip(missing, pool.map(one, missing), strict=True):
+            return best
+        for name, found in zip(missing, pool.map(work, missing), strict=True):
             far[name] = max(found, far.get(name, found), key=lambda f: f.contrast)
-    return {name: _judged(near[name], far.get(name)) for name in names}
 
 
 def settle(view: View, camera: Camera) -> Found:
-    """Follow the agreement of a view from a camera's pose, until it stands still or is hopeless."""
+    """Follow the agreement of a view from a camera's pose, until accepted or no better."""
+    found = _descend(view, camera)
+    while PROMISING <= found.contrast < ACCEPTED:
+        again = _descend(view, found.camera)
+        if again.contrast < GAIN * found.contrast:
+            break
+        found = again
+    return found
+
+
+def _descend(view: View, camera: Camera) -> Found:
+    """Go through the levels once, or until it is hopeless."""
     contrast = 0.0
     for level, windows in SETTLING:
         one = [
@@ -143,42 +173,69 @@ def settle(view: View, camera: Camera) -> Found:
 def _search(
     rig: Rig,
     views: Mapping[str, View],
+    within: Range,
+    searches: Mapping[str, int],
+    seed: int,
+    name: str,
+) -> Found:
+    """Search all of the range for a camera, the second time with more effort."""
+    camera, view = rig.cameras[name], views[name]
+    effort = 1 if searches[name] == 1 else WIDER
+    seed += 1000 * (searches[name] - 1)
+    responses = respond(
+        view.grays,
+        view.clouds,
+        camera,
+        range_rad=within.rotation_rad,
+        most=effort * SEARCH_WINDOWS // len(view.grays),
+        seed=seed,
+    )
+    if not len(responses.maps):
+        return Found(camera, -math.inf, False)
+    found = search_box(responses, _box(camera, within), effort=effort, seed=seed)
+    return _best(view, camera, found)
+
+
+def _propose(
+    rig: Rig,
+    views: Mapping[str, View],
     accepted: Mapping[str, Found],
     within: Range,
-    name: str,
-    *,
     seed: int,
+    name: str,
 ) -> Found:
-    """The first accepted one of what is proposed, or found by a search, else the best."""
-    camera, view = rig.cameras[name], views[name]
+    """Try a camera where accepted cameras put it."""
+    proposals = _proposals(rig, views, accepted, within, seed, name)
+    return _best(views[name], rig.cameras[name], proposals)
+
+
+def _best(view: View, camera: Camera, poses: Iterable[Array]) -> Found:
+    """The first that is accepted of what some poses settle to, else the best."""
     best = Found(camera, -math.inf, False)
-    for T in _candidates(view, camera, within, list(_proposals(rig, name, accepted)), seed):
+    for T in poses:
         best = max(best, settle(view, camera.moved_to(T)), key=lambda f: f.contrast)
         if best.accepted:
             break
     return best
 
 
-def _candidates(
-    view: View, camera: Camera, within: Range, proposals: Sequence[Array], seed: int
+def _box(camera: Camera, within: Range) -> Box:
+    return Box(camera.T_camera_lidar, within.rotation_rad, within.translation_m)
+
+
+def _proposals(
+    rig: Rig,
+    views: Mapping[str, View],
+    accepted: Mapping[str, Found],
+    within: Range,
+    seed: int,
+    name: str,
 ) -> Iterator[Array]:
-    """What is proposed, and only then what a search finds."""
-    yield from proposals
-    box = Box(camera.T_camera_lidar, within.rotation_rad, within.translation_m)
-    responses = respond(
-        view.grays,
-        view.clouds,
-        camera,
-        range_rad=within.rotation_rad,
-        most=SEARCH_WINDOWS,
-        seed=seed,
-    )
-    if len(responses.maps):
-        yield from search_box(responses, box, proposals=proposals, seed=seed)
+    """Where the accepted cameras put another.
 
-
-def _proposals(rig: Rig, name: str, accepted: Mapping[str, Found]) -> Iterator[Array]:
-    """Where the accepted cameras put another: by known relative poses, then by the guess's."""
+    By known relative poses, by what both see, and by the guess's relative poses.
+    """
+    camera = rig.cameras[name]
     poses = {other: f.camera.T_camera_lidar for other, f in accepted.items()}
     for pair in rig.relative_poses:
         if pair.a == name and pair.b in poses:
@@ -186,18 +243,36 @@ def _proposals(rig: Rig, name: str, accepted: Mapping[str, Found]) -> Iterator[A
         elif pair.b == name and pair.a in poses:
             yield np.linalg.inv(pair.T_a_b) @ poses[pair.a]
     for other, T in poses.items():
-        guess = rig.cameras[name].T_camera_lidar
-        yield guess @ np.linalg.inv(rig.cameras[other].T_camera_lidar) @ T
+        grays = views[other].grays, views[name].grays
+        T_this_other = overlap_pose(rig.cameras[other], camera, *grays, seed=seed)
+        if T_this_other is not None:
+            yield from _at_lengths(T_this_other, T, _box(camera, within))
+    for other, T in poses.items():
+        yield camera.T_camera_lidar @ np.linalg.inv(rig.cameras[other].T_camera_lidar) @ T
 
 
-def _judged(near: Found, far: Found | None) -> Found:
-    """The accepted one; what is near the guess also if nothing else comes near its contrast."""
+def _at_lengths(T_b_a: Array, T_a_lidar: Array, box: Box) -> Iterator[Array]:
+    """Camera b in a box, by the pose of a and by T_b_a with a translation of unknown length."""
+    apart = np.linalg.norm((T_a_lidar @ np.linalg.inv(box.guess))[:3, 3])
+    farthest = apart + np.sqrt(3) * box.translation_m
+    for length in np.arange(LENGTH_STEP_M / 2, farthest + LENGTH_STEP_M, LENGTH_STEP_M):
+        T = T_b_a.copy()
+        T[:3, 3] *= length
+        T = T @ T_a_lidar
+        if box.excess(box.displacement(T)[None])[0] < OUTSIDE:
+            yield T
+
+
+def _judged(near: Found, far: Found | None, *, searched: bool) -> Found:
+    """The accepted one; what is near the guess also if a search finds nothing like its contrast."""
     if far is None or near.accepted:
         return near
     if far.accepted:
         return far
-    alone = near.contrast >= CLEARER * far.contrast or _same(near, far)
-    if near.contrast >= ACCEPTED_NEAR and alone:
+    least = [c for c, times in ACCEPTED_NEAR if near.contrast >= times * far.contrast]
+    if _same(near, far):
+        least = [c for c, _ in ACCEPTED_NEAR]
+    if searched and near.contrast >= min(least, default=math.inf):
         return replace(near, accepted=True)
     return max(near, far, key=lambda found: found.contrast)
 

@@ -63,23 +63,21 @@ class Box:
         return np.asarray(np.maximum(np.abs(displacements) / self.half_widths - 1, 0).sum(axis=1))
 
 
-def search_box(
-    responses: Responses, box: Box, *, proposals: Sequence[Array], seed: int
-) -> list[Array]:
+def search_box(responses: Responses, box: Box, *, effort: int = 1, seed: int) -> list[Array]:
     """The best poses in a box, T_camera_lidar (4, 4), best first, none near to another.
 
     Args:
         responses: of one camera.
         box: where to search.
-        proposals: (4, 4) each, poses to try besides.
+        effort: how many times as many of the best go on from each stage.
         seed: of the search.
     """
     coarse = responses.blurred(COARSE_BLUR_STEPS, COARSE_EVERY)
     rng = np.random.default_rng(seed)
-    seeds = [box.displacement(T) for T in proposals] + _apart(_turned(coarse, box, rng), SEEDS)
-    rough = _climbed(coarse, box, seeds, COARSE_SPREAD, rng)[:SHARPENED]
+    seeds = _apart(_turned(coarse, box, rng), effort * SEEDS)
+    rough = _climbed(coarse, box, seeds, COARSE_SPREAD, rng)[: effort * SHARPENED]
     fine = responses.blurred(FINE_BLUR_STEPS)
-    sharp = _apart(_climbed(fine, box, rough, FINE_SPREAD, rng), CANDIDATES)
+    sharp = _apart(_climbed(fine, box, rough, FINE_SPREAD, rng), effort * CANDIDATES)
     return list(box.poses(np.array(sharp)))
 
 
