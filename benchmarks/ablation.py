@@ -170,7 +170,9 @@ def _plain_sums() -> AbstractContextManager[Any]:
 
 SEARCH: Mapping[str, Part] = {
     "all of it": nullcontext,
-    "cameras do not help each other": lambda: patch.object(locate, "_proposals", _no_proposals),
+    "cameras do not help each other": lambda: patch.object(
+        locate._Seeker, "_proposals", _no_proposals
+    ),
     "samples not turned": lambda: patch.object(search, "_turned", _not_turned),
     "all groups' spread": _plain_sums,
     "one search per camera": lambda: patch.object(locate, "SEARCHES", 1),

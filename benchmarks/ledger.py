@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import time
@@ -45,6 +46,15 @@ def read(path: Path) -> list[Record]:
 def key_of(record: Record) -> Key:
     """Which case a line is of."""
     return Key(*(record[name] for name in Key.__dataclass_fields__))
+
+
+def records_of(
+    arguments: argparse.Namespace, cases: Iterable[Key], work: Callable[[Key], Record]
+) -> list[Record]:
+    """The cases of the file ``--summary`` if it is given, else of a :func:`run`."""
+    if arguments.summary is not None:
+        return read(arguments.summary)
+    return run(cases, work, out=arguments.out, jobs=arguments.jobs)
 
 
 def run(

@@ -33,18 +33,15 @@ BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
 def main() -> None:
     """Run cases, print the table."""
     arguments = parsed()
-    if arguments.summary is not None:
-        records = ledger.read(arguments.summary)
-    else:
-        cases = [
-            Key(within, kind, data, seed)
-            for seed in range(arguments.first, arguments.first + arguments.starts)
-            for within in arguments.within
-            for kind in arguments.kinds
-            for data in arguments.data
-        ]
-        work = partial(run_case, folders=Folders(arguments.realdata, None))
-        records = ledger.run(cases, work, out=arguments.out, jobs=arguments.jobs)
+    cases = [
+        Key(within, kind, data, seed)
+        for seed in range(arguments.first, arguments.first + arguments.starts)
+        for within in arguments.within
+        for kind in arguments.kinds
+        for data in arguments.data
+    ]
+    work = partial(run_case, folders=Folders(arguments.realdata, None))
+    records = ledger.records_of(arguments, cases, work)
     print(report(records))
 
 

@@ -46,16 +46,13 @@ class Component:
 def main() -> None:
     """Run cases, print the tables, draw the picture."""
     arguments = parsed()
-    if arguments.summary is not None:
-        records = ledger.read(arguments.summary)
-    else:
-        cases = [
-            Key("data", "sigma", name, seed)
-            for seed in range(arguments.first, arguments.first + arguments.starts)
-            for name in arguments.sequences
-        ]
-        work = partial(run_case, folders=Folders(arguments.realdata, None))
-        records = ledger.run(cases, work, out=arguments.out, jobs=arguments.jobs)
+    cases = [
+        Key("data", "sigma", name, seed)
+        for seed in range(arguments.first, arguments.first + arguments.starts)
+        for name in arguments.sequences
+    ]
+    work = partial(run_case, folders=Folders(arguments.realdata, None))
+    records = ledger.records_of(arguments, cases, work)
     print(report(records))
     if arguments.picture is not None:
         draw(list(components_of(records)), arguments.picture)

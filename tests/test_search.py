@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Dataset, Rig, StructureMatcher
+from calibgraph import Camera, Dataset, Rig, StructureMatcher
 from calibgraph.pipeline import match_in_rounds
 from calibgraph.structure import locate
 from calibgraph.structure.cross_entropy import maximize
@@ -222,6 +222,25 @@ class TestSample:
         code, _, err = call("solve", rig, table, "--out", tmp_path / "out")
         assert code == 1
         assert "no pose within the matcher's range explains the images" in err
+
+    def test_no_pose_is_tried_when_time_is_over(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        settled: list[Camera] = []
+
+        def settle(view: locate.View, camera: Camera) -> locate.Found:
+            settled.append(camera)
+            return locate.Found(camera, 0.0, False)
+
+        monkeypatch.setattr(locate, "settle", settle)
+        monkeypatch.setattr(locate, "search_box", lambda *_, **__: [np.eye(4)] * 50)
+        rig = Rig(cameras={"left": truth.cameras["left"]})
+        data = calibgraph.load_dataset(SAMPLE, rig).select("0")
+        start = StructureMatcher().locate(
+            data, rig, out_of_time=lambda: len(settled) > 3, progress=silent
+        )
+        assert len(settled) == 4  # the guess, and three poses
+        assert "left" in start.metadata["missed"]
 
     def test_no_time_makes_it_partial(self, truth: Rig) -> None:
         data = calibgraph.load_dataset(SAMPLE).select("0:2")

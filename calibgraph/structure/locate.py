@@ -112,11 +112,12 @@ def locate(
         views: by the names of the cameras.
         within: where to search what is not near the guess.
         seed: of the search.
-        out_of_time: asked before each search.
+        out_of_time: asked before each search, and before each pose that it tries.
         pool: where cameras are worked on side by side.
         progress: to be told how far it is.
     """
     names = list(rig.cameras)
+    seeker = _Seeker(rig, views, within, seed, out_of_time)
     progress("trying the guess", 0, SEARCHES * len(names))
     tried = pool.map(lambda name: settle(views[name], rig.cameras[name]), names)
     near = dict(zip(names, tried, strict=True))
@@ -127,19 +128,19 @@ def locate(
         best = {n: _judged(near[n], far.get(n), searched=searches[n] > 0) for n in names}
         missing = [name for name in names if not best[name].accepted]
         news = {n: f for n, f in best.items() if f.accepted and n not in asked}
-        if news:
-            asked |= news.keys()
-            work = partial(_propose, rig, views, news, within, seed)
-        else:
+        if not news:
             missing = [name for name in missing if searches[name] < SEARCHES]
             missing = sorted(missing, key=searches.__getitem__)[:SIDE_BY_SIDE]
-            searches |= {name: searches[name] + 1 for name in missing}
-            work = partial(_search, rig, views, within, dict(searches), seed)
-            done = sum(searches.values()) - len(missing)
-            what = f"searching: {', '.join(missing)}"
-            progress(what, done, SEARCHES * len(names))
         if not missing or out_of_time():
             return best
+        if news:
+            asked |= news.keys()
+            work = partial(seeker.propose, news)
+        else:
+            what = f"searching: {', '.join(missing)}"
+            progress(what, sum(searches.values()), SEARCHES * len(names))
+            searches |= {name: searches[name] + 1 for name in missing}
+            work = partial(seeker.search, dict(searches))
         for name, found in zip(missing, pool.map(work, missing), strict=True):
             far[name] = max(found, far.get(name, found), key=lambda f: f.contrast)
 
@@ -170,85 +171,68 @@ def _descend(view: View, camera: Camera) -> Found:
     return Found(camera, contrast, contrast >= ACCEPTED)
 
 
-def _search(
-    rig: Rig,
-    views: Mapping[str, View],
-    within: Range,
-    searches: Mapping[str, int],
-    seed: int,
-    name: str,
-) -> Found:
-    """Search all of the range for a camera, the second time with more effort."""
-    camera, view = rig.cameras[name], views[name]
-    effort = 1 if searches[name] == 1 else WIDER
-    seed += 1000 * (searches[name] - 1)
-    responses = respond(
-        view.grays,
-        view.clouds,
-        camera,
-        range_rad=within.rotation_rad,
-        most=effort * SEARCH_WINDOWS // len(view.grays),
-        seed=seed,
-    )
-    if not len(responses.maps):
-        return Found(camera, -math.inf, False)
-    found = search_box(responses, _box(camera, within), effort=effort, seed=seed)
-    return _best(view, camera, found)
+@dataclass(frozen=True, eq=False)
+class _Seeker:
+    """Looks for one camera of a rig at a time, see :func:`locate`."""
 
+    rig: Rig
+    views: Mapping[str, View]
+    within: Range
+    seed: int
+    out_of_time: Callable[[], bool]
 
-def _propose(
-    rig: Rig,
-    views: Mapping[str, View],
-    accepted: Mapping[str, Found],
-    within: Range,
-    seed: int,
-    name: str,
-) -> Found:
-    """Try a camera where accepted cameras put it."""
-    proposals = _proposals(rig, views, accepted, within, seed, name)
-    return _best(views[name], rig.cameras[name], proposals)
+    def search(self, searches: Mapping[str, int], name: str) -> Found:
+        """Search all of the range for a camera, with more effort if it is not the first time."""
+        camera, view = self.rig.cameras[name], self.views[name]
+        effort = 1 if searches[name] == 1 else WIDER
+        seed = self.seed + 1000 * (searches[name] - 1)
+        responses = respond(
+            view.grays,
+            view.clouds,
+            camera,
+            range_rad=self.within.rotation_rad,
+            most=effort * SEARCH_WINDOWS // len(view.grays),
+            seed=seed,
+        )
+        if not len(responses.maps):
+            return Found(camera, -math.inf, False)
+        return self._best(name, search_box(responses, self._box(name), effort=effort, seed=seed))
 
+    def propose(self, accepted: Mapping[str, Found], name: str) -> Found:
+        """Try a camera where accepted cameras put it."""
+        poses = {other: found.camera.T_camera_lidar for other, found in accepted.items()}
+        return self._best(name, self._proposals(poses, name))
 
-def _best(view: View, camera: Camera, poses: Iterable[Array]) -> Found:
-    """The first that is accepted of what some poses settle to, else the best."""
-    best = Found(camera, -math.inf, False)
-    for T in poses:
-        best = max(best, settle(view, camera.moved_to(T)), key=lambda f: f.contrast)
-        if best.accepted:
-            break
-    return best
+    def _best(self, name: str, poses: Iterable[Array]) -> Found:
+        """The first that is accepted of what some poses settle to, else the best."""
+        camera = self.rig.cameras[name]
+        best = Found(camera, -math.inf, False)
+        for T in poses:
+            best = max(best, settle(self.views[name], camera.moved_to(T)), key=lambda f: f.contrast)
+            if best.accepted or self.out_of_time():
+                break
+        return best
 
+    def _proposals(self, poses: Mapping[str, Array], name: str) -> Iterator[Array]:
+        """By known relative poses, by what both see, and by the guess's relative poses."""
+        camera = self.rig.cameras[name]
+        for pair in self.rig.relative_poses:
+            if pair.a == name and pair.b in poses:
+                yield pair.T_a_b @ poses[pair.b]
+            elif pair.b == name and pair.a in poses:
+                yield np.linalg.inv(pair.T_a_b) @ poses[pair.a]
+        for other, T in poses.items():
+            grays = self.views[other].grays, self.views[name].grays
+            T_this_other = overlap_pose(self.rig.cameras[other], camera, *grays, seed=self.seed)
+            if T_this_other is not None:
+                yield from _at_lengths(T_this_other, T, self._box(name))
+        for other, T in poses.items():
+            yield camera.T_camera_lidar @ np.linalg.inv(self.rig.cameras[other].T_camera_lidar) @ T
 
-def _box(camera: Camera, within: Range) -> Box:
-    return Box(camera.T_camera_lidar, within.rotation_rad, within.translation_m)
-
-
-def _proposals(
-    rig: Rig,
-    views: Mapping[str, View],
-    accepted: Mapping[str, Found],
-    within: Range,
-    seed: int,
-    name: str,
-) -> Iterator[Array]:
-    """Where the accepted cameras put another.
-
-    By known relative poses, by what both see, and by the guess's relative poses.
-    """
-    camera = rig.cameras[name]
-    poses = {other: f.camera.T_camera_lidar for other, f in accepted.items()}
-    for pair in rig.relative_poses:
-        if pair.a == name and pair.b in poses:
-            yield pair.T_a_b @ poses[pair.b]
-        elif pair.b == name and pair.a in poses:
-            yield np.linalg.inv(pair.T_a_b) @ poses[pair.a]
-    for other, T in poses.items():
-        grays = views[other].grays, views[name].grays
-        T_this_other = overlap_pose(rig.cameras[other], camera, *grays, seed=seed)
-        if T_this_other is not None:
-            yield from _at_lengths(T_this_other, T, _box(camera, within))
-    for other, T in poses.items():
-        yield camera.T_camera_lidar @ np.linalg.inv(rig.cameras[other].T_camera_lidar) @ T
+    def _box(self, name: str) -> Box:
+        within = self.within
+        guess = self.rig.cameras[name].T_camera_lidar
+        return Box(guess, within.rotation_rad, within.translation_m)
 
 
 def _at_lengths(T_b_a: Array, T_a_lidar: Array, box: Box) -> Iterator[Array]:
@@ -269,10 +253,8 @@ def _judged(near: Found, far: Found | None, *, searched: bool) -> Found:
         return near
     if far.accepted:
         return far
-    least = [c for c, times in ACCEPTED_NEAR if near.contrast >= times * far.contrast]
-    if _same(near, far):
-        least = [c for c, _ in ACCEPTED_NEAR]
-    if searched and near.contrast >= min(least, default=math.inf):
+    rival = 0.0 if _same(near, far) else far.contrast
+    if searched and any(near.contrast >= max(c, times * rival) for c, times in ACCEPTED_NEAR):
         return replace(near, accepted=True)
     return max(near, far, key=lambda found: found.contrast)
 
