@@ -163,7 +163,7 @@ def match(
     occlusion_filter: OcclusionOption = None,
     batch: BatchOption = None,
 ) -> None:
-    """Find correspondences and write them as a table, without keeping the calibration."""
+    """Find correspondences and write them as a table; exit 1 if a camera was not found."""
     from calibgraph.files import require_place_for_file
     from calibgraph.pipeline import match_in_rounds
 
