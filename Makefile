@@ -40,7 +40,8 @@ type: $(VENV)/test ## Check types
 	$(BIN)/mypy
 
 bench: $(VENV)/test ## Measure the solve, the updates and the network against other ways
-	$(BIN)/python benchmarks/solve.py
+	$(BIN)/python benchmarks/solve.py --frames 10 100 --cameras 2
+	$(BIN)/python benchmarks/scaling.py --rows 1e3 1e5 1e7
 	$(BIN)/python benchmarks/incremental.py
 	$(BIN)/python benchmarks/cmrnext.py
 

@@ -93,7 +93,8 @@ class Calibration:
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
-        correspondences: of the last round of ``calibrate``.
+        correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
+            its last round.
         inputs: SHA-256 of the input files, by path.
         versions: of this package and the libraries that matter.
     """

@@ -29,6 +29,7 @@ _OPTIONAL_WHOLE = ("stamp_ns", "point_index")
 _WHOLE = ("frame", *_OPTIONAL_WHOLE)
 _REQUIRED = ("camera", "frame", *COORDINATES)
 _COLUMNS = (*_REQUIRED, "confidence", *_OPTIONAL_WHOLE, *INFORMATION)
+_PART_ROWS = 2**18
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 
@@ -78,6 +79,40 @@ def load_correspondences(path: Path | str) -> Correspondences:
         return from_arrow(table)
     except CorrespondenceError as error:
         raise FileError(path, str(error)) from error
+
+
+def parts_of_file(path: Path) -> Iterator[Correspondences]:
+    """The table of a file in parts, in order: of Parquet some rows at a time; a CSV file whole.
+
+    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
+
+    Raises:
+        FileError: as of :func:`load_correspondences`, once the wrong part is reached; the rows that
+            it names are counted from the beginning of the file.
+    """
+    rows = 0
+    for part in _arrow_parts(require_file(path)):
+        try:
+            yield from_arrow(part)
+        except CorrespondenceError as error:
+            raise FileError(path, str(error.after(rows))) from error
+        rows += len(part)
+    require_rows(path, rows)
+
+
+def _arrow_parts(path: Path) -> Iterator[pa.Table]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    if path.suffix == ".csv":
+        yield read_arrow(path)
+        return
+    # One row group after the other: until it is done, a reader holds on to all that it has read.
+    with arrow_reads(path), parquet.ParquetFile(path) as file:
+        metadata = file.schema_arrow.metadata
+        for group in range(file.num_row_groups):
+            for batch in file.iter_batches(_PART_ROWS, row_groups=[group]):
+                yield pa.Table.from_batches([batch]).replace_schema_metadata(metadata)
 
 
 def read_arrow(path: Path) -> pa.Table:
@@ -194,7 +229,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
     for name in table.column_names:
         if table[name].null_count:
             row = table[name].is_null().to_pylist().index(True)
-            raise CorrespondenceError(f"row {row}: column {name!r} is empty; fill in or drop it")
+            raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
 
     def stack(names: Sequence[str]) -> Array:
         return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -122,15 +123,19 @@ class Correspondences:
 
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The table with only some rows: a mask, an index array or a slice."""
-        columns = {name: getattr(self, name) for name in _WIDTHS}
-        kept: dict[str, Any] = {k: None if a is None else a[rows] for k, a in columns.items()}
-        return replace(self, **kept)
+        kept = copy.copy(self)  # not checked again: rows of a good table are good
+        for name in _WIDTHS:
+            column = getattr(self, name)
+            object.__setattr__(kept, name, None if column is None else column[rows])
+        return kept
 
     def of_camera(self, name: str) -> Correspondences:
         """The rows of one camera (none, if the camera is not in the table)."""
         if name not in self.cameras:
             return self.select(slice(0, 0))
-        return self.select(self.camera_index == self.cameras.index(name))
+        rows = np.flatnonzero(self.camera_index == self.cameras.index(name))
+        adjacent = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+        return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view, if it can
 
     @property
     def systematic_sigmas(self) -> tuple[float, float]:
@@ -205,10 +210,10 @@ class Correspondences:
         row = int(np.flatnonzero(~good)[0])
         camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
         raise CorrespondenceError(
-            f"row {row} (camera {camera!r}, frame {frame}): {what} must {rule}, found "
-            f"{found[row].tolist()}; drop or mend the row",
+            f"{what} must {rule}, found {found[row].tolist()}; drop or mend the row",
             camera=camera,
             frame=frame,
+            row=row,
         )
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,8 @@ class Scale:
             fixed loss scale (the paper's objective), else their robust spread.
         loss_scale: delta, of the whitened residual before that division.
         gate_px: tau.
-        sigma_px: robust spread of the unweighted residuals, per axis.
+        sigma_px: robust spread of the unweighted residuals, per axis; infinite if there are none;
+            NaN if it was not measured, because loss and gate are configured.
     """
 
     sigma: float
@@ -72,17 +74,23 @@ class Matches:
     information: Array | None
     frame: NDArray[np.int64]
 
-    def select(self, rows: NDArray[np.bool_]) -> Matches:
+    @cached_property
+    def frame_edges(self) -> NDArray[np.int64]:
+        """(f + 1,) where the frames begin, and the end."""
+        new = np.flatnonzero(np.diff(self.frame)) + 1
+        return np.concatenate([[0], new, [len(self.frame)]])
+
+    def weighted(self, weights: Array) -> Matches:
+        """The matches with their information times (n,) weights."""
+        root = self.block.sqrt_information
+        ones = np.tile(_IDENTITY, (len(self.frame), 1)) if root is None else root
+        root = ones * np.sqrt(weights)[:, None]
+        return replace(self, block=replace(self.block, sqrt_information=root))
+
+    def select(self, rows: NDArray[Any]) -> Matches:
         """Only some rows."""
-        kept = [None if a is None else a[rows]
-                for a in (self.block.sqrt_information, self.information)]  # fmt: skip
-        block = replace(
-            self.block,
-            points_lidar_m=self.block.points_lidar_m[rows],
-            pixels_px=self.block.pixels_px[rows],
-            sqrt_information=kept[0],
-        )
-        return Matches(block, kept[1], self.frame[rows])
+        information = None if self.information is None else self.information[rows]
+        return Matches(self.block.select(rows), information, self.frame[rows])
 
     def as_table(self, *, camera: str) -> Correspondences:
         """The matches as a table of correspondences, their weights as information."""
@@ -100,11 +108,7 @@ class Matches:
 
     def scaled(self, scale: Scale) -> ProjectionBlock:
         """The block with its loss, in units of the residuals' sigma."""
-        root = self.block.sqrt_information
-        if scale.sigma != 1.0:
-            ones = np.tile(_IDENTITY, (len(self.frame), 1))
-            root = (ones if root is None else root) / scale.sigma
-        return replace(self.block, sqrt_information=root, scale=scale.loss_scale / scale.sigma)
+        return self.block.rescaled(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] where constrained; (n,) whether projectable."""
@@ -113,10 +117,14 @@ class Matches:
 
     def scale(self, T_camera_lidar: Array, config: Config) -> Scale:
         """The configured scales, or those of the residuals' own spread at a pose."""
+        if config.loss_scale_px is not None and config.gate_px is not None:
+            _, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
+            unmeasured = math.nan if valid.any() else math.inf
+            return Scale(1.0, config.loss_scale_px, config.gate_px, unmeasured)
         sizes_px, sizes = self.sizes(T_camera_lidar)
-        return scale_from(
-            robust_spread(sizes_px), max(robust_spread(sizes), self.least_spread), config
-        )
+        spread_px = robust_spread(sizes_px)
+        spread = spread_px if sizes is sizes_px else robust_spread(sizes)
+        return scale_from(spread_px, max(spread, self.least_spread), config)
 
     def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
         """How large the residuals of projectable matches are, in medians of a standard Gaussian.
@@ -126,9 +134,11 @@ class Matches:
             standard deviation per axis is that standard deviation.
         """
         residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-        medians = _MEDIAN_NORM[self._constrained_axes[valid] - 1]
-        errors = constrained_error_px(residuals, self.information)[valid]
-        return errors / medians, self._whitened_norm(residuals)[valid] / medians
+        medians = self._median_norms[valid] if self._median_norms.ndim else self._median_norms
+        sizes_px = constrained_error_px(residuals, self.information)[valid] / medians
+        if self.information is None and self.block.sqrt_information is None:
+            return sizes_px, sizes_px
+        return sizes_px, self._whitened_norm(residuals)[valid] / medians
 
     def gated(self, T_camera_lidar: Array, scale: Scale) -> Matches:
         """Without what lies beyond the gate, or behind the camera (paper, two-pass solver, 2)."""
@@ -149,12 +159,8 @@ class Matches:
         across = self._error_gradient(residuals, errors)[band]
         across *= (self._whitened_norm(residuals)[band] / errors[band])[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
-        edge = replace(
-            self.block,
-            points_lidar_m=self.block.points_lidar_m[band],
-            pixels_px=self.block.pixels_px[band],
-            sqrt_information=root / scale.sigma,
-            scale=scale.loss_scale / scale.sigma,
+        edge = replace(self.block.select(band), sqrt_information=root).rescaled(
+            scale=scale.loss_scale / scale.sigma, sigma=scale.sigma
         )
         added: Array = -edge.sums(pose).hessian / (2 * _GATE_BAND)
         return added
@@ -184,7 +190,7 @@ class Matches:
     def _whitened_norm(self, residuals: Array) -> Array:
         root = self.block.sqrt_information
         if root is None:
-            return np.hypot(residuals[:, 0], residuals[:, 1])
+            return constrained_error_px(residuals, None)
         first = root[:, 0] * residuals[:, 0] + root[:, 1] * residuals[:, 1]
         return np.hypot(first, root[:, 2] * residuals[:, 1])
 
@@ -196,13 +202,13 @@ class Matches:
         return MIN_SIGMA_PX * typical
 
     @cached_property
-    def _constrained_axes(self) -> NDArray[np.int64]:
-        """(n,) how many directions each match constrains: 1 or 2."""
+    def _median_norms(self) -> Array:
+        """() or (n,) medians of a standard Gaussian error, of as many axes as are constrained."""
         if self.information is None:
-            return np.full(len(self.frame), 2)
+            return np.asarray(_MEDIAN_NORM[1])
         uu, uv, vv = self.information.T
         rank_one = uu * vv - uv**2 <= 1e-3 * (uu + vv) ** 2
-        return np.where(rank_one, 1, 2)
+        return _MEDIAN_NORM[np.where(rank_one, 0, 1)]
 
 
 def scale_from(sigma_px: float, spread: float, config: Config) -> Scale:
@@ -257,8 +263,13 @@ def robust_spread(values: Array) -> float:
     ordered = np.sort(values)
 
     def quantile_below(limit: float, share: float) -> float:
-        inside = ordered[: np.searchsorted(ordered, limit, side="right")]
-        return float(np.quantile(inside, share)) if len(inside) else math.nan
+        last = int(np.searchsorted(ordered, limit, side="right")) - 1
+        if last < 0:
+            return math.nan
+        place = share * last
+        low = int(place)
+        below, above = ordered[low], ordered[min(low + 1, last)]
+        return float(below + (place - low) * (above - below))
 
     return settled_spread(quantile_below)
 

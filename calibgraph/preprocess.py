@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences
+from calibgraph.correspondence_file import parts_of_file
+from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.errors import CorrespondenceError
+from calibgraph.grid import best_in_cell
 from calibgraph.rig import Rig
 
 Array = NDArray[np.float64]
 
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
+
+_MERGED_ROWS = 250_000  # rows of parts that may wait to be merged, about 15 to 25 MB
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,71 @@ def preprocess(rig: Rig, table: Correspondences, config: Config) -> Preprocessed
     Raises:
         CorrespondenceError: if the table names a camera that the rig does not have.
     """
+    return preprocess_parts(rig, [table], config)
+
+
+def preprocess_file(rig: Rig, path: Path | str, config: Config) -> Preprocessed:
+    """The same of the table in a file, which may be larger than memory.
+
+    Memory is needed for one row group of it and for what the grid keeps, at most one match of each
+    cell, camera and frame, in whatever order the rows are. A CSV file is read whole.
+
+    Raises:
+        CorrespondenceError: if the table names a camera that the rig does not have.
+        FileError: as of :func:`calibgraph.load_correspondences`.
+    """
+    return preprocess_parts(rig, parts_of_file(Path(path)), config)
+
+
+def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config) -> Preprocessed:
+    """The same of a table that comes in parts, at least one."""
+    kept: list[Correspondences] = []
+    counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
+    settled = 0
+    for part in parts:
+        best, passed = _filtered(rig, part, config)
+        counts[:3] += passed
+        kept.append(best)
+        if sum(map(len, kept)) > 2 * settled + _MERGED_ROWS:
+            kept = [_merged(rig, kept, config)]
+            settled = len(kept[0])
+    table = _merged(rig, kept, config)
+    camera = _places(rig, table)
+    counts[3] = np.bincount(camera, minlength=len(rig.cameras))
+    rows = np.flatnonzero(_capped(table, camera, config))
+    counts[4] = np.bincount(camera[rows], minlength=len(rig.cameras))
+    order = rows[np.lexsort((table.frame[rows], camera[rows]))]
+    named = {
+        name: dict(zip(FILTERS, column, strict=True))
+        for name, column in zip(rig.cameras, counts.T.tolist(), strict=True)
+    }
+    return Preprocessed(table.select(order), named)
+
+
+def _filtered(
+    rig: Rig, table: Correspondences, config: Config
+) -> tuple[Correspondences, NDArray[np.int64]]:
+    """What of a part may be kept; (3, N) per camera its rows: given, projectable, confident."""
+    camera = _places(rig, table)
+    projectable = _projectable(rig, table, camera)
+    rows = np.flatnonzero(projectable & (table.confidence >= config.confidence_min))
+    passed = [np.bincount(c, minlength=len(rig.cameras))
+              for c in (camera, camera[projectable], camera[rows])]  # fmt: skip
+    confident = table.select(rows)
+    best = confident.select(best_in_cell(rig, confident, camera[rows], config))
+    return best, np.array(passed)
+
+
+def _merged(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
+    """The best of what is best in the parts, in the order of the table."""
+    if len(kept) == 1:
+        return kept[0]
+    table = concatenate(kept)
+    return table.select(best_in_cell(rig, table, _places(rig, table), config))
+
+
+def _places(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
+    """(n,) the place of each row's camera in the rig."""
     for name in table.cameras:
         if name not in rig.cameras:
             raise CorrespondenceError(
@@ -45,81 +116,27 @@ def preprocess(rig: Rig, table: Correspondences, config: Config) -> Preprocessed
                 camera=name,
             )
     numbers = np.array([list(rig.cameras).index(name) for name in table.cameras], dtype=np.int64)
-    camera = numbers[table.camera_index] if len(table) else np.empty(0, np.int64)
-    kept = np.arange(len(table))
-    counts = [np.bincount(camera, minlength=len(rig.cameras))]
-    filters = (_projectable, _confident, _best_in_cell, _capped)
-    for keep in filters:
-        kept = kept[keep(rig, table.select(kept), camera[kept], config)]
-        counts.append(np.bincount(camera[kept], minlength=len(rig.cameras)))
-    order = kept[np.lexsort((table.frame[kept], camera[kept]))]
-    by_camera = np.array(counts).T.tolist()
-    named = {
-        name: dict(zip(FILTERS, row, strict=True))
-        for name, row in zip(rig.cameras, by_camera, strict=True)
-    }
-    return Preprocessed(table.select(order), named)
+    return numbers[table.camera_index] if len(table) else np.empty(0, np.int64)
 
 
-def _projectable(
-    rig: Rig, table: Correspondences, camera: NDArray[np.int64], config: Config
-) -> NDArray[np.bool_]:
+def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
     keep = np.empty(len(table), dtype=np.bool_)
-    for number, model in enumerate(rig.cameras.values()):
-        rows = camera == number
-        T = model.T_camera_lidar
+    for place, model in enumerate(rig.cameras.values()):
+        rows, T = np.flatnonzero(camera == place), model.T_camera_lidar
         keep[rows] = model.lens.project(table.points_lidar_m[rows] @ T[:3, :3].T + T[:3, 3])[1]
     return keep
 
 
-def _confident(
-    rig: Rig, table: Correspondences, camera: NDArray[np.int64], config: Config
-) -> NDArray[np.bool_]:
-    keep: NDArray[np.bool_] = table.confidence >= config.confidence_min
-    return keep
-
-
-def _best_in_cell(
-    rig: Rig, table: Correspondences, camera: NDArray[np.int64], config: Config
-) -> NDArray[np.bool_]:
-    """Most confident match of each cell of the image grid, per camera and frame.
-
-    Of equally confident ones the first in the table is kept.
-    """
-    sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
-    shape = np.array([config.grid_columns, config.grid_rows])
-    cells = np.floor((table.pixels_px + 0.5) / sizes[camera] * shape).astype(np.int64)
-    cells = np.clip(cells, 0, shape - 1)
-    cell = cells[:, 1] * config.grid_columns + cells[:, 0]
-    order = np.lexsort((-table.confidence, cell, table.frame, camera))
-    return _first_of_each(order, camera, table.frame, cell)
-
-
-def _capped(
-    rig: Rig, table: Correspondences, camera: NDArray[np.int64], config: Config
-) -> NDArray[np.bool_]:
+def _capped(table: Correspondences, camera: NDArray[np.int64], config: Config) -> NDArray[np.bool_]:
     """The most confident ``matches_max`` of each camera and frame."""
     order = np.lexsort((-table.confidence, table.frame, camera))
-    starts = _is_new(camera[order], table.frame[order])
+    starts = np.ones(len(order), dtype=np.bool_)
+    starts[1:] = (np.diff(camera[order]) != 0) | (np.diff(table.frame[order]) != 0)
     first = np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
     keep = np.empty(len(order), dtype=np.bool_)
     keep[order] = np.arange(len(order)) - first < config.matches_max
     return keep
-
-
-def _first_of_each(order: NDArray[np.intp], *keys: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask of the rows that come first, in ``order``, among those with equal keys."""
-    keep = np.empty(len(order), dtype=np.bool_)
-    keep[order] = _is_new(*(key[order] for key in keys))
-    return keep
-
-
-def _is_new(*sorted_keys: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which rows of sorted keys differ from the row before."""
-    new = np.ones(len(sorted_keys[0]), dtype=np.bool_)
-    new[1:] = np.any([key[1:] != key[:-1] for key in sorted_keys], axis=0)
-    return new
 
 
 def sqrt_information(table: Correspondences, config: Config) -> Array | None:
@@ -155,7 +172,8 @@ def constrained_error_px(residuals: Array, information: Array | None) -> Array:
     The plain reprojection error where no information is given; for an edge, the distance from it.
     """
     if information is None:
-        return np.asarray(np.hypot(residuals[:, 0], residuals[:, 1]))
+        x, y = residuals.T
+        return np.asarray(np.sqrt(x * x + y * y))  # hypot takes ten times as long
     uu, uv, vv = information.T
     largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
     x, y = residuals.T

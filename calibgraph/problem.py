@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.config import Config, Terms
+from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph import Optimum, joined, optimize, projection_graph
 from calibgraph.matches import MIN_MATCHES, Matches, Scale
@@ -83,7 +84,7 @@ class Problem:
         """
         scales = {name: m.scale(poses[name], config) for name, m in self.matches.items()}
         for name, scale in scales.items():
-            if not math.isfinite(scale.sigma_px):
+            if math.isinf(scale.sigma_px):
                 raise CorrespondenceError(
                     f"camera {name!r}: all its correspondences are behind it at the estimate; do "
                     "its guess and the relative_poses hold (p_camera = T_camera_lidar * p_lidar, "
@@ -136,9 +137,7 @@ class Fit:
 
     Attributes:
         rig: lenses, and the guess.
-        metadata: of the table of correspondences.
-        systematic_sigmas: rotation [rad] and translation [m] that the matcher says all frames
-            share, per axis: the scatter between frames cannot show them.
+        table: the preprocessed correspondences.
         config: the settings.
         problem: all correspondences that were usable.
         inliers: those within the gate, which the solution was fitted to.
@@ -150,8 +149,7 @@ class Fit:
     """
 
     rig: Rig
-    metadata: dict[str, Any]
-    systematic_sigmas: tuple[float, float]
+    table: Correspondences
     config: Config
     problem: Problem
     inliers: Problem
@@ -160,6 +158,19 @@ class Fit:
     stage1_T_camera_lidar: Poses
     counts: dict[str, dict[str, int]]
     clock: Clock
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Of the table: what the matcher says."""
+        return self.table.metadata
+
+    @property
+    def systematic_sigmas(self) -> tuple[float, float]:
+        """Rotation [rad] and translation [m] that the matcher says all frames share, per axis.
+
+        The scatter between frames cannot show them.
+        """
+        return self.table.systematic_sigmas
 
     @property
     def poses(self) -> Poses:

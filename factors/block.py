@@ -12,21 +12,27 @@ that is concave in s with rho(0) = 0.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
-from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.kernel import accumulate_alone, accumulate_shared, residuals_of
+from factors.kernel import (
+    accumulate_alone,
+    accumulate_shared,
+    residuals_alone,
+    residuals_shared,
+)
 from factors.lens import Lens
 from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
-_WORTH_SHARING = 300_000  # correspondences (2 ms): below, waking other threads costs more
+_WORTH_SHARING = 300_000  # correspondences (1 ms): below, waking other threads costs more
 
 
 @dataclass(frozen=True)
@@ -55,10 +61,13 @@ class ProjectionBlock:
         sqrt_information: (n, 3) entries (0,0), (0,1), (1,1) of upper triangular whitening matrices
             [1/px], or None for the identity.
         loss: name of the robust loss.
-        scale: whitened residual norm at which the loss bends (the paper's delta).
+        scale: norm of a whitened residual, divided by sigma, at which the loss bends (the paper's
+            delta).
+        sigma: what all whitened residuals are divided by.
 
     Raises:
-        ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale <= 0.
+        ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
+            <= 0.
     """
 
     lens: Lens
@@ -67,7 +76,13 @@ class ProjectionBlock:
     sqrt_information: Array | None = None
     loss: str = "cauchy"
     scale: float = 4.0
+    sigma: float = 1.0
+    _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, contiguous by row
+    _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
     _last: list[tuple[bytes, tuple[Array, Array]]] = field(
+        default_factory=list, init=False, repr=False
+    )
+    _seen: list[tuple[bytes, tuple[Array, NDArray[np.bool_]]]] = field(
         default_factory=list, init=False, repr=False
     )
 
@@ -78,18 +93,47 @@ class ProjectionBlock:
         if self.sqrt_information is not None:
             _check_shape("sqrt_information", self.sqrt_information, (n, 3))
         loss_id(self.loss)
-        if not self.scale > 0:
-            raise ValueError(f"the robust scale must be positive, found {self.scale}")
+        columns = np.empty((5, n))
+        columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
+        self._set(_columns=columns, _whitening=_whitening(self.sqrt_information, n))
+        self._set(points_lidar_m=columns[:3].T, pixels_px=columns[3:].T)  # held once
+        self._check_scales()
+
+    def _check_scales(self) -> None:
+        for name in ("scale", "sigma"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"the robust {name} must be positive, found {getattr(self, name)}")
+
+    def _set(self, **attributes: Any) -> None:
+        for name, value in attributes.items():
+            object.__setattr__(self, name, value)
+
+    def _but(self, **attributes: Any) -> ProjectionBlock:
+        """A block with other attributes, of which those that are correspondences are known good."""
+        twin = copy.copy(self)
+        twin._set(_last=[], _seen=[], **attributes)
+        return twin
 
     def __len__(self) -> int:
-        return len(self.points_lidar_m)
+        return len(self.pixels_px)
 
-    @cached_property
-    def _columns(self) -> tuple[Array, Array]:
-        """(5, n) x y z u v and (3, n) or (3, 0) whitening, contiguous by row for the kernel."""
-        columns = np.ascontiguousarray(np.hstack([self.points_lidar_m, self.pixels_px]).T)
-        whitening = np.empty((0, 3)) if self.sqrt_information is None else self.sqrt_information
-        return columns, np.ascontiguousarray(whitening.T)
+    def rescaled(self, *, scale: float, sigma: float = 1.0) -> ProjectionBlock:
+        """The same correspondences, not copied, with another scale of the loss, and sigma."""
+        twin = self._but(scale=scale, sigma=sigma)
+        twin._check_scales()
+        return twin
+
+    def select(self, rows: NDArray[Any]) -> ProjectionBlock:
+        """The block with only some correspondences: a mask or an index array."""
+        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        columns, root = self._columns.take(rows, axis=1), self.sqrt_information
+        return self._but(
+            points_lidar_m=columns[:3].T,
+            pixels_px=columns[3:].T,
+            sqrt_information=None if root is None else root[rows],
+            _columns=columns,
+            _whitening=self._whitening.take(rows, axis=1),
+        )
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
@@ -101,20 +145,30 @@ class ProjectionBlock:
         return _unpacked(self._segment_sums(T_lidar_camera, np.asarray(edges, dtype=np.int64)))
 
     def _segment_sums(self, T_lidar_camera: gtsam.Pose3, edges: NDArray[np.int64]) -> Array:
-        columns, whitening = self._columns
         T = np.ascontiguousarray(T_lidar_camera.inverse().matrix())
         run = accumulate_alone if len(self) < _WORTH_SHARING else accumulate_shared
+        # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, T, columns, whitening,
-            loss_id(self.loss), self.scale, edges,
+            self.lens.kind, self.lens.packed, T, self._columns, self._whitening,
+            loss_id(self.loss), self.scale * self.sigma, edges,
         )  # fmt: skip
-        return sums
+        return sums if self.sigma == 1.0 else sums / self.sigma**2
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
-        columns, _ = self._columns
+        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable.
+
+        Those of the last pose are remembered, and not to be written to.
+        """
+        pose = T_lidar_camera.matrix().tobytes()
+        if not self._seen or self._seen[0][0] != pose:
+            self._seen[:] = [(pose, self._residuals(T_lidar_camera))]
+        return self._seen[0][1]
+
+    def _residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         T = np.ascontiguousarray(T_lidar_camera.inverse().matrix())
-        residuals, valid = residuals_of(self.lens.kind, self.lens.packed, T, columns)
+        run = residuals_alone if len(self) < _WORTH_SHARING else residuals_shared
+        residuals, valid = run(self.lens.kind, self.lens.packed, T, self._columns)
+        residuals.flags.writeable = valid.flags.writeable = False
         return residuals, valid
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
@@ -169,6 +223,14 @@ def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
+
+
+def _whitening(root: Array | None, n: int) -> Array:
+    """The whitening for the kernel: matrices by columns, or (1, n) if they are all numbers."""
+    if root is None:
+        return np.empty((0, n))
+    isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
+    return np.ascontiguousarray((root[:, :1] if isotropic else root).T)
 
 
 _UPPER = np.triu_indices(6)

@@ -104,6 +104,61 @@ def test_error_and_linearization_equal_the_separate_factors(name: str, loss: str
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("weights", ["none", "numbers"])
+@pytest.mark.parametrize("name", ["pinhole", "radtan"])
+def test_numbers_as_weights_equal_the_separate_factors(name: str, weights: str, loss: str) -> None:
+    """The kernel has a way of its own for a pinhole whose weights are no matrices.
+
+    600 correspondences are more than two of its tiles; at the last pose some lie behind.
+    """
+    numbers = np.random.default_rng(3).uniform(0.2, 2, 600)
+    numbers = np.ones(600) if weights == "none" else numbers
+    roots = np.column_stack([numbers, np.zeros(600), numbers])
+    with_roots = with_loss(replace(world(LENSES[name], 600), sqrt_information=roots), loss)
+    block = replace(with_roots, sqrt_information=None if weights == "none" else roots)
+    many = separate(with_roots)
+    for pose in poses():
+        expected = many.linearize(at(pose)).hessian()
+        found = together(block).linearize(at(pose)).hessian()
+        assert together(block).error(at(pose)) == pytest.approx(many.error(at(pose)), rel=1e-9)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_sigma_divides_the_whitened_residuals(loss: str) -> None:
+    block = with_loss(world(LENSES["pinhole"], 100), loss)
+    divided = replace(block, sqrt_information=block.sqrt_information / 0.7, scale=2.0)
+    found, expected = block.rescaled(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
+    # Sums of 100 terms, each rounded a few times: 1e-12 of the largest is far above that.
+    for a, b in zip(vars(found).values(), vars(expected).values(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
+
+
+def test_selected_correspondences_are_those_of_the_arrays() -> None:
+    block = with_loss(world(LENSES["pinhole"], 300), "cauchy")
+    block.residuals(TRUTH)  # remembered, and not to be taken for those of the selection
+    some = np.random.default_rng(1).random(300) < 0.5
+    part = block.select(some)
+    made = ProjectionBlock(
+        block.lens, block.points_lidar_m[some], block.pixels_px[some], block.sqrt_information[some],
+        block.loss, block.scale,
+    )  # fmt: skip
+    np.testing.assert_array_equal(part.points_lidar_m, made.points_lidar_m)
+    np.testing.assert_array_equal(part.residuals(TRUTH)[0], made.residuals(TRUTH)[0])
+    np.testing.assert_array_equal(part.sums(TRUTH).hessian, made.sums(TRUTH).hessian)
+
+
+def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
+    """The sum of logarithms is taken as that of a product, of weights down to 1e-20 each here."""
+    points = np.tile([0.0, 0.0, 1.0], (1001, 1))
+    pixels = np.tile([1e6, 0.0], (1001, 1))
+    block = ProjectionBlock(Lens.pinhole(fx=1.0, fy=1.0, cx=0, cy=0), points, pixels, scale=1e-4)
+    expected = 1001 * 1e-8 * np.log1p(1e20)
+    assert float(block.sums(gtsam.Pose3()).cost) == pytest.approx(expected, rel=1e-12)
+
+
 def solution(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Pose3:
     """LM, then Gauss-Newton until the gradient vanishes: an error known to 1e-16 of itself says
     where its minimum is only to 1e-8 of the pose's sigma."""
