@@ -24,7 +24,7 @@ from calibgraph.config import Config
 from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.graph import pose_key, prior_graph, values_of
 from calibgraph.matches import CAUCHY_SCALE_SIGMAS, matches_by_camera
-from calibgraph.simulate import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from factors import block_factor
 
 RIG = Rig(

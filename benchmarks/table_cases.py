@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -23,7 +23,7 @@ from calibgraph import (
     perturb,
     solve,
 )
-from calibgraph.simulate import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 
 Array = np.ndarray
 Rng = np.random.Generator
@@ -107,7 +107,7 @@ class World:
     def drawn(self) -> dict[str, Any]:
         """The numbers, without the rig."""
         values = {k: v for k, v in vars(self).items() if k not in ("truth", "errors")}
-        return {**values, **vars(self.errors)}
+        return {**values, **asdict(self.errors)}
 
 
 Case = tuple[Rig, Correspondences, dict[str, Any]]

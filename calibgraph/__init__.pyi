@@ -30,8 +30,11 @@ from calibgraph.rig import Camera as Camera
 from calibgraph.rig import Intrinsics as Intrinsics
 from calibgraph.rig import RelativePose as RelativePose
 from calibgraph.rig import Rig as Rig
-from calibgraph.simulate import MatcherErrors as MatcherErrors
-from calibgraph.simulate import simulate_correspondences as simulate_correspondences
+from calibgraph.simulation.correspondences import MatcherErrors as MatcherErrors
+from calibgraph.simulation.correspondences import (
+    simulate_correspondences as simulate_correspondences,
+)
+from calibgraph.simulation.recording import simulate_street as simulate_street
 from calibgraph.structure import StructureMatcher as StructureMatcher
 from calibgraph.tracking import DurableCalibrator as DurableCalibrator
 from calibgraph.tracking import Event as Event

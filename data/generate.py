@@ -13,7 +13,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import yaml  # type: ignore[import-untyped, unused-ignore]
-from street import UNIT_X, UNIT_Y, UNIT_Z, UV_AXES, Array, Image, Points, Solid, pose, street
+from numpy.typing import NDArray
+from street import street
+
+from calibgraph.simulation.paints import painted
+from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, UV_AXES, Solid, pose
+
+Array = NDArray[np.floating[Any]]
+Image, Points = NDArray[np.uint8], NDArray[np.float32]
 
 WIDTH_PX, HEIGHT_PX, OVERSAMPLING, JPEG_QUALITY, GAMMA = 640, 360, 2, 85, 1 / 2.2
 PIXEL_BLUR_PX, PIXEL_NOISE, BUNDLE = 0.45, 0.008, 80  # rays that are culled together
@@ -96,7 +103,7 @@ class World(NamedTuple):
             axes = UV_AXES[abs(outward / half).argmax(axis=1)]
             uv = np.take_along_axis((unit + 1) * half, axes, axis=1)
             u, v = (uv / TEXEL_M).astype(int).T % NOISE_TEXELS
-            albedo[rays] = solid.paint(uv, self.noise[u, v], solid.albedo)
+            albedo[rays] = painted(solid.paint, uv, self.noise[u, v], solid.albedo)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         return distance, normal, albedo
 

@@ -27,7 +27,7 @@ from calibgraph import (
 )
 from calibgraph.matches import Matches, matches_by_camera
 from calibgraph.preprocess import preprocess
-from calibgraph.simulate import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.change import Steps, cause_of
 from calibgraph.tracking.memory import STRENGTHS, Memory

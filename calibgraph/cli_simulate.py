@@ -1,0 +1,93 @@
+"""The command that makes data with a known truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibgraph.cli_options import SeedOption
+from calibgraph.cli_support import checked_arguments, progress_bar, terminal
+
+if TYPE_CHECKING:
+    from calibgraph.rig import Rig
+
+STREET = "street"
+_STREET = "Scenario street"
+
+
+def simulate(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="street: a rig drives along a procedural street; a dataset of scans and images. "
+            "kitti, walkley, surround, fisheye: a table of correspondences, of a matcher that errs "
+            "as the paper's does (kitti, walkley) or in between.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    rig: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME|RIG",
+            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
+            "file of your own; its poses are the truth.",
+            rich_help_panel=_STREET,
+        ),
+    ] = "kitti",
+    frames: Annotated[int, typer.Option(help="How many, at different places.")] = 10,
+    rotation_deg: Annotated[
+        float, typer.Option(min=0, help="Angle by which the guess, rig.yaml, is off.")
+    ] = 5.0,
+    translation_m: Annotated[
+        float, typer.Option(min=0, help="Length by which the guess is off.")
+    ] = 0.3,
+    seed: SeedOption = 0,
+    beams: Annotated[
+        int,
+        typer.Option(metavar="16|64|128", help="Of the LiDAR.", rich_help_panel=_STREET),
+    ] = 64,
+    step_m: Annotated[
+        float, typer.Option(help="Between two frames, on average.", rich_help_panel=_STREET)
+    ] = 4.0,
+) -> None:
+    """Make data with a known truth, reference.yaml, and a guess that is off, rig.yaml."""
+    from calibgraph.simulation.recording import simulate_street
+    from calibgraph.simulation.scenarios import simulate_table
+
+    with progress_bar() as progress, checked_arguments():
+        if scenario == STREET:
+            written = simulate_street(
+                out,
+                _rig(rig),
+                beams=beams,
+                frames=frames,
+                step_m=step_m,
+                seed=seed,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+                progress=progress,
+            )
+        else:
+            written = simulate_table(
+                out,
+                scenario,
+                frames=frames,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+                seed=seed,
+            )
+    for path in written:
+        terminal().print(f"{path}: written", soft_wrap=True, markup=False, highlight=False)
+
+
+def _rig(name: str) -> Rig:
+    """A rig by its name, or from a file."""
+    from calibgraph.load import load_rig
+    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+
+    if name not in RIG_NAMES and Path(name).exists():
+        return load_rig(name)
+    return rig_of(name)

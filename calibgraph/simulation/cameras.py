@@ -1,0 +1,171 @@
+"""Cameras in a simulated world: the rays of a lens, and pictures."""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.rig import Camera
+from calibgraph.simulation.world import World, cast, colours
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+SAMPLES_PX = np.array([[-0.375, 0.125], [-0.125, -0.375], [0.125, 0.375], [0.375, -0.125]])
+"""Where a pixel is sampled, from its centre: no two in one row or column, so edges are smooth."""
+MAX_FIELD_RAD = math.radians(95.0)
+_GAMMA = 1 / 2.2
+_BLOCK_PX = 2**17
+_MISS_PX = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaging:
+    """What happens to light behind a lens.
+
+    Attributes:
+        blur_px: standard deviation of the optical blur.
+        noise: standard deviation per pixel and channel, as a share of the range.
+        exposure_spread: standard deviation of the logarithm of the exposure, per image.
+    """
+
+    blur_px: float = 0.45
+    noise: float = 0.008
+    exposure_spread: float = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRays:
+    """The rays of a camera, which its pictures share.
+
+    Attributes:
+        directions: (height, width, samples, 3) unit vectors in the camera's frame; 0 where the
+            lens sees nothing.
+        blind: (height, width) pixels that the lens leaves black.
+        pixel_rad: the angle of a pixel, about.
+    """
+
+    directions: Floats
+    blind: NDArray[np.bool_]
+    pixel_rad: float
+
+
+def camera_rays(camera: Camera) -> CameraRays:
+    """The rays through the samples of every pixel."""
+    v, u = np.indices((camera.height_px, camera.width_px), dtype=np.float64)
+    pixels = np.stack([u, v], axis=-1)[:, :, None] + SAMPLES_PX
+    rays = pixel_directions(camera, pixels.reshape(-1, 2)).astype(np.float32)
+    rays = rays.reshape(*pixels.shape[:3], 3)
+    blind = np.asarray(~np.all(rays.any(axis=3), axis=2))
+    return CameraRays(directions=rays, blind=blind, pixel_rad=1 / camera.intrinsics_px.fx)
+
+
+def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
+    """The directions in which a camera's pixels look.
+
+    Args:
+        camera: its lens.
+        pixels_px: (n, 2) column and row.
+
+    Returns:
+        (n, 3) unit vectors in the camera's frame; 0 where the lens projects no direction to the
+        pixel, or one that is more than 95 degrees off its axis.
+    """
+    undistorted = _fisheye_directions if camera.model == "fisheye" else _pinhole_directions
+    directions = undistorted(camera, pixels_px)
+    back, valid = camera.lens.project(directions)
+    with np.errstate(invalid="ignore"):
+        valid &= np.abs(back - pixels_px).max(axis=1) < _MISS_PX
+    valid &= directions[:, 2] >= math.cos(MAX_FIELD_RAD)
+    directions[~valid] = 0
+    return directions
+
+
+def render(
+    world: World,
+    rays: CameraRays,
+    T_world_camera: Array,
+    rng: np.random.Generator,
+    imaging: Imaging | None = None,
+) -> Image:
+    """Take a picture.
+
+    Args:
+        world: what is seen.
+        rays: of the camera.
+        T_world_camera: (4, 4) pose of the camera, whose x is right, y down, z forward.
+        rng: draws exposure and noise.
+        imaging: blur and noise.
+
+    Returns:
+        (height, width, 3) BGR.
+    """
+    imaging = imaging or Imaging()
+    linear = light(world, rays, T_world_camera)
+    linear *= math.exp(rng.normal(0, imaging.exposure_spread))
+    if imaging.blur_px > 0:
+        linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), imaging.blur_px))
+    image = linear**_GAMMA
+    image += np.float32(imaging.noise) * rng.standard_normal(image.shape, np.float32)
+    return (255 * image.clip(0, 1) + 0.5).astype(np.uint8)
+
+
+def light(world: World, rays: CameraRays, T_world_camera: Array) -> Floats:
+    """(height, width, 3) the light on a camera's pixels, linear BGR; black beyond the lens."""
+    height, width = rays.directions.shape[:2]
+    rows = max(1, _BLOCK_PX // width)
+    blocks = [rays.directions[row : row + rows] for row in range(0, height, rows)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        parts = pool.map(lambda block: _block(world, block, T_world_camera, rays.pixel_rad), blocks)
+        image = np.concatenate(list(parts))
+    image[rays.blind] = 0
+    return image
+
+
+def _block(world: World, directions: Floats, T_world_camera: Array, pixel_rad: float) -> Floats:
+    """(rows, width, 3) light on some rows of pixels."""
+    outwards = directions.reshape(-1, 3) @ T_world_camera[:3, :3].T.astype(np.float32)
+    origin = T_world_camera[:3, 3]
+    hits = cast(world, origin, outwards)
+    seen = colours(world, origin, outwards, hits, pixel_rad=pixel_rad).reshape(directions.shape)
+    total = seen[:, :, 0] + seen[:, :, 1] + seen[:, :, 2] + seen[:, :, 3]  # as mean() is slow
+    return np.asarray(total / len(SAMPLES_PX))
+
+
+def _pinhole_directions(camera: Camera, pixels_px: Array) -> Array:
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    lens = np.array(camera.distortion or (0.0,) * 4)
+    plane = cv2.undistortPoints(pixels_px[:, None], camera.matrix_px, lens, criteria=criteria)
+    directions = np.insert(np.asarray(plane[:, 0], np.float64), 2, 1.0, axis=1)
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def _fisheye_directions(camera: Camera, pixels_px: Array) -> Array:
+    """OpenCV's own inverse ends at 90 degrees; this one at the end of the lens."""
+    k = camera.intrinsics_px
+    x, y = (pixels_px[:, 0] - k.cx) / k.fx, (pixels_px[:, 1] - k.cy) / k.fy
+    distorted = np.hypot(x, y)
+    angle = _undistorted_angle(np.asarray(camera.distortion), distorted, camera.lens.packed[-1])
+    sideways = np.sin(angle) / np.maximum(distorted, 1e-12)
+    return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
+
+
+def _undistorted_angle(distortion: Array, distorted: Array, limit_rad: float) -> Array:
+    """Angles [rad] off the axis, up to a limit below which their distorted ones rise."""
+    powers = np.array([3, 5, 7, 9])
+    table = np.linspace(0, min(limit_rad, MAX_FIELD_RAD + 0.1), 2000)
+    bent = table + (table[:, None] ** powers) @ distortion
+    angle = np.interp(distorted, bent, table)
+    for _ in range(3):  # Newton
+        square = angle * angle
+        series = np.polynomial.polynomial.polyval(square, np.array([1, *distortion]))
+        slope = np.polynomial.polynomial.polyval(square, np.array([1, *((powers) * distortion)]))
+        angle = angle - (angle * series - distorted) / np.maximum(slope, 1e-3)
+    return np.asarray(angle.clip(0, table[-1]))

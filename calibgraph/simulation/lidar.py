@@ -1,0 +1,115 @@
+"""A spinning LiDAR in a simulated world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.simulation.world import World, albedos, cast
+
+Array = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+_REFERENCE_M = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lidar:
+    """A spinning LiDAR.
+
+    Attributes:
+        elevations_deg: of the beams, evenly spaced.
+        azimuth_step_deg: between two shots of a beam.
+        min_range_m: nearer returns are not given.
+        max_range_m: farther returns are not given.
+        range_noise_m: standard deviation.
+        intensity_noise: standard deviation.
+        ring_spread: standard deviation of the beams' gains, about 1.
+        dropout: share of shots that are lost by chance.
+        weakest: albedo, head on at 100 m, of which 1 - 1/e of the shots return.
+    """
+
+    elevations_deg: tuple[float, ...]
+    azimuth_step_deg: float = 0.2
+    min_range_m: float = 1.0
+    max_range_m: float = 100.0
+    range_noise_m: float = 0.02
+    intensity_noise: float = 0.015
+    ring_spread: float = 0.05
+    dropout: float = 0.01
+    weakest: float = 0.06
+
+
+_FIELD_DEG = {16: (15.0, -15.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
+
+
+def lidar_of(beams: int) -> Lidar:
+    """A LiDAR by its number of beams: 16 (15 to -15 deg), 64 (2 to -24.8), 128 (15 to -25).
+
+    Raises:
+        ValueError: if there is none of so many.
+    """
+    if beams not in _FIELD_DEG:
+        known = ", ".join(map(str, _FIELD_DEG))
+        raise ValueError(f"{beams} beams: a LiDAR has one of {known}")
+    return Lidar(elevations_deg=tuple(np.linspace(*_FIELD_DEG[beams], beams).tolist()))
+
+
+def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
+    """(beams,) the gain of each beam's intensity, which a LiDAR keeps."""
+    return 1 + lidar.ring_spread * rng.standard_normal(len(lidar.elevations_deg))
+
+
+def scan(
+    world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, rng: np.random.Generator
+) -> Points:
+    """Scan the world, all of one instant: the points of a moving sensor, motion taken out.
+
+    A shot has no width: points lie on one surface or another, never between.
+
+    Args:
+        world: what is scanned.
+        lidar: the sensor.
+        gains: (beams,) of the intensities.
+        T_world_lidar: (4, 4) pose of the LiDAR, whose x is ahead, y left, z up.
+        rng: draws noise, dropouts and the order.
+
+    Returns:
+        (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in no order.
+    """
+    shots = shot_directions(lidar)
+    directions = (shots @ T_world_lidar[:3, :3].T).astype(np.float32)
+    hits = cast(world, T_world_lidar[:3, 3], directions)
+    albedo, incidence = albedos(world, directions, hits)
+    gain = np.repeat(gains, len(shots) // len(gains))
+    intensity = albedo[:, 3] * (0.55 + 0.45 * incidence) * gain
+    intensity += rng.normal(0, lidar.intensity_noise, len(shots))
+    distance = hits.distance_m + rng.normal(0, lidar.range_noise_m, len(shots))
+    kept = (distance > lidar.min_range_m) & (distance < lidar.max_range_m)
+    kept &= rng.random(len(shots)) < return_chance(lidar, albedo[:, 3] * incidence, distance)
+    order = rng.permutation(np.flatnonzero(kept))
+    xyz = shots[order] * distance[order, None]
+    return np.column_stack([xyz, intensity[order].clip(0, 1)]).astype(np.float32)
+
+
+def shot_directions(lidar: Lidar) -> Array:
+    """(beams * steps, 3) unit vectors in the LiDAR's frame, beam by beam."""
+    azimuth_deg = np.arange(-180, 180, lidar.azimuth_step_deg)
+    azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(lidar.elevations_deg))
+    flat = np.cos(elevation)
+    shots = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
+    return np.stack(shots, axis=-1).reshape(-1, 3)
+
+
+def return_chance(lidar: Lidar, brightness: Array, distance_m: Array) -> Array:
+    """(n,) chance that a shot comes back: of weak light, from dark, far or slanted surfaces, less.
+
+    Args:
+        lidar: the sensor.
+        brightness: (n,) albedo times the cosine of the angle of incidence.
+        distance_m: (n,) may be infinite.
+    """
+    light = brightness * (_REFERENCE_M / np.maximum(distance_m, lidar.min_range_m)) ** 2
+    return np.asarray((1 - lidar.dropout) * -np.expm1(-light / lidar.weakest))

@@ -1,0 +1,168 @@
+"""A simulated recording: a rig drives along a street, and its sensors' data become a dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
+from calibgraph.load import RIG_FILE
+from calibgraph.perturbation import perturb
+from calibgraph.pipeline import Progress
+from calibgraph.rig import Rig
+from calibgraph.simulation.cameras import camera_rays, render
+from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
+from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, pose
+from calibgraph.simulation.street import LANE_Y_M, Centreline, build_street, winding_line
+from calibgraph.simulation.world import World, build_world
+
+Array = NDArray[np.float64]
+
+REFERENCE_FILE = "reference.yaml"
+MAX_STREET_M = 2000
+"""Longer ones take gigabytes of memory."""
+_LIDAR_Z_M = 1.8
+_SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
+_JPEG_QUALITY = 92
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE = range(5)  # each draws from a stream of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A world, and where the LiDAR stands in it when each frame is taken.
+
+    Attributes:
+        world: the street.
+        T_world_lidar: per frame (4, 4).
+    """
+
+    world: World
+    T_world_lidar: tuple[Array, ...]
+
+
+def simulate_street(
+    out: Path | str,
+    rig: Rig,
+    *,
+    beams: int = 64,
+    frames: int = 10,
+    step_m: float = 4.0,
+    seed: int = 0,
+    rotation_deg: float = 5.0,
+    translation_m: float = 0.3,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Drive a rig along a procedural street and write what its sensors see as a dataset.
+
+    All sensors of a frame see one instant: there is no rolling shutter, and scans are free of the
+    motion. The same arguments give the same files.
+
+    Args:
+        out: folder to write: ``rig.yaml`` (the guess), ``reference.yaml`` (the truth), ``lidar``
+            and ``cameras``.
+        rig: its poses are the truth. The LiDAR is 1.8 m above a road; its x is ahead, z up.
+        beams: of the LiDAR: 16, 64 or 128.
+        frames: stops of the drive.
+        step_m: distance between stops, on average; all steps are at most 2 km.
+        seed: of the street, the drive, the noise and the guess.
+        rotation_deg: how far the guess is off; see :func:`calibgraph.perturb`.
+        translation_m: the same.
+        progress: called with what is done, how much of it, and of how much.
+
+    Returns:
+        The rig files and the folders.
+
+    Raises:
+        ValueError: if an argument is out of range.
+        FileError: if there is a recording already.
+        CalibrationError: if Open3D is missing.
+    """
+    out, lidar = Path(out), lidar_of(beams)
+    _require_range(frames, step_m)
+    guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
+    _require_empty(out)
+    tell = progress or (lambda what, done, total: None)
+    tell("building the street", 0, frames)
+    drive = street_drive(frames=frames, step_m=step_m, seed=seed)
+    _take_scans(out / "lidar", lidar, drive, seed, tell)
+    _take_pictures(out / "cameras", rig, drive, seed, tell)
+    rig.save(out / REFERENCE_FILE)
+    guess.save(out / RIG_FILE)  # last: only a whole recording is a dataset
+    return [out / RIG_FILE, out / REFERENCE_FILE, out / "lidar", out / "cameras"]
+
+
+def street_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
+    """Build a street and drive along it; see :func:`simulate_street`."""
+    rng = np.random.default_rng([seed, _WORLD])
+    length_m = (frames - 1) * step_m * (1 + _SWAY_STEP)
+    line = winding_line(length_m, rng)
+    world = build_world(build_street(line, length_m, rng), _sun(rng), rng)
+    return Drive(world, _stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
+
+
+def _sun(rng: np.random.Generator) -> Array:
+    """Unit vector towards the sun, which is neither low nor overhead."""
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
+    flat = np.cos(elevation)
+    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+
+
+def _stops(
+    line: Centreline, frames: int, step_m: float, rng: np.random.Generator
+) -> tuple[Array, ...]:
+    """Poses of the LiDAR, swaying in its lane."""
+    stops, s = [], 0.0
+    for _ in range(frames):
+        (x, y), heading_deg = line.at(s, LANE_Y_M + rng.normal(0, _SWAY_Y_M))
+        yaw, pitch, roll = rng.normal(0, _SWAY_DEG)
+        turns = (heading_deg + yaw) * UNIT_Z, pitch * UNIT_Y, roll * UNIT_X
+        stops.append(pose((x, y, _LIDAR_Z_M), *turns))
+        s += step_m * rng.uniform(1 - _SWAY_STEP, 1 + _SWAY_STEP)
+    return tuple(stops)
+
+
+def _take_scans(folder: Path, lidar: Lidar, drive: Drive, seed: int, tell: Progress) -> None:
+    gains = ring_gains(lidar, np.random.default_rng([seed, _GAINS]))
+    for frame, T_world_lidar in enumerate(drive.T_world_lidar):
+        tell("scanning", frame, len(drive.T_world_lidar))
+        rng = np.random.default_rng([seed, _SCAN, frame])
+        cloud = scan(drive.world, lidar, gains, T_world_lidar, rng)
+        _write_cloud(folder / f"{frame:06d}.npy", cloud)
+
+
+def _take_pictures(folder: Path, rig: Rig, drive: Drive, seed: int, tell: Progress) -> None:
+    """All pictures, camera by camera: the rays of one are much to keep."""
+    frames = len(drive.T_world_lidar)
+    for index, (name, camera) in enumerate(rig.cameras.items()):
+        rays = camera_rays(camera)
+        for frame, T_world_lidar in enumerate(drive.T_world_lidar):
+            tell(f"taking pictures, {name}", index * frames + frame, frames * len(rig.cameras))
+            rng = np.random.default_rng([seed, _IMAGE, index, frame])
+            T_world_camera = T_world_lidar @ np.linalg.inv(camera.T_camera_lidar)
+            image = render(drive.world, rays, T_world_camera, rng)
+            _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+            write_bytes(folder / name / f"{frame:06d}.jpg", data.tobytes())
+
+
+def _write_cloud(path: Path, cloud: NDArray[np.float32]) -> None:
+    write_atomically(path, lambda temporary: np.save(temporary, cloud))
+
+
+def _require_range(frames: int, step_m: float) -> None:
+    if not (frames >= 1 and 0 <= step_m * frames <= MAX_STREET_M):
+        raise ValueError(
+            f"{frames} frames, {step_m} m apart: expected at least 1 frame, and 0 to "
+            f"{MAX_STREET_M} m in all"
+        )
+
+
+def _require_empty(out: Path) -> None:
+    require_place_for_folder(out)
+    for path in (out / "lidar", out / "cameras", out / RIG_FILE, out / REFERENCE_FILE):
+        if path.exists():
+            raise FileError(path, "is there already; write into another folder, or remove it")

@@ -1,0 +1,245 @@
+"""A procedural street that winds: ground with markings, houses, trees, poles, cars, people.
+
+Frames: the world is x ahead on the whole, y left, z up; a place in the street is its distance s
+along the centreline and its distance y to the left of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.simulation.mesh import Mesh, mesh_of, mesh_of_solid, ribbon
+from calibgraph.simulation.paints import (
+    ASPHALT,
+    BARK,
+    BAY_M,
+    COLOURS,
+    FACADE,
+    GRASS,
+    KERB,
+    KERB_Y_M,
+    LANE_M,
+    LEAFY,
+    PAVING,
+    PLAIN,
+    ROAD,
+    ROOFING,
+    SLABS,
+    SLATS,
+    STEEL,
+    STOREY_M,
+    TILES,
+    TRIM,
+    Albedo,
+    Paint,
+)  # fmt: skip
+from calibgraph.simulation.solids import (
+    CAR,
+    FURNITURE,
+    HEDGE,
+    PERSON,
+    SLANTED_CAR,
+    STRETCH_M,
+    TREE,
+    UNPAINTED,
+    VAN,
+    Solid,
+    box,
+    cylinder,
+    place,
+)  # fmt: skip
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+
+MARGIN_M = 70.0
+"""How far the street goes on behind the first stop and beyond the last."""
+LANE_Y_M = -LANE_M / 2
+_PAVEMENT_Y_M, _GROUND_Y_M = 9.36, 24.0
+_WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wavelength [m]
+_STEP_M = 1.0
+_PARKED, _ONCOMING, _GAP, _BALCONIES, _GABLE, _ROADSIDE_TREE = 0.6, 0.35, 0.15, 0.4, 0.6, 0.45
+_CLEAR_M = 14.0
+_KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
+
+
+@dataclass(frozen=True, eq=False)
+class Centreline:
+    """The line that a street follows.
+
+    Attributes:
+        along_m: (k,) distances s along it, rising.
+        xy_m: (k, 2) places.
+        heading_rad: (k,) directions, unwrapped.
+    """
+
+    along_m: Array
+    xy_m: Array
+    heading_rad: Array
+
+    def at(self, s_m: float, y_m: float) -> tuple[tuple[float, float], float]:
+        """The place (x, y) [m] that is ``y_m`` to the left of the line, and the heading [deg]."""
+        x, y = (np.interp(s_m, self.along_m, column) for column in self.xy_m.T)
+        heading = np.interp(s_m, self.along_m, self.heading_rad)
+        place_m = float(x - y_m * np.sin(heading)), float(y + y_m * np.cos(heading))
+        return place_m, float(np.degrees(heading))
+
+    @property
+    def with_left(self) -> Array:
+        """(k, 4) the places, and the unit vectors to the left."""
+        left = [-np.sin(self.heading_rad), np.cos(self.heading_rad)]
+        return np.column_stack([self.xy_m, *left])
+
+
+def winding_line(length_m: float, rng: Rng) -> Centreline:
+    """A line that winds about the x axis, from ``MARGIN_M`` behind 0 to as much beyond."""
+    along = np.arange(-MARGIN_M, length_m + MARGIN_M + _STEP_M, _STEP_M)
+    phases = rng.uniform(0, 2 * np.pi, len(_WINDING))
+    heading = sum(
+        amplitude * np.sin(2 * np.pi * along / wavelength + phase)
+        for (amplitude, wavelength), phase in zip(_WINDING, phases, strict=True)
+    )
+    steps = _STEP_M * np.column_stack([np.cos(heading), np.sin(heading)])
+    xy = np.cumsum(steps, axis=0) - steps / 2
+    xy -= xy[np.searchsorted(along, 0.0)]
+    return Centreline(along, xy, np.asarray(heading))
+
+
+def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
+    """Compose a street along a line; the lane at ``LANE_Y_M`` is free from 0 to ``length_m``."""
+    solids = [*_cars(line, length_m, rng), *_backdrop(line, rng)]
+    for side in (1, -1):
+        solids += [*_houses(line, side, rng), *_roadside(line, side, rng)]
+    return mesh_of([*_ground(line), *map(mesh_of_solid, solids)])
+
+
+def _ground(line: Centreline) -> Iterator[Mesh]:
+    """Road, kerbs, pavements and grass, and a plain to the horizon."""
+    yield mesh_of_solid(box((0, 0, -1.05), (4000, 4000, 1), GRASS, LEAFY))
+    yield _band(line, ((KERB_Y_M, 0), (-KERB_Y_M, 0)), ASPHALT, ROAD)
+    kerb, paving, lawn = (KERB_Y_M, 0.15), (KERB_Y_M + 0.16, 0.15), (_PAVEMENT_Y_M, 0.1)
+    for side in (1, -1):
+        for (y, z), (y_next, z_next), albedo, paint in (
+            ((KERB_Y_M, 0.0), kerb, KERB, PLAIN),
+            (kerb, paving, KERB, PLAIN),
+            (paving, (_PAVEMENT_Y_M, 0.15), PAVING, SLABS),
+            ((_PAVEMENT_Y_M, 0.15), lawn, KERB, PLAIN),
+            (lawn, (_GROUND_Y_M, 0.1), GRASS, LEAFY),
+        ):
+            yield _band(line, ((side * y, z), (side * y_next, z_next)), albedo, paint)
+
+
+def _band(
+    line: Centreline,
+    edges_m: tuple[tuple[float, float], tuple[float, float]],
+    albedo: Albedo,
+    paint: Paint,
+) -> Mesh:
+    return ribbon(line.with_left, line.along_m, edges_m, albedo, paint)
+
+
+def _stand(
+    line: Centreline, parts: Iterable[Solid], s_m: float, y_m: float, *, yaw_deg: float,
+    body: Albedo,
+) -> list[Solid]:  # fmt: skip
+    """Stand parts in the street, turned with it."""
+    xy, heading_deg = line.at(s_m, y_m)
+    return place(parts, xy, yaw_deg=heading_deg + yaw_deg, body=body)
+
+
+def _any_colour(rng: Rng) -> Albedo:
+    return COLOURS[rng.integers(len(COLOURS))]
+
+
+def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
+    """Cars ahead, behind, oncoming, and parked on both sides."""
+    first, last = line.along_m[[0, -1]]
+    places = [(length_m + _CLEAR_M + 6, LANE_Y_M, 0.0), (-_CLEAR_M, LANE_Y_M, 0.0)]
+    for s in np.arange(first, last, 12.0):
+        if rng.random() < _ONCOMING:
+            places.append((s + rng.uniform(-3, 3), -LANE_Y_M, 180.0))
+    for side in (1, -1):
+        for s in np.arange(first, last, 6.0):
+            if rng.random() < _PARKED:
+                places.append((s + 3 + rng.normal(0, 0.3), side * 4.75, 0.0))
+    for s, y, yaw_deg in places:
+        kind = _KINDS[rng.choice(len(_KINDS), p=_KIND_SHARES)]
+        turned = yaw_deg + rng.normal(0, 2) + 180 * rng.integers(2)
+        yield from _stand(line, kind, s, y, yaw_deg=turned, body=_any_colour(rng))
+
+
+def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
+    """Rows of houses with gaps, in which there are fences and hedges."""
+    s, turned = line.along_m[0], 0.0 if side > 0 else 180.0
+    while s < line.along_m[-1]:
+        bays, storeys = int(rng.integers(3, 6)), int(rng.integers(2, 5))
+        front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * BAY_M / 2
+        if rng.random() < _GAP:
+            yield from _stand(line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK)
+            yield from _stand(line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK)
+            s += 11
+            continue
+        parts, body = list(_house(bays, storeys, rng)), _any_colour(rng)
+        yield from _stand(line, parts, middle, side * front, yaw_deg=turned, body=body)
+        s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < _GAP else 0)
+
+
+def _house(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
+    """A house; its front is at y = 0, its middle at x = 0."""
+    width, depth, height = bays * BAY_M, 4 * BAY_M, storeys * STOREY_M
+    walls = box((0, depth / 2, 0), (width, depth, height), UNPAINTED, FACADE)
+    yield replace(walls, uv_from_m=(3 * BAY_M * rng.integers(100), 0.0))
+    if rng.random() < _GABLE:
+        eaves = box((0, depth / 2, height), (width + 0.4, depth + 0.8, 2.8), TILES, ROOFING)
+        yield replace(eaves, taper=(0.97, 0.02))
+    else:
+        yield box((0, depth / 2, height), (width + 0.3, depth + 0.3, 0.5), TRIM)
+    yield box((rng.uniform(-0.3, 0.3) * width, depth / 2, height), (0.7, 0.9, 3.6), BARK)
+    yield cylinder((width / 2 - 0.1, -0.08, 0), (0.12, 0.12, height), STEEL)
+    yield box((BAY_M * 1.5 - width / 2, -0.45, 0), (1.6, 0.9, 0.35), PAVING)
+    if rng.random() < _BALCONIES:
+        yield from _balconies(bays, storeys, rng)
+
+
+def _balconies(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
+    for bay, storey in np.ndindex(bays, storeys - 1):
+        if rng.random() < _BALCONIES:
+            x, z = (bay + 0.5 - bays / 2) * BAY_M, (storey + 1) * STOREY_M
+            yield box((x, -0.55, z), (2.0, 1.1, 0.14), TRIM)
+            yield box((x, -1.07, z + 0.14), (2.0, 0.05, 0.95), STEEL, SLATS)
+
+
+def _roadside(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
+    """What stands on the pavements, and the people on them."""
+    turned = 0.0 if side > 0 else 180.0
+    for s in np.arange(line.along_m[0], line.along_m[-1], STRETCH_M) + rng.uniform(-1, 1):
+        colour, body = _any_colour(rng), _any_colour(rng)
+        yield from _stand(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
+        person, person_y = s + rng.uniform(-5, 5), side * (KERB_Y_M + rng.uniform(1.2, 2.8))
+        yield from _stand(line, PERSON, person, person_y, yaw_deg=0, body=body)
+        if rng.random() < _ROADSIDE_TREE:
+            yaw, tree_y = rng.uniform(0, 360), side * (_PAVEMENT_Y_M - 0.5)
+            yield from _stand(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
+
+
+def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
+    """Blocks behind the houses, and across both ends of the street."""
+    for side in (1, -1):
+        x = line.xy_m[0, 0] - 40
+        while x < line.xy_m[-1, 0] + 40:
+            bays, storeys = int(rng.integers(4, 8)), int(rng.integers(3, 7))
+            xy = x + bays * BAY_M / 2, side * (48 + rng.uniform(-4, 4))
+            body = _any_colour(rng)
+            yield from place(_block(bays, 4, storeys), xy, yaw_deg=rng.normal(0, 4), body=body)
+            x += bays * BAY_M + rng.uniform(0, 8)
+    for s in line.along_m[[0, -1]]:
+        yield from _stand(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=_any_colour(rng))
+
+
+def _block(bays_along: int, bays_across: int, storeys: int) -> list[Solid]:
+    size = bays_along * BAY_M, bays_across * BAY_M, storeys * STOREY_M
+    return [box((0, 0, 0), size, UNPAINTED, FACADE)]
