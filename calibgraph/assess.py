@@ -43,6 +43,7 @@ Alone = tuple[Poses, Array | None]
 """Poses without priors and relative poses, and their (6 M, 6 M) covariance."""
 
 PULLED_SIGMAS = 4.0
+APART_WARN, APART_FAIL = 0.35, 0.9
 PRIOR_WARN = 0.5
 """Share of a result above which it says more of the priors than of the data."""
 
@@ -240,13 +241,24 @@ def _causes(fit: Fit, guess: Rig, camera: str) -> list[Check]:
     return checks if matches is None else [*checks, points_check(matches)]
 
 
+def _apart_check(counts: Mapping[str, int]) -> Check:
+    return above(
+        "frames apart from where they are densest",
+        counts["frames_apart"] / max(1, counts["frames"]),
+        APART_WARN,
+        APART_FAIL,
+        "share",
+        "few frames decide against many; check what differs between them",
+    )
+
+
 def _trials(fit: Fit, name: str, evidence: Evidence) -> list[Check]:
     """What is asked of a camera's result beyond its own residuals."""
     matches, T = fit.problem.matches.get(name), fit.poses[name]
     camera = fit.rig.cameras[name]
     if matches is None or not fit.problem.fits_matches:
         return []
-    checks = [rival_check(fit, name)]
+    checks = [rival_check(fit, name), _apart_check(fit.counts[name])]
     if fit.config.loss_scale_px is not None and evidence.residuals is not None:
         checks.append(assumed_spread_check(evidence.residuals, fit.config.loss_scale_px))
     if evidence.halves is not None:

@@ -60,6 +60,9 @@ class Config(BaseModel):
         gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
         confidence_min: c_min.
         confidence_weights: weigh residuals by sqrt(clip(c, 0.1, 1)), else uniformly.
+        learnt_weights: weigh frames and confidences by what the residuals say of them, and leave
+            out frames that are far from where frames are densest; where per-camera estimates come
+            from PnP.
         grid_columns, grid_rows: cells of the image in which only the best match is kept.
         matches_max: cap per camera and frame.
         stage1: where the per-camera estimates T_hat come from: ``pnp``, one pose per frame,
@@ -83,6 +86,7 @@ class Config(BaseModel):
     gate_px: Pixels | None = None
     confidence_min: Annotated[float, Field(ge=0, le=1)] = 0.1
     confidence_weights: bool = False
+    learnt_weights: bool = True
     grid_columns: Cells = 40
     grid_rows: Cells = 25
     matches_max: Annotated[int, Field(gt=0)] = 10_000
@@ -114,6 +118,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "loss_scale_px": 4.0,
         "gate_px": 3.0,
         "confidence_min": 0.1,
+        "learnt_weights": False,
     },
     "walkley": {
         "prior_weight": 2.0,
@@ -122,6 +127,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "gate_px": 16.0,
         "confidence_min": 0.2,
         "confidence_weights": True,
+        "learnt_weights": False,
     },
 }
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)

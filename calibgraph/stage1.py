@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -36,11 +37,13 @@ class Stage1:
 
     Attributes:
         T_camera_lidar: per camera with at least one solved frame, (4, 4): T_hat of the paper.
-        per_frame: per camera, (f, 4, 4) the poses of its frames that did not fail.
+        solved: per camera, (4, 4) the poses that PnP gave, by the frames' numbers.
+        per_frame: per camera, (f, 4, 4) those that are not far from all others.
         failed_frames: per camera, how many frames gave no pose, or one far from all others.
     """
 
     T_camera_lidar: dict[str, Array]
+    solved: dict[str, dict[int, Array]]
     per_frame: dict[str, Array]
     failed_frames: dict[str, int]
 
@@ -50,21 +53,28 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
 
     Args:
         rig: lenses; its poses are not used.
-        table: preprocessed correspondences.
+        table: preprocessed correspondences, those of a camera sorted by frame.
         config: ``aggregate``, ``pnp_threshold_px``, ``seed``.
     """
-    estimates, per_frame, failed = {}, {}, {}
+    stage1 = Stage1({}, {}, {}, {})
     with ThreadPoolExecutor() as pool:
         for name, camera in rig.cameras.items():
             rows = table.of_camera(name)
-            frames = [rows.select(rows.frame == frame) for frame in np.unique(rows.frame)]
+            numbers, starts = np.unique(rows.frame, return_index=True)
+            edges = np.append(starts, len(rows))
+            frames = [rows.select(slice(*edge)) for edge in pairwise(edges)]
             poses = pool.map(lambda f, c=camera: frame_pose(c, f, config), frames)
-            solved = np.array([p for p in poses if p is not None]).reshape(-1, 4, 4)
-            per_frame[name] = solved[agreeing(solved)]
-            failed[name] = len(frames) - len(per_frame[name])
+            found = {
+                int(n): pose for n, pose in zip(numbers, poses, strict=True) if pose is not None
+            }
+            solved = np.array([*found.values()]).reshape(-1, 4, 4)
+            stage1.solved[name] = found
+            stage1.per_frame[name] = solved[agreeing(solved)]
+            stage1.failed_frames[name] = len(frames) - len(stage1.per_frame[name])
             if len(solved):
-                estimates[name] = aggregate(per_frame[name], config.aggregate)
-    return Stage1(estimates, per_frame, failed)
+                estimate = aggregate(stage1.per_frame[name], config.aggregate)
+                stage1.T_camera_lidar[name] = estimate
+    return stage1
 
 
 def frame_pose(camera: Camera, matches: Correspondences, config: Config) -> Array | None:

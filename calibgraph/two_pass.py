@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,32 +14,41 @@ from calibgraph.config import TERMS, Config, Terms
 from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph import pose_graph
+from calibgraph.learnt_weights import Weighed, learn_weights
 from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
-from calibgraph.preprocess import FILTERS, preprocess
+from calibgraph.preprocess import FILTERS, preprocess, preprocess_file
 from calibgraph.problem import Clock, Fit, Poses, Problem
 from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
 
 Array = NDArray[np.float64]
 
+_JUDGED_MATCHES = 5000  # of a camera, to choose where to start
+
 
 def solve(
-    rig: Rig, table: Correspondences, config: Config | None = None, terms: Terms = "full"
+    rig: Rig,
+    table: Correspondences | Path | str,
+    config: Config | None = None,
+    terms: Terms = "full",
 ) -> Calibration:
     """Calibrate all cameras of a rig jointly from correspondences.
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
-        table: correspondences; their points are in the LiDAR frame.
+        table: correspondences, their points in the LiDAR frame; or the file that holds them, which
+            may be larger than memory: what the preprocessing keeps is held, nothing else.
         config: settings; the preset ``auto`` if None.
         terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
             ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are
             measurements and take part in all but ``stage1``.
 
     Returns:
-        The calibration, with a verdict that says whether it can be used.
+        The calibration, with a verdict that says whether it can be used, and the preprocessed
+        correspondences.
 
     Raises:
+        FileError: if the file cannot be read, or holds wrong values.
         CorrespondenceError: if a camera cannot be determined: fewer than 6 usable correspondences
             and no relative pose that ties it to a camera that has more.
         ValueError: if ``terms`` is unknown.
@@ -47,20 +57,39 @@ def solve(
 
 
 def fit(
-    rig: Rig, table: Correspondences, config: Config | None = None, terms: Terms = "full"
+    rig: Rig,
+    table: Correspondences | Path | str,
+    config: Config | None = None,
+    terms: Terms = "full",
+    *,
+    stage1: Stage1 | None = None,
 ) -> Fit:
-    """The two passes alone, see :func:`solve`; nothing is judged."""
+    """The two passes alone, see :func:`solve`; nothing is judged.
+
+    The pairwise estimates may be given as ``stage1``, if they are known: to compare solves of the
+    same correspondences without the PnP of every frame again.
+    """
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config = config or Config()
     clock = Clock()
     with clock("preprocess"):
-        kept = preprocess(rig, table, config)
+        if isinstance(table, Correspondences):
+            kept = preprocess(rig, table, config)
+        else:
+            kept = preprocess_file(rig, table, config)
         _require_determined(rig, kept.counts)
         matches = matches_by_camera(rig, kept.table, config)
     with clock("stage1"):
-        stage1 = _stage1(rig, kept.table, config)
-        start = _start(rig, matches, stage1.T_camera_lidar, config=config, terms=terms)
+        stage1 = stage1 or _stage1(rig, kept.table, config)
+        start = _start(rig, matches, stage1, config=config, terms=terms)
+    apart: dict[str, int] = {}
+    if config.learnt_weights and config.stage1 == "pnp" and terms in ("full", "reprojection"):
+        with clock("weights"):
+            weighed = _weighed(kept.table, matches, stage1, start)
+        matches = {name: w.matches for name, w in weighed.items()}
+        start |= {name: w.T_camera_lidar for name, w in weighed.items()}
+        apart = {name: w.frames_apart for name, w in weighed.items()}
     known = pose_graph(rig, stage1.T_camera_lidar, config, terms)
     problem = Problem(tuple(rig.cameras), matches, known, terms)
     with clock("pass1"):
@@ -70,17 +99,31 @@ def fit(
         optimum = inliers.minimize(poses, scales)
     return Fit(
         rig=rig,
-        metadata=table.metadata,
-        systematic_sigmas=table.systematic_sigmas,
+        table=kept.table,
         config=config,
         problem=problem,
         inliers=inliers,
         scales=scales,
         optimum=optimum,
         stage1_T_camera_lidar=stage1.T_camera_lidar,
-        counts=_counts(kept.counts, problem, inliers, stage1),
+        counts=_counts(kept.counts, problem, inliers, stage1, apart),
         clock=clock,
     )
+
+
+def _weighed(
+    table: Correspondences, matches: Mapping[str, Matches], stage1: Stage1, start: Poses
+) -> dict[str, Weighed]:
+    """The matches of every camera, weighted by what their residuals say."""
+    return {
+        name: learn_weights(
+            given,
+            table.of_camera(name).confidence.astype(np.float64),
+            start[name],
+            stage1.solved.get(name, {}),
+        )
+        for name, given in matches.items()
+    }
 
 
 def judged(fit: Fit, guess: Rig | None = None) -> Calibration:
@@ -108,6 +151,7 @@ def judged(fit: Fit, guess: Rig | None = None) -> Calibration:
         weaknesses=assessment.weaknesses,
         prior_share=assessment.prior_share,
         bootstrap=assessment.bootstrap,
+        correspondences=fit.table,
     )
 
 
@@ -148,24 +192,25 @@ def _why_few(count: Mapping[str, int]) -> str:
 def _stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     if config.stage1 == "rig":
         named = [name for name in rig.cameras if name in table.cameras]
-        return Stage1({name: rig.cameras[name].T_camera_lidar for name in named}, {}, {})
+        return Stage1({name: rig.cameras[name].T_camera_lidar for name in named}, {}, {}, {})
     return estimate_stage1(rig, table, config)
 
 
 def _start(
     rig: Rig,
     matches: Mapping[str, Matches],
-    T_hat: Mapping[str, Array],
+    stage1: Stage1,
     *,
     config: Config,
     terms: Terms,
 ) -> Poses:
     """Where the first pass starts.
 
-    Per camera it is the better of Stage 1 and the rig's guess, by the errors of the matches with a
-    Cauchy loss of the PnP's threshold; with the terms ``stage1``, Stage 1 itself. Cameras
-    without matches start where a relative pose puts them.
+    Per camera it is the best of Stage 1, the poses of single frames and the rig's guess, by the
+    errors of the matches of all frames with a Cauchy loss of half the PnP's threshold; with the
+    terms ``stage1``, Stage 1 itself. Cameras without matches start where a relative pose puts them.
     """
+    T_hat = stage1.T_camera_lidar
     start = {}
     for name in matches:
         if terms == "stage1" and name not in T_hat:
@@ -176,10 +221,8 @@ def _start(
             )
         candidates = [T_hat[name]] if name in T_hat else []
         if terms != "stage1":
-            candidates.append(rig.cameras[name].T_camera_lidar)
-        errors = [matches[name].errors_px(T)[0] / config.pnp_threshold_px for T in candidates]
-        costs = [float(np.mean(np.log1p(e**2))) for e in errors]
-        start[name] = candidates[int(np.argmin(costs))]
+            candidates += [rig.cameras[name].T_camera_lidar, *stage1.solved.get(name, {}).values()]
+        start[name] = _best(candidates, matches[name], config.pnp_threshold_px / 2)
     for _ in rig.cameras:
         for pair in rig.relative_poses:
             if pair.b in start:
@@ -189,8 +232,20 @@ def _start(
     return {name: start[name] for name in rig.cameras}
 
 
+def _best(candidates: Sequence[Array], matches: Matches, scale_px: float) -> Array:
+    """The pose with the least mean Cauchy loss, judged by an even selection of the matches."""
+    step = -(-len(matches.frame) // _JUDGED_MATCHES)
+    judged = matches.select(np.arange(len(matches.frame)) % step == 0)
+    errors = [judged.errors_px(T)[0] / scale_px for T in candidates]
+    return candidates[int(np.argmin([np.mean(np.log1p(e**2)) for e in errors]))]
+
+
 def _counts(
-    filters: Mapping[str, Mapping[str, int]], problem: Problem, inliers: Problem, stage1: Stage1
+    filters: Mapping[str, Mapping[str, int]],
+    problem: Problem,
+    inliers: Problem,
+    stage1: Stage1,
+    apart: Mapping[str, int],
 ) -> dict[str, dict[str, int]]:
     """Per camera: correspondences left after each filter and the gate, and its frames."""
     counts = {}
@@ -202,7 +257,8 @@ def _counts(
         counts[name] = {
             **before,
             "used": len(used),
-            "frames": len(np.unique(given)),
+            "frames": len(np.unique(given)) + apart.get(name, 0),
+            "frames_apart": apart.get(name, 0),
             "frames_used": len(np.unique(used)),
             "frames_without_pnp": stage1.failed_frames.get(name, 0),
         }

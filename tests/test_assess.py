@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import gtsam
 import numpy as np
 import pytest
@@ -248,7 +250,9 @@ class TestSmells:
     def test_a_shifted_centre_is_worth_a_warning(self, pair: Rig) -> None:
         result = solve(with_lens(pair, cx=20.0), simulated(pair))
         (check,) = named(result, "left", "principal point")
-        assert check.status == "WARN" and "off by (-2" in check.text
+        assert check.status == "WARN"
+        (found,) = re.findall(r"off by \((-[0-9.]+), ", check.text)
+        assert abs(float(found) + 20) < 1
 
     def test_what_hangs_on_the_focal_length_is_told(self, pair: Rig) -> None:
         far = solve(pair, simulated(pair, depth_m=(40.0, 80.0)))

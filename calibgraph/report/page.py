@@ -42,6 +42,7 @@ _FILTERS = {
     "frames": "frames with correspondences",
     "frames_used": "frames with used correspondences",
     "frames_waiting": "frames that wait for more of their kind",
+    "frames_apart": "frames left out, far from where frames are densest",
     "frames_without_pnp": "frames in which PnP found no pose",
 }
 _OVERLAY_HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen

@@ -1,0 +1,216 @@
+"""Frames that a matcher saw wrongly, and how much the others are worth: weights from residuals.
+
+The matches of one frame share errors: a learned matcher that stops short moves all of them, and
+thousands of matches then agree on a wrong pose. So frames are random effects: each has a pose of
+its own, which scatters about the camera's. A frame counts by the spread of its matches about its
+own pose and by that scatter, whatever the number of its matches; frames far from where frames are
+densest do not count at all. Confidences are turned into standard deviations by what they are worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+from calibgraph.graph import to_T_lidar_camera
+from calibgraph.matches import CAUCHY_SCALE_SIGMAS, Matches, robust_spread
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 8  # of fewer, frames say too little of each other: weights would flatter the error bar
+_OWN_STEPS = 6  # towards a frame's own pose
+_MAX_TURN_RAD = 0.05  # per step
+_DAMPING = 1e-6  # of a frame that leaves a direction free
+_NEAREST_SHARE = 0.15  # of the frames, whose distance is the unit of nearness
+_NARROW = 3.0  # units of reach while where frames are densest is looked for
+_REACH = 4.0  # units from there at which a frame does not count any more
+_FLAT = 2.0  # frames count in full up to half the reach
+_WIDER = 2.2  # nearness to spread: the median of a Rayleigh law over its quantile of that share
+_MOVING_STEPS, _STEPS = 5, 15  # of the mean shift: looking, and in all
+_CANDIDATES, _JUDGED_MATCHES = 200, 5000  # where to start looking
+_MOST = 1e6  # of a spread: a frame that is all behind its camera has none
+_FAR = 1e3  # spreads, beyond which matches are alike
+_SETTLED = 1e-6  # rad, m
+_CONFIDENCE_BINS, _BIN_MATCHES = 20, 100
+_LEAST_SIZE = 0.05  # of a frame's spread, which is not below MIN_SIGMA_PX
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """Matches of one camera, weighted by what they are worth.
+
+    Attributes:
+        matches: without those of frames apart.
+        T_camera_lidar: (4, 4) where the frames are densest.
+        frames_apart: how many frames do not count.
+    """
+
+    matches: Matches
+    T_camera_lidar: Array
+    frames_apart: int
+
+
+def learn_weights(
+    matches: Matches,
+    confidence: Array,
+    T_camera_lidar: Array,
+    own: Mapping[int, Array],
+) -> Weighed:
+    """Weigh the matches of one camera by what their residuals say of frames and confidences.
+
+    Args:
+        matches: of one camera.
+        confidence: (n,) of its matches.
+        T_camera_lidar: (4, 4) where to start; a wrong majority of frames does not matter then.
+        own: (4, 4) poses of frames that are known, by PnP.
+    """
+    edges = matches.frame_edges
+    if len(edges) - 1 < MIN_FRAMES:
+        return Weighed(matches, T_camera_lidar, 0)
+    numbers = matches.frame[edges[:-1]]
+    parts = [matches.select(np.arange(*edge)) for edge in pairwise(edges)]
+    frames = _at_own_poses(parts, [own.get(int(n), T_camera_lidar) for n in numbers])
+    sigmas = confidence_sigmas(frames.sizes, confidence)
+    start = _best(matches, frames, T_camera_lidar)
+    T_consensus, weights = _consensus(frames, start)
+    each = np.repeat(weights, np.diff(edges))
+    counted = each > 0
+    kept = matches.select(counted).weighted(each[counted] / sigmas[counted] ** 2)
+    return Weighed(kept, T_consensus, int(np.count_nonzero(weights == 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """The frames of a camera, each at its own pose.
+
+    Attributes:
+        poses: (f,) T_lidar_camera.
+        counts: (f,) matches.
+        spreads: (f,) of whitened residuals about the own pose.
+        hessians: (f, 6, 6) of whitened residuals there.
+        sizes: (n,) of the residuals there, relative to the frame's spread; in medians of a standard
+            Gaussian.
+    """
+
+    poses: tuple[gtsam.Pose3, ...]
+    counts: Array
+    spreads: Array
+    hessians: Array
+    sizes: Array
+
+
+def _consensus(frames: _Frames, start: gtsam.Pose3) -> tuple[Array, Array]:
+    """Where frames are densest, (4, 4) T_camera_lidar, and (f,) their weights, at most 1.
+
+    Mean shift over the frames' own poses, with a kernel that is zero beyond a reach. Distances are
+    root mean square displacements of a frame's whitened pixels; the unit of the reach is that of
+    the nearest frames, so that frames which all err alike are all near. Once it stands still the
+    reach is widened, not to lose good frames.
+    """
+    pose = start
+    noise = 6 * frames.spreads**2 / frames.counts  # mean square that noise displaces pixels by
+    least = float(np.median(noise))
+    for step in range(_STEPS):
+        away = np.array([pose.localCoordinates(other) for other in frames.poses])
+        shift = np.einsum("fi,fij,fj->f", away, frames.hessians, away) / frames.counts
+        if step < _MOVING_STEPS:
+            reach = _NARROW**2 * max(_of_nearest(shift, fewest=2), least)
+        elif step == _MOVING_STEPS:
+            unit = min(robust_spread(np.sqrt(shift)) ** 2, _WIDER**2 * _of_nearest(shift, fewest=3))
+            reach = _REACH**2 * max(unit, least)
+        near = np.clip(_FLAT * (1 - np.sqrt(shift / reach)), 0, 1)
+        if not near.any():  # no two frames agree: there is nothing to learn
+            return start.inverse().matrix(), np.ones(len(near))
+        scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
+        weights = near / (frames.spreads**2 + frames.counts * scatter / 6)
+        pull = np.einsum("f,fij,fj->i", weights, frames.hessians, away)
+        move = np.linalg.solve(_damped(np.einsum("f,fij->ij", weights, frames.hessians)), pull)
+        pose = pose.retract(move)
+        if step > _MOVING_STEPS and np.abs(move).max() < _SETTLED:
+            break
+    return pose.inverse().matrix(), weights / weights.max()
+
+
+def _best(matches: Matches, frames: _Frames, T_camera_lidar: Array) -> gtsam.Pose3:
+    """The pose that explains most matches of all frames best: a frame's own, or the given one.
+
+    By a Cauchy loss on the scale of the matches' spread within frames, over an even selection.
+    """
+    every = -(-len(matches.frame) // _JUDGED_MATCHES)
+    judged = matches.select(np.arange(0, len(matches.frame), every))
+    scale = CAUCHY_SCALE_SIGMAS * float(np.median(frames.spreads))
+    each = -(-len(frames.poses) // _CANDIDATES)
+    candidates = [to_T_lidar_camera(T_camera_lidar), *frames.poses[::each]]
+    costs = [
+        np.mean(np.log1p(np.minimum(_whitened_sizes(judged, pose) / scale, _FAR) ** 2))
+        for pose in candidates
+    ]
+    return candidates[int(np.argmin(costs))]
+
+
+def _of_nearest(shift: Array, *, fewest: int) -> float:
+    nearest = max(fewest, int(np.ceil(_NEAREST_SHARE * len(shift))))
+    return float(np.sort(shift)[nearest - 1])
+
+
+def _at_own_poses(parts: list[Matches], starts: list[Array]) -> _Frames:
+    """Fit every frame alone, robustly, by damped Gauss-Newton steps."""
+    poses, spreads, hessians, sizes = [], [], [], []
+    for part, start in zip(parts, starts, strict=True):
+        pose = to_T_lidar_camera(start)
+        for _ in range(_OWN_STEPS):
+            own = _whitened_sizes(part, pose)
+            spread = min(max(robust_spread(own[np.isfinite(own)]), part.least_spread), _MOST)
+            sums = replace(part.block, scale=CAUCHY_SCALE_SIGMAS * spread).sums(pose)
+            step = -np.linalg.solve(_damped(sums.hessian), sums.gradient)
+            step *= min(1.0, _MAX_TURN_RAD / max(float(np.abs(step[:3]).max()), 1e-12))
+            pose = pose.retract(step)
+        poses.append(pose)
+        spreads.append(spread)
+        hessians.append(sums.hessian)
+        sizes.append(own / spread)
+    counts = np.array([len(part.frame) for part in parts], dtype=np.float64)
+    together = np.concatenate(sizes)
+    return _Frames(tuple(poses), counts, np.array(spreads), np.array(hessians), together)
+
+
+def _damped(hessian: Array) -> Array:
+    """A Hessian that can be solved with, though it leaves directions free."""
+    least = np.finfo(float).tiny
+    return np.asarray(hessian + np.diag(_DAMPING * np.diag(hessian) + least))
+
+
+def _whitened_sizes(part: Matches, pose: gtsam.Pose3) -> Array:
+    """(n,) sizes of whitened residuals, infinite where a point is not projectable."""
+    T = pose.inverse().matrix()
+    sizes = np.full(len(part.frame), np.inf)
+    sizes[part.errors_px(T)[1]] = part.sizes(T)[1]
+    return sizes
+
+
+def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
+    """How large errors are by their confidence: (n,) standard deviations, relative to the median.
+
+    Monotone: errors do not grow with confidence. Where confidences say nothing they come out alike.
+
+    Args:
+        sizes: (n,) of whitened residuals, in medians of a standard Gaussian.
+        confidence: (n,) the higher, the better.
+    """
+    known = np.flatnonzero(np.isfinite(sizes))
+    order = known[np.argsort(confidence[known], kind="stable")]
+    if len(order) < 2 * _BIN_MATCHES or confidence[order[0]] == confidence[order[-1]]:
+        return np.ones(len(sizes))
+    groups = np.array_split(order, min(_CONFIDENCE_BINS, len(order) // _BIN_MATCHES))
+    spreads = np.array([max(robust_spread(sizes[group]), _LEAST_SIZE) for group in groups])
+    counts = np.array([len(group) for group in groups])
+    middles = np.array([np.median(confidence[group]) for group in groups])
+    falling = isotonic_regression(np.log(spreads), weights=counts, increasing=False).x
+    learnt = np.exp(np.interp(confidence, middles, falling))
+    return np.asarray(learnt / np.median(learnt))
