@@ -1,163 +1,164 @@
 """Solve time: ours against the paper's own way (SciPy) and against separate GTSAM factors.
 
-All minimize the same objective (paper, Eq. 5: Cauchy on the reprojection error, both priors) from
-the same start, on simulated correspondences: 2 cameras, N frames, 1000 matches each, 15 % outliers.
-The costs beside the times are all evaluated by one function. Run with ``make bench``.
+    python benchmarks/solve.py [--frames 10 100 1000] [--cameras 2 6 12] [--longest-s 300]
+
+All minimize the same objective (paper, Eq. 5: Cauchy on the reprojection error, both priors, the
+relative one over each camera with the next) from the same start, on simulated correspondences: N
+frames, 1000 matches each in every camera, 15 % outliers; a stereo pair, or a ring of cameras. Ours
+and SciPy's TRF do both passes: fit, drop what lies beyond the gate, fit again from there. What is
+dropped is the same for both. The costs beside the times are all evaluated by one function. A way
+that would take longer than --longest-s by what it took for fewer correspondences, or whose Jacobian
+would not fit, is not run.
+
+CPU: processor time of all threads, which other work on the machine does not add to; the ratios are
+of this. Ours is the least of several runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph import Camera, Intrinsics, MatcherErrors, Rig, perturb, simulate_correspondences
-from calibgraph.correspondences import Correspondences
-from calibgraph.graph import (
-    joined,
-    optimize,
-    pose_key,
-    prior_graph,
-    projection_graph,
-    relative_prior_graph,
-    values_of,
-)
-from factors import ProjectionBlock, projection_factor
+from calibgraph import Camera, MatcherErrors, Rig, perturb, preset, simulate_correspondences
+from calibgraph.bench.baselines import minimize_trf, prior_rows
+from calibgraph.graph import joined, pose_graph, pose_key, values_of
+from calibgraph.matches import matches_by_camera
+from calibgraph.problem import Problem
+from calibgraph.simulation.rigs import rig_of
+from factors import projection_factor
 
-Array = np.ndarray
+Array = NDArray[np.float64]
 Poses = dict[str, Array]
 
-PRIOR_WEIGHT, RELATIVE_WEIGHT, SCALE_PX = 1.0, 5.0, 4.0  # the paper's, for KITTI
-FX, CX, CY = 718.856, 607.19, 185.22
+CONFIG = preset("kitti").changed(stage1="rig")
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.15)
+SCALE_PX, GATE_PX = 4.0, 3.0  # the preset's
+MATCHES = 1000
+JACOBIAN_BYTES = 3e9  # of TRF, which keeps a few of them
+FACTORS = 600_000  # more separate factors than these take gigabytes
+PYTHON_FACTORS = 60_000
 
 
-class Problem:
+class World:
     """One problem, its start, and its objective."""
 
-    def __init__(self, frames: int) -> None:
-        self.rig = kitti_like_rig()
-        errors = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.15)
-        table = simulate_correspondences(self.rig, frames=frames, matches=1000, errors=errors)
-        self.cameras = list(self.rig.cameras)
-        self.rows: dict[str, Correspondences] = {n: table.of_camera(n) for n in self.cameras}
-        self.hat = perturb(self.rig, rotation_deg=0.5, translation_m=0.05).T_camera_lidar
+    def __init__(self, frames: int, cameras: int) -> None:
+        rig = rig_of("kitti") if cameras == 2 else ring(cameras)
+        self.table = simulate_correspondences(rig, frames=frames, matches=MATCHES, errors=ERRORS)
+        self.rig = perturb(rig, rotation_deg=0.5, translation_m=0.05)
+        self.cameras = list(rig.cameras)
+        self.hat = self.rig.T_camera_lidar
+        self.rows = {name: self.table.of_camera(name) for name in self.cameras}
+
+    def gated(self, T: Poses) -> World:
+        """The problem without what lies beyond the gate at some poses."""
+        inside = World.__new__(World)
+        inside.__dict__.update(self.__dict__)
+        inside.rows = {
+            name: rows.select(np.linalg.norm(self.residuals(name, T[name]), axis=1) <= GATE_PX)
+            for name, rows in self.rows.items()
+        }
+        return inside
+
+    def residuals(self, name: str, T: Array) -> Array:
+        """(n, 2) residuals of a camera, as the paper's Python would compute them."""
+        lens, rows = self.rig.cameras[name].intrinsics_px, self.rows[name]
+        p = rows.points_lidar_m @ T[:3, :3].T + T[:3, 3]
+        u, v = lens.fx * p[:, 0] / p[:, 2] + lens.cx, lens.fy * p[:, 1] / p[:, 2] + lens.cy
+        return np.stack([u, v], 1) - rows.pixels_px
 
     def cost(self, T: Poses) -> float:
         """The paper's objective, evaluated directly."""
-        total = 0.0
-        for name, rows in self.rows.items():
-            s = np.sum(reprojection(T[name], rows) ** 2, axis=1)
-            total += SCALE_PX**2 * np.log1p(s / SCALE_PX**2).sum()
-        return total + float(np.sum(self.prior_rows(T) ** 2))
+        total = float(np.sum(self.prior_rows(T) ** 2))
+        for name in self.rows:
+            s = np.sum(self.residuals(name, T[name]) ** 2, axis=1)
+            total += float(SCALE_PX**2 * np.log1p(s / SCALE_PX**2).sum())
+        return total
 
     def prior_rows(self, T: Poses) -> Array:
         """Both priors as residuals: their squares are the two terms."""
-        hat, now = ({n: gtsam.Pose3(p) for n, p in poses.items()} for poses in (self.hat, T))
-        one, two = self.cameras
-        relative = hat[two].compose(hat[one].inverse())
-        own = [gtsam.Pose3.Logmap(hat[n].inverse().compose(now[n])) for n in self.cameras]
-        between = gtsam.Pose3.Logmap(
-            relative.inverse().compose(now[two].compose(now[one].inverse()))
-        )
-        return np.concatenate(
-            [np.sqrt(PRIOR_WEIGHT) * row for row in own] + [np.sqrt(RELATIVE_WEIGHT) * between]
-        )
+        return prior_rows(T, self.hat, CONFIG)
 
 
-def kitti_like_rig() -> Rig:
-    """Two cameras, 54 cm apart."""
-    cameras = {}
-    for name, x in (("left", 0.06), ("right", -0.48)):
-        T = np.eye(4)
-        T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-        T[:3, 3] = [x, -0.08, -0.27]
-        intrinsics = Intrinsics(fx=FX, fy=FX, cx=CX, cy=CY)
-        cameras[name] = Camera(
-            width_px=1241, height_px=376, intrinsics_px=intrinsics, T_camera_lidar=T
-        )
+def ring(count: int) -> Rig:
+    """So many cameras of the stereo pair's kind, evenly all round, 40 cm from the LiDAR."""
+    kind = next(iter(rig_of("kitti").cameras.values()))
+    cameras: dict[str, Camera] = {}
+    for k in range(count):
+        out = np.eye(4)  # T_lidar_camera
+        turn = Rotation.from_euler("z", 2 * np.pi * k / count).as_matrix()
+        out[:3, :3] = turn @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+        out[:3, 3] = turn @ [0.4, 0.0, -0.2]
+        cameras[f"camera_{k:02}"] = kind.moved_to(np.linalg.inv(out))
     return Rig(cameras=cameras)
 
 
-def reprojection(T: Array, rows: Correspondences) -> Array:
-    """(n, 2) residuals of a pinhole, as the paper's Python would compute them."""
-    p = rows.points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    return np.stack([FX * p[:, 0] / p[:, 2] + CX, FX * p[:, 1] / p[:, 2] + CY], 1) - rows.pixels_px
+@dataclass(frozen=True)
+class Passes:
+    """What a way found.
+
+    Attributes:
+        first: poses after the first pass.
+        second: after the second; None if the way was not asked for it.
+    """
+
+    first: Poses
+    second: Poses | None = None
 
 
-def ours(problem: Problem) -> Poses:
-    """Block factors, LM; the time includes building the graph."""
-    blocks = {
-        n: ProjectionBlock(
-            problem.rig.cameras[n].lens, r.points_lidar_m, r.pixels_px, None, "cauchy", SCALE_PX
-        )
-        for n, r in problem.rows.items()
-    }
-    graph = joined(projection_graph(problem.cameras, blocks), pose_graph(problem))
-    return optimize(graph, problem.cameras, problem.hat).T_camera_lidar
+def ours(world: World) -> Passes:
+    """Both passes of calibgraph; the time includes building the graph."""
+    problem = _problem(world)
+    poses, scales = problem.settled(world.hat, CONFIG)
+    inliers = problem.gated(poses, scales)
+    return Passes(poses, inliers.minimize(poses, scales).T_camera_lidar)
 
 
-def pose_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """Both priors, as factors."""
-    return joined(
-        prior_graph(problem.cameras, problem.hat, weight=PRIOR_WEIGHT),
-        relative_prior_graph(
-            problem.cameras, problem.hat, weight=RELATIVE_WEIGHT, pairs="spanning"
-        ),
-    )
+def ours_once(world: World) -> Passes:
+    """The first pass alone, for comparison with those that do no more."""
+    return Passes(_problem(world).settled(world.hat, CONFIG)[0])
 
 
-def scipy_trf(problem: Problem) -> Poses:
-    """The paper's way: TRF, axis-angle and translation, Cauchy, tolerances 1e-6."""
-    counts = [len(rows) for rows in problem.rows.values()]
-
-    def unpack(x: Array) -> Poses:
-        poses = {}
-        for name, six in zip(problem.cameras, x.reshape(-1, 6), strict=True):
-            poses[name] = np.eye(4)
-            poses[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
-            poses[name][:3, 3] = six[3:]
-        return poses
-
-    def residuals(x: Array) -> Array:
-        T = unpack(x)
-        norms = [np.linalg.norm(reprojection(T[n], r), axis=1) for n, r in problem.rows.items()]
-        return np.concatenate([*norms, problem.prior_rows(T)])
-
-    def loss(z: Array) -> Array:
-        """Cauchy on the correspondences, none on the priors."""
-        rho = np.array([z, np.ones_like(z), np.zeros_like(z)])
-        s = z[: sum(counts)] / SCALE_PX**2
-        rho[:, : sum(counts)] = [
-            SCALE_PX**2 * np.log1p(s), 1 / (1 + s), -1 / (SCALE_PX**2 * (1 + s) ** 2),
-        ]  # fmt: skip
-        return rho
-
-    start = np.concatenate(
-        [
-            np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
-            for T in problem.hat.values()
-        ]
-    )
-    found = least_squares(
-        residuals, start, method="trf", loss=loss, ftol=1e-6, xtol=1e-6, max_nfev=2000
-    )
-    return unpack(found.x)
+def _problem(world: World) -> Problem:
+    matches = matches_by_camera(world.rig, world.table, CONFIG)
+    known = pose_graph(world.rig, world.hat, CONFIG, "full")
+    return Problem(tuple(world.cameras), matches, known, "full")
 
 
-def gtsam_stock(problem: Problem) -> Poses:
+def scipy_trf(world: World, inliers: World) -> Passes:
+    """The paper's way, twice."""
+    first = one_trf(world, world.hat)
+    return Passes(first, one_trf(inliers, first))
+
+
+def one_trf(world: World, start: Poses) -> Poses:
+    """One pass of TRF as the library's comparison with the paper runs it."""
+
+    def residuals(T: Poses) -> Array:
+        return np.concatenate([world.residuals(name, T[name]) for name in world.cameras])
+
+    return minimize_trf(residuals, world.prior_rows, start, scale_px=SCALE_PX)
+
+
+def gtsam_stock(world: World) -> Passes:
     """GTSAM's C++ projection factor each, its landmark held fixed."""
-    calibration = gtsam.Cal3_S2(FX, FX, 0.0, CX, CY)
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(SCALE_PX)
     noise = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Unit.Create(2))
-    graph, values = pose_graph(problem), values_of(problem.cameras, problem.hat)
+    graph, values = _start(world)
     landmark = 0
-    for name, rows in problem.rows.items():
-        key = pose_key(problem.cameras, name)
+    for name, rows in world.rows.items():
+        key, lens = pose_key(world.cameras, name), world.rig.cameras[name].intrinsics_px
+        calibration = gtsam.Cal3_S2(lens.fx, lens.fy, 0.0, lens.cx, lens.cy)
         for point, pixel in zip(rows.points_lidar_m, rows.pixels_px, strict=True):
             graph.add(
                 gtsam.GenericProjectionFactorCal3_S2(pixel, noise, key, landmark, calibration)
@@ -165,93 +166,143 @@ def gtsam_stock(problem: Problem) -> Poses:
             graph.add(gtsam.NonlinearEqualityPoint3(landmark, point))
             values.insert(landmark, point)
             landmark += 1
-    return _gtsam_poses(problem, graph, values)
+    return _gtsam_poses(world, graph, values)
 
 
-def gtsam_python(problem: Problem) -> Poses:
+def gtsam_python(world: World) -> Passes:
     """Our plain per-correspondence factor, a Python call each."""
-    graph = pose_graph(problem)
-    for name, rows in problem.rows.items():
-        key, lens = pose_key(problem.cameras, name), problem.rig.cameras[name].lens
+    graph, values = _start(world)
+    for name, rows in world.rows.items():
+        key, lens = pose_key(world.cameras, name), world.rig.cameras[name].lens
         for point, pixel in zip(rows.points_lidar_m, rows.pixels_px, strict=True):
             graph.add(projection_factor(key, lens, point, pixel, scale=SCALE_PX))
-    return _gtsam_poses(problem, graph, values_of(problem.cameras, problem.hat))
+    return _gtsam_poses(world, graph, values)
 
 
-def _gtsam_poses(
-    problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> Poses:
+def _start(world: World) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    known = pose_graph(world.rig, world.hat, CONFIG, "full")
+    return joined(known), values_of(world.cameras, world.hat)
+
+
+def _gtsam_poses(world: World, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Passes:
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    keys = {name: pose_key(problem.cameras, name) for name in problem.cameras}
-    return {name: found.atPose3(key).inverse().matrix() for name, key in keys.items()}
+    keys = {name: pose_key(world.cameras, name) for name in world.cameras}
+    return Passes({name: found.atPose3(key).inverse().matrix() for name, key in keys.items()})
 
 
-def timed(run: Callable[[Problem], Poses], problem: Problem, repeats: int) -> tuple[float, Poses]:
-    """Least wall time of several runs, and the poses."""
-    times, poses = [], {}
-    for _ in range(repeats):
-        start = time.perf_counter()
-        poses = run(problem)
-        times.append(time.perf_counter() - start)
-    return min(times), poses
+@dataclass(frozen=True)
+class Timed:
+    """How a way did.
+
+    Attributes:
+        frames, cameras, correspondences: of the problem.
+        way: its name.
+        wall_s, cpu_s: least of several runs.
+        ratio: of processor time to ours, of as many passes.
+        cost_1: the objective after the first pass.
+        cost_2: after the second, of the correspondences within the gate; None without one.
+    """
+
+    frames: int
+    cameras: int
+    correspondences: int
+    way: str
+    wall_s: float
+    cpu_s: float
+    ratio: float
+    cost_1: float
+    cost_2: float | None
 
 
-def bandwidth_gb_s() -> float:
-    """What one thread reads from memory: the sum of an array that fits no cache."""
-    array = np.ones(30_000_000)
-    array.sum()
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        array.sum()
-        times.append(time.perf_counter() - start)
-    return array.nbytes / min(times) / 1e9
+@dataclass
+class Bench:
+    """The problems so far: what each way took, to tell what it would take."""
 
+    longest_s: float
+    rows: list[Timed]
+    seconds: dict[str, tuple[int, float]]
 
-def pass_ns(correspondences: int) -> float:
-    """Nanoseconds per correspondence of one pass: H, b and c together."""
-    rig = kitti_like_rig()
-    table = simulate_correspondences(rig, frames=1, matches=100_000).of_camera("left")
-    copies = correspondences // len(table)
-    points, pixels = (np.tile(a, (copies, 1)) for a in (table.points_lidar_m, table.pixels_px))
-    block = ProjectionBlock(rig.cameras["left"].lens, points, pixels)
-    pose = values_of(["left"], rig.T_camera_lidar).atPose3(pose_key(["left"], "left"))
-    block.sums(pose)
-    times = []
-    for _ in range(20):
-        start = time.perf_counter()
-        block.sums(pose)
-        times.append(time.perf_counter() - start)
-    return min(times) / len(block) * 1e9
+    def compare(self, frames: int, cameras: int) -> None:
+        """Time every way on one problem and print a line each."""
+        world = World(frames, cameras)
+        inliers = world.gated(ours(world).first)
+        size = frames, cameras, len(world.table)
+        print(f"\nN = {frames} frames, {cameras} cameras, {size[2]} correspondences")
+        print(
+            f"{'':34} {'wall s':>9} {'CPU s':>9} {'ratio':>7} {'cost, pass 1':>18} {'pass 2':>18}"
+        )
+        base = {
+            2: self._timed("calibgraph", lambda: ours(world), size, (world, inliers), None),
+            1: self._timed("calibgraph, pass 1", lambda: ours_once(world), size,
+                           (world, inliers), None),
+        }  # fmt: skip
+        count, jacobian = size[2], 16 * size[2] * 6 * cameras  # two rows each
+        ways: list[tuple[str, Callable[[], Passes], int, bool]] = [
+            ("SciPy TRF", lambda: scipy_trf(world, inliers), 2, jacobian < JACOBIAN_BYTES),
+            ("GTSAM, C++ factor each, pass 1", lambda: gtsam_stock(world), 1, count <= FACTORS),
+            ("GTSAM, Python factor each, pass 1", lambda: gtsam_python(world), 1,
+             count <= PYTHON_FACTORS),
+        ]  # fmt: skip
+        for way, run, passes, fits in ways:
+            expected = self._expected(way, count * cameras if "TRF" in way else count)
+            if fits and expected < self.longest_s:
+                self._timed(way, run, size, (world, inliers), base[passes])
+            else:
+                why = f"would take about {expected:.0f} s" if fits else "too large"
+                print(f"{way:34} not run: {why}", flush=True)
+
+    def _expected(self, way: str, work: int) -> float:
+        """Seconds that a way would take, by its largest problem so far."""
+        done, seconds = self.seconds.get(way, (1, 0.0))
+        return seconds * work / done
+
+    def _timed(
+        self,
+        way: str,
+        run: Callable[[], Passes],
+        size: tuple[int, int, int],
+        worlds: tuple[World, World],
+        base_cpu_s: float | None,
+    ) -> float:
+        """Run, print, remember; returns the processor time."""
+        repeats = int(np.clip(4e6 / size[2], 3, 30)) if base_cpu_s is None else 1
+        wall_s, cpu_s = np.inf, np.inf
+        for _ in range(repeats):
+            wall, cpu = time.perf_counter(), time.process_time()
+            found = run()
+            wall_s = min(wall_s, time.perf_counter() - wall)
+            cpu_s = min(cpu_s, time.process_time() - cpu)
+        world, inliers = worlds
+        second = None if found.second is None else inliers.cost(found.second)
+        timed = Timed(*size, way, wall_s, cpu_s, cpu_s / (base_cpu_s or cpu_s),
+                      world.cost(found.first), second)  # fmt: skip
+        self.rows.append(timed)
+        work = size[2] * size[1] if "TRF" in way else size[2]
+        if work >= self.seconds.get(way, (0, 0.0))[0]:
+            self.seconds[way] = work, wall_s
+        costs = f"{timed.cost_1:18.6f} " + ("" if second is None else f"{second:18.6f}")
+        print(f"{way:34} {wall_s:9.4f} {cpu_s:9.4f} {timed.ratio:7.1f} {costs}", flush=True)
+        return cpu_s
 
 
 def main() -> None:
-    """Print one table per N, then the time of a pass."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, nargs="+", default=[10, 100])
-    parser.add_argument("--python-factors-up-to", type=int, default=10, metavar="N")
-    arguments = parser.parse_args()
-    ours(Problem(1))  # compile
-    for frames in arguments.frames:
-        problem = Problem(frames)
-        ways = [
-            ("calibgraph, block factors", ours, 5),
-            ("SciPy TRF, the paper's way", scipy_trf, 1),
-        ]
-        ways.append(("GTSAM, stock C++ factor each", gtsam_stock, 1))
-        if frames <= arguments.python_factors_up_to:
-            ways.append(("GTSAM, Python factor each", gtsam_python, 1))
-        print(f"\nN = {frames} frames, {sum(map(len, problem.rows.values()))} correspondences")
-        print(f"{'':30} {'seconds':>10} {'ratio':>8} {'cost':>18}")
-        base = 0.0
-        for name, run, repeats in ways:
-            seconds, poses = timed(run, problem, repeats)
-            base = base or seconds
-            print(f"{name:30} {seconds:10.4f} {seconds / base:8.1f} {problem.cost(poses):18.8f}")
-    speed = bandwidth_gb_s()
-    print(f"\nmemory, one thread: {speed:.1f} GB/s; 40 bytes a correspondence: {40 / speed:.2f} ns")
-    for count in (100_000, 4_000_000):
-        print(f"one pass over {count}: {pass_ns(count):.2f} ns a correspondence")
+    """Print one table per problem."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, nargs="+", default=[10, 100, 1000])
+    parser.add_argument("--cameras", type=int, nargs="+", default=[2, 6, 12])
+    parser.add_argument("--longest-s", type=float, default=300.0)
+    parser.add_argument("--json", type=Path, help="write the numbers into this file, too")
+    options = parser.parse_args()
+    ours(World(1, 2))  # compile
+    bench = Bench(options.longest_s, [], {})
+    for cameras in options.cameras:
+        for frames in options.frames:
+            bench.compare(frames, cameras)
+            if options.json is not None:
+                content: list[dict[str, Any]] = [asdict(row) for row in bench.rows]
+                options.json.write_text(json.dumps(content, indent=1), "utf-8")
 
 
 if __name__ == "__main__":

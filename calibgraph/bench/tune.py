@@ -1,0 +1,195 @@
+"""The paper's random search for lambda, mu, delta and tau, with a test that it has not seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibgraph.bench.paper import draw_seed
+from calibgraph.bench.sources import Sample, Source
+from calibgraph.config import Config, preset
+from calibgraph.errors import CorrespondenceError
+from calibgraph.files import write_yaml
+from calibgraph.metrics import evaluate
+from calibgraph.preprocess import preprocess
+from calibgraph.stage1 import Stage1, estimate_stage1
+from calibgraph.two_pass import fit
+
+UNIT_DEG, UNIT_CM = 1.0, 10.0
+"""Errors that count as one in the score."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The discrete sets that are searched.
+
+    Attributes:
+        prior_weight: lambda.
+        relative_prior_weight: mu.
+        loss_scale_px: delta.
+        gate_px: tau.
+    """
+
+    prior_weight: tuple[float, ...] = (0, 0.1, 0.5, 1, 2, 5, 10)
+    relative_prior_weight: tuple[float, ...] = (0, 1, 2, 5, 10, 20)
+    loss_scale_px: tuple[float, ...] = (1, 2, 4, 8, 16)
+    gate_px: tuple[float, ...] = (2, 3, 5, 8, 16, 32)
+
+    def sampled(self, base: Config, count: int, seed: int) -> list[Config]:
+        """So many different combinations at random, or all if there are no more.
+
+        Raises:
+            ValueError: if a set is empty or a value is out of range.
+        """
+        names = list(vars(self))
+        combinations = list(product(*vars(self).values()))
+        if not combinations or count < 1:
+            raise ValueError("nothing to search: a set of candidates is empty, or no sample asked")
+        order = np.random.default_rng(seed).permutation(len(combinations))[:count]
+        return [base.changed(**dict(zip(names, combinations[i], strict=True))) for i in order]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Settings and their scores; infinite if a solve failed.
+
+    Attributes:
+        name: what to call them.
+        config: the settings.
+        tuning: score on the draws that the search saw.
+        test: score on others; None if it was not measured.
+    """
+
+    name: str
+    config: Config
+    tuning: float
+    test: float | None = None
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What the search found.
+
+    Attributes:
+        best: the best candidate.
+        others: the paper's settings and ``auto``, on the same draws.
+        tried: all candidates, best first.
+    """
+
+    best: Scored
+    others: tuple[Scored, ...]
+    tried: tuple[Scored, ...]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        rows = (self.best, *self.others)
+        return {
+            "settings": _chosen(self.best.config),
+            "scores": {row.name: {"tuning": row.tuning, "test": row.test} for row in rows},
+            "tried": [{**_chosen(row.config), "tuning": row.tuning} for row in self.tried],
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the best candidate as settings that ``--config`` reads."""
+        write_yaml(path, {"preset": self.best.config.preset, **_chosen(self.best.config)})
+
+
+def _chosen(config: Config) -> dict[str, float]:
+    return {name: getattr(config, name) for name in vars(Candidates())}
+
+
+def tune(
+    source: Source,
+    *,
+    base: Config,
+    frames: int,
+    samples: int = 50,
+    draws: int = 5,
+    candidates: Candidates | None = None,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> Tuned:
+    """Search for settings at random on some draws, and judge the best on others.
+
+    The paper minimizes "a combined rotation-and-translation error"; here that is :func:`score`.
+    The solver is ours, which ends at the same optimum as the paper's.
+
+    Args:
+        source: its tuning and test draws share no frame.
+        base: settings that are not searched.
+        frames: of a draw.
+        samples: how many candidates.
+        draws: for tuning, and as many for the test.
+        candidates: what is searched.
+        seed: of everything.
+        progress: to be told.
+
+    Raises:
+        ValueError: if there is nothing to search.
+    """
+    found = (candidates or Candidates()).sampled(base, samples, seed)
+    halves = [_drawn(half, frames, draws, seed) for half in source.halves(seed)]
+    tried = []
+    for index, config in enumerate(found):
+        progress("candidates", index, len(found))
+        tried.append(Scored("candidate", config, score(halves[0], config)))
+    tried.sort(key=lambda scored: scored.tuning)
+    best = tried[0]
+    others = {f"the paper's ({base.preset})": base, "auto": preset("auto").changed(seed=base.seed)}
+    return Tuned(
+        Scored("best", best.config, best.tuning, score(halves[1], best.config)),
+        tuple(
+            Scored(name, config, *(score(half, config) for half in halves))
+            for name, config in others.items()
+        ),
+        tuple(tried),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """A draw, and its Stage 1 by ``confidence_min``, which alone that depends on here."""
+
+    sample: Sample
+    stage1: dict[float, Stage1]
+
+    def error(self, config: Config) -> float:
+        """Score of one draw: the mean over its cameras; infinite if the solve failed."""
+        sample = self.sample
+        if sample.matched:
+            config = config.changed(stage1="rig")
+        try:
+            found = fit(sample.rig, sample.table, config, stage1=self._known(config)).solved_rig
+        except CorrespondenceError:
+            return math.inf
+        errors = evaluate(found, next(iter(sample.references.values()))).cameras.values()
+        return float(
+            np.mean([
+                e.rotation_error_deg / UNIT_DEG + e.translation_error_cm / UNIT_CM for e in errors
+            ])
+        )  # fmt: skip
+
+    def _known(self, config: Config) -> Stage1 | None:
+        if config.stage1 == "rig":
+            return None
+        if config.confidence_min not in self.stage1:
+            kept = preprocess(self.sample.rig, self.sample.table, config).table
+            self.stage1[config.confidence_min] = estimate_stage1(self.sample.rig, kept, config)
+        return self.stage1[config.confidence_min]
+
+
+def score(draws: Sequence[_Draw], config: Config) -> float:
+    """E_R / 1 deg + E_t / 10 cm of the full method, the mean over cameras and draws."""
+    return float(np.mean([draw.error(config) for draw in draws]))
+
+
+def _drawn(source: Source, frames: int, draws: int, seed: int) -> list[_Draw]:
+    return [
+        _Draw(source.draw(frames, draw_seed(seed, frames, index)), {}) for index in range(draws)
+    ]
