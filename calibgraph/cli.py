@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibgraph.cli_bench import bench, tune
 from calibgraph.cli_learned import train, weights
 from calibgraph.cli_options import (
     BatchOption,
@@ -38,6 +39,7 @@ from calibgraph.cli_options import (
     TimeLimitOption,
     WeightsOption,
 )
+from calibgraph.cli_simulate import simulate
 from calibgraph.cli_support import checked_arguments, progress_bar, terminal
 
 if TYPE_CHECKING:
@@ -210,7 +212,11 @@ def match(
 def solve(
     rig: RigArgument,
     correspondences: Annotated[
-        Path, typer.Argument(metavar="CORRESPONDENCES", help="Table, .parquet or .csv.")
+        Path,
+        typer.Argument(
+            metavar="CORRESPONDENCES",
+            help="Table, .parquet or .csv; a .parquet may be larger than memory.",
+        ),
     ],
     terms: TermsOption = "full",
     preset: PresetOption = None,
@@ -221,9 +227,6 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """From a table of correspondences to one calibration of all cameras, with a report."""
-    from dataclasses import replace
-
-    from calibgraph.correspondence_file import load_correspondences
     from calibgraph.files import require_place_for_folder, sha256
     from calibgraph.load import load_rig
     from calibgraph.report import write_report
@@ -232,10 +235,8 @@ def solve(
     require_place_for_folder(out)
     with checked_arguments():
         settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
-    table = load_correspondences(correspondences)
-    result = solve(load_rig(rig), table, settings, checked_terms)
+    result = solve(load_rig(rig), correspondences, settings, checked_terms)
     result = result.with_inputs({str(correspondences): sha256(correspondences)})
-    result = replace(result, correspondences=table)
     written = [result.save(out), write_report(result, out / "report.html")]
     _finish(result, written, as_json)
 
@@ -324,8 +325,11 @@ def perturb(
     terminal().print(f"{out}: {len(moved.cameras)} cameras displaced (seed {seed})")
 
 
+app.command()(simulate)
 app.command()(weights)
 app.command()(train)
+app.add_typer(bench, name="bench")
+app.command()(tune)
 
 
 @app.command()

@@ -43,7 +43,26 @@ class RigError(CalibrationError):
 
 
 class CorrespondenceError(CalibrationError):
-    """Correspondences that are malformed, unusable or too few."""
+    """Correspondences that are malformed, unusable or too few; of which ``row``, if it is one."""
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        camera: str | None = None,
+        frame: str | int | None = None,
+        row: int | None = None,
+    ) -> None:
+        whose = "" if camera is None else f" (camera {camera!r}, frame {frame})"
+        where = "" if row is None else f"row {row}{whose}: "
+        super().__init__(where + message, camera=camera, frame=frame)
+        self.row = row
+        self._message = message
+
+    def after(self, rows: int) -> CorrespondenceError:
+        """The same error of a longer table, which has so many rows before these."""
+        row = None if self.row is None else rows + self.row
+        return CorrespondenceError(self._message, camera=self.camera, frame=self.frame, row=row)
 
 
 class DatasetError(CalibrationError):

@@ -21,11 +21,16 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
     return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
 
 
-def load_kitti_rig(sequence: Path) -> Rig:
+def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
     """The rig of a KITTI odometry sequence, from its own calibration.
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
-    translate(K^-1 P_k[:, 3]) Tr. (Some tools shift by P_k[0, 3] / fx alone: about 5 mm off.)
+    translate(K^-1 P_k[:, 3]) Tr.
+
+    Args:
+        sequence: its folder.
+        shift_along_x_only: read it as some tools do, which shift by P_k[0, 3] / fx alone: about
+            5 mm off.
 
     Raises:
         FileError: if ``calib.txt`` is malformed or there is no image.
@@ -36,18 +41,26 @@ def load_kitti_rig(sequence: Path) -> Rig:
     if not folders:
         raise FileError(sequence, "has no image folder (image_0 .. image_3)")
     cameras = {
-        name: _camera(path, matrices, f"P{name[-1]}", folder) for name, folder in folders.items()
+        name: _camera(path, matrices, f"P{name[-1]}", folder, along_x_only=shift_along_x_only)
+        for name, folder in folders.items()
     }
     return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
 
 
-def _camera(path: Path, matrices: dict[str, NDArray[np.float64]], key: str, folder: Path) -> Camera:
+def _camera(
+    path: Path,
+    matrices: dict[str, NDArray[np.float64]],
+    key: str,
+    folder: Path,
+    *,
+    along_x_only: bool,
+) -> Camera:
     for needed in (key, "Tr"):
         if needed not in matrices:
             raise FileError(path, f"line {needed!r} is missing")
     P, K = matrices[key], matrices[key][:, :3]
     shift = np.eye(4)
-    shift[:3, 3] = np.linalg.solve(K, P[:, 3])
+    shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
     lidar_to_rectified = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
     width, height = _image_size(folder)
     return Camera(

@@ -15,6 +15,8 @@ from calibgraph.calibration import FRAMES_SENTENCE, Array, Calibration, degrees_
 from calibgraph.metrics import Evaluation, PoseError, pose_error
 
 if TYPE_CHECKING:
+    from calibgraph.bench.paper import Report, Row
+    from calibgraph.bench.tune import Tuned
     from calibgraph.cmrnext.validation import Validation
 
 MOST_REASONS = 16  # the worst come first
@@ -168,3 +170,37 @@ def _cells(error: PoseError) -> list[str]:
         *(f"{value:.2f}" for value in (error.x_cm, error.y_cm, error.z_cm)),
         *(f"{value:.3f}" for value in (error.roll_deg, error.pitch_deg, error.yaw_deg)),
     ]
+
+
+def print_bench(console: Console, report: Report) -> None:
+    """Print, per number of frames and reference, the errors of the worst camera of every row."""
+    for block in report.blocks:
+        title = f"{report.data}, N = {block.frames}, {block.draws} draws, against {block.reference}"
+        table = _table(escape(title), "worst camera: median, 95 %")
+        _add_numbers(table, "E_R deg", "", "E_t cm", "", "failed")
+        for name, row in block.rows.items():
+            cells = [*_worst(row, "rotation_error_deg", 3), *_worst(row, "translation_error_cm", 2)]
+            table.add_row(escape(name), *cells, str(row.failed) if row.failed else "")
+        console.print(table)
+
+
+def _worst(row: Row, metric: str, digits: int) -> list[str]:
+    """Median and 95 % quantile of the camera that errs most."""
+    found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
+    if not found:
+        return ["-", "-"]
+    worst = max(found, key=lambda interval: interval.median)
+    return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
+
+
+def print_tuned(console: Console, tuned: Tuned) -> None:
+    """Print the scores of the best settings, the paper's and ``auto``."""
+    table = _table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
+    _add_numbers(table, "lambda", "mu", "delta", "tau", "tuning", "test")
+    for row in (tuned.best, *tuned.others):
+        c = row.config
+        sets = (c.prior_weight, c.relative_prior_weight, c.loss_scale_px, c.gate_px)
+        cells = ["by spread" if value is None else f"{value:g}" for value in sets]
+        test = "-" if row.test is None else f"{row.test:.4f}"
+        table.add_row(escape(row.name), *cells, f"{row.tuning:.4f}", test)
+    console.print(table)

@@ -30,30 +30,26 @@ def start_and_reference(folders: list[Path], seed: int) -> tuple[Rig, Rig]:
     return start, reference
 
 
-@pytest.mark.parametrize("names", ["00", "05", "06+07+08"])
+@pytest.mark.parametrize("names", ["00", "06+07+08"])
 def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) -> None:
-    seeds = range(3)  # benchmarks/search.py has more
-    good = 0
-    for seed in seeds:
-        folders = sequences(realdata, names)
-        start, reference = start_and_reference(folders, seed)
-        matched = match_in_rounds(folders, start, progress=lambda *_: None)
-        errors = calibgraph.evaluate(matched.fit.solved_rig, reference).cameras.values()
-        good += all(e.rotation_error_deg < 0.3 and e.translation_error_cm < 8 for e in errors)
-    assert good == len(seeds)
+    """One start each; benchmarks/search.py has more, and from farther."""
+    folders = sequences(realdata, names)
+    start, reference = start_and_reference(folders, seed=0)
+    matched = match_in_rounds(folders, start, progress=lambda *_: None)
+    for error in calibgraph.evaluate(matched.fit.solved_rig, reference).cameras.values():
+        assert error.rotation_error_deg < 0.3
+        assert error.translation_error_cm < 8
 
 
 @pytest.mark.parametrize("names", ["01", "08"])
 def test_poor_scenes_are_not_passed(realdata: Path, names: str) -> None:
     """A motorway with 3 frames, and one place with 4: results that are off do not say PASS."""
-    for seed in range(3):
-        start, reference = start_and_reference(sequences(realdata, names), seed)
-        matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)  # quick
-        result = calibgraph.calibrate(sequences(realdata, names), start, matcher)
-        errors = calibgraph.evaluate(result.rig, reference).cameras
-        for name, error in errors.items():
-            if error.rotation_error_deg > 0.3 or error.translation_error_cm > 8:
-                assert result.camera_verdicts[name].status != "PASS"
+    start, reference = start_and_reference(sequences(realdata, names), seed=0)
+    matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)  # quick
+    result = calibgraph.calibrate(sequences(realdata, names), start, matcher)
+    for name, error in calibgraph.evaluate(result.rig, reference).cameras.items():
+        if error.rotation_error_deg > 0.3 or error.translation_error_cm > 8:
+            assert result.camera_verdicts[name].status != "PASS"
 
 
 @pytest.mark.parametrize("name", ["surround6", "vlp16_distorted"])

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from calibgraph import (
+    Config,
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
@@ -50,26 +51,30 @@ def outcomes_of(scenario: str, runs: int) -> list[Any]:
 
 @pytest.mark.parametrize(
     ("scenario", "runs"),
-    [("step_of_camera", 12), ("step_of_lidar", 12), ("step_in_garbage", 12), ("blind", 6),
-     ("slow_drift", 2), ("slow_drift_of_lidar", 2)],
+    [("step_of_camera", 4), ("step_of_lidar", 4), ("step_in_garbage", 4), ("blind", 2),
+     ("slow_drift", 1)],
 )  # fmt: skip
 def test_what_moves_is_found_and_named(scenario: str, runs: int) -> None:
-    """At a rate of 99 %, one miss in 12 happens once in 9 times, two once in 170 times."""
+    """At a rate of 99 %, one miss in 4 happens once in 25 times, two once in 1700 times.
+
+    ``benchmarks/events.py`` has more runs, and the drift of a LiDAR.
+    """
     outcomes = outcomes_of(scenario, runs)
-    assert sum(o.detected and o.attributed for o in outcomes) >= runs - 1, outcomes
+    missed = sum(not (o.detected and o.attributed) for o in outcomes)
+    assert missed <= (runs > 1), outcomes
     assert sum(o.false_alarms for o in outcomes) <= 1, outcomes
 
 
-@pytest.mark.parametrize(("scenario", "runs"), [("nothing", 10), ("garbage", 12)])
+@pytest.mark.parametrize(("scenario", "runs"), [("nothing", 2), ("garbage", 4)])
 def test_what_stands_still_is_not_called_moved(scenario: str, runs: int) -> None:
-    """10,000 and 6,000 frames; at most one alarm in 10,000 is allowed."""
+    """2000 frames each; at most one alarm in 10,000 is allowed."""
     outcomes = outcomes_of(scenario, runs)
     assert sum(o.false_alarms for o in outcomes) <= 1, outcomes
 
 
 def test_the_errors_after_are_those_of_the_error_bar() -> None:
     """The largest of 18 components in sigmas: 2.2 in the median if the sigmas are right."""
-    outcomes = outcomes_of("step_of_camera", 12)
+    outcomes = outcomes_of("step_of_camera", 6)
     values = sorted(o.error_sigmas for o in outcomes)
     assert 1.5 < values[len(values) // 2] < 3.5
 
@@ -82,7 +87,8 @@ def test_300_frames_give_what_a_batch_gives(mixed_rig: Rig) -> None:
     guess = perturb(mixed_rig, rotation_deg=1, translation_m=0.1, seed=1)
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
     table = simulate_correspondences(mixed_rig, frames=300, matches=500, errors=errors, seed=1)
-    batch, tracker = solve(guess, table), IncrementalCalibrator(guess)
+    config = Config(learnt_weights=False)  # the tracker weighs frames alike
+    batch, tracker = solve(guess, table, config), IncrementalCalibrator(guess)
     for frame in range(300):
         update = tracker.update(table.select(table.frame == frame))
     apart = []

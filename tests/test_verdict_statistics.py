@@ -18,7 +18,7 @@ TABLES = (
     "good,random,swapped,shuffled,focal_5,focal_3,principal,distorted,mirrored,wall,far_away,"
     "two_poses_60,few_frames,time_offset,units"
 )
-IMAGES = "good,far,swapped,shuffled,focal_5,mirrored,motorway"
+IMAGES = "good,swapped,focal_5,mirrored,motorway"
 
 
 def cameras_of(tmp_path: Path, *options: object) -> list[dict[str, Any]]:
