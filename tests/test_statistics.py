@@ -14,7 +14,7 @@ from calibgraph.two_pass import fit
 
 pytestmark = pytest.mark.statistics
 
-DRAWS = 120
+DRAWS = 200
 
 
 def error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:

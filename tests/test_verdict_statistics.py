@@ -18,7 +18,7 @@ TABLES = (
     "good,random,swapped,shuffled,focal_5,focal_3,principal,distorted,mirrored,wall,far_away,"
     "two_poses_60,few_frames,time_offset,units"
 )
-IMAGES = "good,swapped,focal_5,mirrored,motorway"
+IMAGES = "good,swapped,focal_5,mirrored"
 
 
 def cameras_of(tmp_path: Path, *options: object) -> list[dict[str, Any]]:
@@ -51,7 +51,7 @@ def test_wrong_recordings_do_not_pass_and_good_ones_do_not_fail(
 ) -> None:
     cameras = cameras_of(tmp_path, "--data", 1, "--kinds", IMAGES, "--realdata", realdata)
     off = [camera for camera in cameras if is_off(camera)]
-    assert len(off) > 8
+    assert len(off) >= 5
     assert not [(c["kind"], c["error_deg"], c["error_cm"]) for c in off if c["status"] == "PASS"]
     right = [
         camera["status"]
