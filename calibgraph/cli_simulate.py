@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from calibgraph.rig import Rig
 
 STREET = "street"
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # of the street, unless the user says otherwise
 _STREET = "Scenario street"
 
 
@@ -29,14 +31,15 @@ def simulate(
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
     rig: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME|RIG",
+            show_default=RIG,
             help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
             "file of your own; its poses are the truth.",
             rich_help_panel=_STREET,
         ),
-    ] = "kitti",
+    ] = None,
     frames: Annotated[int, typer.Option(help="How many, at different places.")] = 10,
     rotation_deg: Annotated[
         float, typer.Option(min=0, help="Angle by which the guess, rig.yaml, is off.")
@@ -46,12 +49,22 @@ def simulate(
     ] = 0.3,
     seed: SeedOption = 0,
     beams: Annotated[
-        int,
-        typer.Option(metavar="16|64|128", help="Of the LiDAR.", rich_help_panel=_STREET),
-    ] = 64,
+        int | None,
+        typer.Option(
+            metavar="16|64|128",
+            show_default=str(BEAMS),
+            help="Of the LiDAR.",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
     step_m: Annotated[
-        float, typer.Option(help="Between two frames, on average.", rich_help_panel=_STREET)
-    ] = 4.0,
+        float | None,
+        typer.Option(
+            show_default=str(STEP_M),
+            help="Between two frames, on average.",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
 ) -> None:
     """Make data with a known truth, reference.yaml, and a guess that is off, rig.yaml."""
     from calibgraph.simulation.recording import simulate_street
@@ -61,16 +74,19 @@ def simulate(
         if scenario == STREET:
             written = simulate_street(
                 out,
-                _rig(rig),
-                beams=beams,
+                _rig(RIG if rig is None else rig),
+                beams=BEAMS if beams is None else beams,
                 frames=frames,
-                step_m=step_m,
+                step_m=STEP_M if step_m is None else step_m,
                 seed=seed,
                 rotation_deg=rotation_deg,
                 translation_m=translation_m,
                 progress=progress,
             )
         else:
+            _refuse_options_of_street(
+                scenario, {"--rig": rig, "--beams": beams, "--step-m": step_m}
+            )
             written = simulate_table(
                 out,
                 scenario,
@@ -81,6 +97,17 @@ def simulate(
             )
     for path in written:
         terminal().print(f"{path}: written", soft_wrap=True, markup=False, highlight=False)
+
+
+def _refuse_options_of_street(scenario: str, given: Mapping[str, object]) -> None:
+    from calibgraph.simulation.scenarios import scenario_of
+
+    named = [option for option, value in given.items() if value is not None]
+    if named and scenario_of(scenario):
+        raise ValueError(
+            f"scenario {scenario!r} has a rig and a matcher of its own, {' and '.join(named)} "
+            f"would change nothing; leave it out, or simulate {STREET!r}"
+        )
 
 
 def _rig(name: str) -> Rig:

@@ -9,6 +9,7 @@ densest do not count at all. Confidences are turned into standard deviations by 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -27,15 +28,16 @@ MIN_FRAMES = 8  # of fewer, frames say too little of each other: weights would f
 _OWN_STEPS = 6  # towards a frame's own pose
 _MAX_TURN_RAD = 0.05  # per step
 _DAMPING = 1e-6  # of a frame that leaves a direction free
+
+# Chosen on simulated drives of the paper's two rigs, other ones than those that are reported.
 _NEAREST_SHARE = 0.15  # of the frames, whose distance is the unit of nearness
 _NARROW = 3.0  # units of reach while where frames are densest is looked for
 _REACH = 4.0  # units from there at which a frame does not count any more
 _FLAT = 2.0  # frames count in full up to half the reach
 _WIDER = 2.2  # nearness to spread: the median of a Rayleigh law over its quantile of that share
 _MOVING_STEPS, _STEPS = 5, 15  # of the mean shift: looking, and in all
-_CANDIDATES, _JUDGED_MATCHES = 200, 5000  # where to start looking
+_CANDIDATES = 200  # where to start looking
 _MOST = 1e6  # of a spread: a frame that is all behind its camera has none
-_FAR = 1e3  # spreads, beyond which matches are alike
 _SETTLED = 1e-6  # rad, m
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100
 _LEAST_SIZE = 0.05  # of a frame's spread, which is not below MIN_SIGMA_PX
@@ -77,7 +79,7 @@ def learn_weights(
     parts = [matches.select(np.arange(*edge)) for edge in pairwise(edges)]
     frames = _at_own_poses(parts, [own.get(int(n), T_camera_lidar) for n in numbers])
     sigmas = confidence_sigmas(frames.sizes, confidence)
-    start = _best(matches, frames, T_camera_lidar)
+    start = _densest_start(matches, frames, T_camera_lidar)
     T_consensus, weights = _consensus(frames, start)
     each = np.repeat(weights, np.diff(edges))
     counted = each > 0
@@ -93,6 +95,7 @@ class _Frames:
         poses: (f,) T_lidar_camera.
         counts: (f,) matches.
         spreads: (f,) of whitened residuals about the own pose.
+        spreads_px: (f,) of unweighted ones.
         hessians: (f, 6, 6) of whitened residuals there.
         sizes: (n,) of the residuals there, relative to the frame's spread; in medians of a standard
             Gaussian.
@@ -101,33 +104,31 @@ class _Frames:
     poses: tuple[gtsam.Pose3, ...]
     counts: Array
     spreads: Array
+    spreads_px: Array
     hessians: Array
     sizes: Array
+
+    @property
+    def noise(self) -> Array:
+        """(f,) mean squares that noise moves whitened pixels of the own pose by."""
+        return 6 * self.spreads**2 / self.counts
 
 
 def _consensus(frames: _Frames, start: gtsam.Pose3) -> tuple[Array, Array]:
     """Where frames are densest, (4, 4) T_camera_lidar, and (f,) their weights, at most 1.
 
-    Mean shift over the frames' own poses, with a kernel that is zero beyond a reach. Distances are
-    root mean square displacements of a frame's whitened pixels; the unit of the reach is that of
-    the nearest frames, so that frames which all err alike are all near. Once it stands still the
-    reach is widened, not to lose good frames.
+    Mean shift over the frames' own poses, with a kernel that is zero beyond a reach. Once it stands
+    still the reach is widened, not to lose good frames.
     """
     pose = start
-    noise = 6 * frames.spreads**2 / frames.counts  # mean square that noise displaces pixels by
-    least = float(np.median(noise))
     for step in range(_STEPS):
-        away = np.array([pose.localCoordinates(other) for other in frames.poses])
-        shift = np.einsum("fi,fij,fj->f", away, frames.hessians, away) / frames.counts
-        if step < _MOVING_STEPS:
-            reach = _NARROW**2 * max(_of_nearest(shift, fewest=2), least)
-        elif step == _MOVING_STEPS:
-            unit = min(robust_spread(np.sqrt(shift)) ** 2, _WIDER**2 * _of_nearest(shift, fewest=3))
-            reach = _REACH**2 * max(unit, least)
-        near = np.clip(_FLAT * (1 - np.sqrt(shift / reach)), 0, 1)
+        away, shift = _shifts(frames, pose)
+        if step <= _MOVING_STEPS:
+            reach = _reach(shift, frames.noise, widened=step == _MOVING_STEPS)
+        near = np.clip(_FLAT * (1 - np.sqrt(shift) / reach), 0, 1)
         if not near.any():  # no two frames agree: there is nothing to learn
             return start.inverse().matrix(), np.ones(len(near))
-        scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
+        scatter = max(float(near @ (shift - frames.noise) / near.sum()), 0.0)
         weights = near / (frames.spreads**2 + frames.counts * scatter / 6)
         pull = np.einsum("f,fij,fj->i", weights, frames.hessians, away)
         move = np.linalg.solve(_damped(np.einsum("f,fij->ij", weights, frames.hessians)), pull)
@@ -137,21 +138,32 @@ def _consensus(frames: _Frames, start: gtsam.Pose3) -> tuple[Array, Array]:
     return pose.inverse().matrix(), weights / weights.max()
 
 
-def _best(matches: Matches, frames: _Frames, T_camera_lidar: Array) -> gtsam.Pose3:
-    """The pose that explains most matches of all frames best: a frame's own, or the given one.
+def _shifts(frames: _Frames, pose: gtsam.Pose3) -> tuple[Array, Array]:
+    """(f, 6) from a pose to the frames' own; (f,) mean squares that whitened pixels move by."""
+    away = np.array([pose.localCoordinates(other) for other in frames.poses])
+    return away, np.einsum("fi,fij,fj->f", away, frames.hessians, away) / frames.counts
 
-    By a Cauchy loss on the scale of the matches' spread within frames, over an even selection.
+
+def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
+    """How far off frames may be to count, in units of how far off the nearest are.
+
+    So frames that all err alike are all near. The wider reach goes by the spread of all that
+    belong together, where that can be told.
     """
-    every = -(-len(matches.frame) // _JUDGED_MATCHES)
-    judged = matches.select(np.arange(0, len(matches.frame), every))
-    scale = CAUCHY_SCALE_SIGMAS * float(np.median(frames.spreads))
-    each = -(-len(frames.poses) // _CANDIDATES)
-    candidates = [to_T_lidar_camera(T_camera_lidar), *frames.poses[::each]]
-    costs = [
-        np.mean(np.log1p(np.minimum(_whitened_sizes(judged, pose) / scale, _FAR) ** 2))
-        for pose in candidates
-    ]
-    return candidates[int(np.argmin(costs))]
+    least = math.sqrt(float(np.median(noise)))
+    if not widened:
+        return _NARROW * max(math.sqrt(_of_nearest(shift, fewest=2)), least)
+    nearest = _WIDER * math.sqrt(_of_nearest(shift, fewest=3))
+    return _REACH * max(min(robust_spread(np.sqrt(shift)), nearest), least)
+
+
+def _densest_start(matches: Matches, frames: _Frames, T_camera_lidar: Array) -> gtsam.Pose3:
+    """The pose that explains most matches of all frames best: a frame's own, or the given one."""
+    every = -(-len(frames.poses) // _CANDIDATES)
+    candidates = [to_T_lidar_camera(T_camera_lidar), *frames.poses[::every]]
+    scale_px = CAUCHY_SCALE_SIGMAS * float(np.median(frames.spreads_px))
+    best = matches.best_explained_by([p.inverse().matrix() for p in candidates], scale_px)
+    return candidates[best]
 
 
 def _of_nearest(shift: Array, *, fewest: int) -> float:
@@ -161,7 +173,7 @@ def _of_nearest(shift: Array, *, fewest: int) -> float:
 
 def _at_own_poses(parts: list[Matches], starts: list[Array]) -> _Frames:
     """Fit every frame alone, robustly, by damped Gauss-Newton steps."""
-    poses, spreads, hessians, sizes = [], [], [], []
+    poses, spreads, spreads_px, hessians, sizes = [], [], [], [], []
     for part, start in zip(parts, starts, strict=True):
         pose = to_T_lidar_camera(start)
         for _ in range(_OWN_STEPS):
@@ -173,11 +185,18 @@ def _at_own_poses(parts: list[Matches], starts: list[Array]) -> _Frames:
             pose = pose.retract(step)
         poses.append(pose)
         spreads.append(spread)
+        spreads_px.append(robust_spread(part.sizes(pose.inverse().matrix())[0]))
         hessians.append(sums.hessian)
         sizes.append(own / spread)
     counts = np.array([len(part.frame) for part in parts], dtype=np.float64)
-    together = np.concatenate(sizes)
-    return _Frames(tuple(poses), counts, np.array(spreads), np.array(hessians), together)
+    return _Frames(
+        poses=tuple(poses),
+        counts=counts,
+        spreads=np.array(spreads),
+        spreads_px=np.array(spreads_px),
+        hessians=np.array(hessians),
+        sizes=np.concatenate(sizes),
+    )
 
 
 def _damped(hessian: Array) -> Array:

@@ -37,6 +37,7 @@ _START_QUANTILE, _START_FACTOR = 0.2, 1.762  # that quantile of a Rayleigh law, 
 _HALF = 0.5
 _CUT = 4.0  # medians: inliers lie below, in one and in two dimensions
 _GATE_BAND = 0.1  # of the gate, on either side of it
+_JUDGED = 5000  # matches, to tell which pose explains them
 _IDENTITY = np.array([1.0, 0.0, 1.0])  # entries (0,0), (0,1), (1,1)
 _MEDIAN_NORM = np.array([0.67449, 1.17741])  # of a standard Gaussian error in 1 and 2 dimensions
 
@@ -114,6 +115,13 @@ class Matches:
         """(n,) unweighted errors [px] where constrained; (n,) whether projectable."""
         residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
         return constrained_error_px(residuals, self.information), valid
+
+    def best_explained_by(self, candidates: Sequence[Array], scale_px: float) -> int:
+        """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
+        every = -(-len(self.frame) // _JUDGED)
+        judged = self.select(np.arange(0, len(self.frame), every))
+        errors = [judged.errors_px(T)[0] / scale_px for T in candidates]
+        return int(np.argmin([np.mean(np.log1p(e**2)) for e in errors]))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> Scale:
         """The configured scales, or those of the residuals' own spread at a pose."""

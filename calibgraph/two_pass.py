@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +22,6 @@ from calibgraph.rig import Rig
 from calibgraph.stage1 import Stage1, estimate_stage1
 
 Array = NDArray[np.float64]
-
-_JUDGED_MATCHES = 5000  # of a camera, to choose where to start
 
 
 def solve(
@@ -222,7 +220,8 @@ def _start(
         candidates = [T_hat[name]] if name in T_hat else []
         if terms != "stage1":
             candidates += [rig.cameras[name].T_camera_lidar, *stage1.solved.get(name, {}).values()]
-        start[name] = _best(candidates, matches[name], config.pnp_threshold_px / 2)
+        best = matches[name].best_explained_by(candidates, config.pnp_threshold_px / 2)
+        start[name] = candidates[best]
     for _ in rig.cameras:
         for pair in rig.relative_poses:
             if pair.b in start:
@@ -230,14 +229,6 @@ def _start(
             if pair.a in start:
                 start.setdefault(pair.b, np.linalg.inv(pair.T_a_b) @ start[pair.a])
     return {name: start[name] for name in rig.cameras}
-
-
-def _best(candidates: Sequence[Array], matches: Matches, scale_px: float) -> Array:
-    """The pose with the least mean Cauchy loss, judged by an even selection of the matches."""
-    step = -(-len(matches.frame) // _JUDGED_MATCHES)
-    judged = matches.select(np.arange(len(matches.frame)) % step == 0)
-    errors = [judged.errors_px(T)[0] / scale_px for T in candidates]
-    return candidates[int(np.argmin([np.mean(np.log1p(e**2)) for e in errors]))]
 
 
 def _counts(

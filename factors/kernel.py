@@ -9,12 +9,17 @@ before a loop, and Python's exception on a division by zero, hence ``error_model
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from numba import njit, prange
+from numba.core.errors import NumbaWarning
 
 from factors.lens import MIN_DEPTH_M, PINHOLE, RADTAN, is_projectable, project_one
 from factors.loss import CAUCHY, loss_and_weight
+
+# Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
+warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _SMALL = 1e-100  # far from the smallest float by more than four factors

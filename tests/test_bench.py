@@ -45,7 +45,7 @@ def test_the_papers_solver_and_ours_reach_the_same_poses() -> None:
     sample = source_of("kitti").draw(3, seed=1)
     bench = Bench.of(sample, KITTI, seed=1)
     theirs = bench.of_paper("full")
-    ours = fit(sample.rig, sample.table, KITTI, "full", stage1=bench.pairwise_estimates(KITTI))
+    ours = fit(sample.rig, sample.table, KITTI, "full", stage1=sample.stage1(KITTI))
     for name, matches in ours.inliers.matches.items():
         pose, other = to_T_lidar_camera(ours.poses[name]), to_T_lidar_camera(theirs[name])
         away = pose.localCoordinates(other)

@@ -100,6 +100,9 @@ def test_the_command_writes_a_table_that_can_be_solved(
         (("nowhere",), "unknown scenario 'nowhere'; known are street, kitti"),
         (("kitti", "--frames", 0), "0 frames: expected 1 to"),
         (("walkley", "--rotation-deg", 200), "expected an angle within"),
+        (("kitti", "--beams", 16, "--rig", "fisheye"), "--rig and --beams would change nothing"),
+        (("walkley", "--step-m", 0), "--step-m would change nothing"),
+        (("nowhere", "--beams", 16), "unknown scenario 'nowhere'"),
     ],
 )
 def test_wrong_arguments_are_one_line(

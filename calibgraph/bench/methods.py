@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.preprocess import preprocess
 from calibgraph.problem import Poses
 from calibgraph.rig import RelativePose, Rig
-from calibgraph.stage1 import Stage1, aggregate, estimate_stage1
+from calibgraph.stage1 import aggregate
 from calibgraph.two_pass import fit
 
 STAGE1 = "Stage 1: PnP, median"
@@ -51,7 +51,6 @@ class Bench:
         ours: our settings.
         seed: of the noise of the relative poses.
         table: what the preprocessing keeps with the paper's settings.
-        stage1: by ``confidence_min``, which alone it depends on here.
     """
 
     sample: Sample
@@ -59,7 +58,6 @@ class Bench:
     ours: Config
     seed: int
     table: Correspondences
-    stage1: dict[float, Stage1] = field(default_factory=dict)
 
     @staticmethod
     def of(sample: Sample, theirs: Config, seed: int) -> Bench:
@@ -67,21 +65,13 @@ class Bench:
         ours = preset("auto").changed(stage1="rig" if sample.matched else "pnp", seed=theirs.seed)
         return Bench(sample, theirs, ours, seed, preprocess(sample.rig, sample.table, theirs).table)
 
-    def pairwise_estimates(self, config: Config) -> Stage1:
-        """Stage 1 of what these settings let through, computed once."""
-        least = config.confidence_min
-        if least not in self.stage1:
-            kept = preprocess(self.sample.rig, self.sample.table, config).table
-            self.stage1[least] = estimate_stage1(self.sample.rig, kept, config)
-        return self.stage1[least]
-
     def aggregated(self, how: str) -> Poses:
         """Per-frame PnP, aggregated over frames; the paper's Stage 1 is the median.
 
         Raises:
             CorrespondenceError: if PnP gave a camera no pose.
         """
-        found = self.pairwise_estimates(self.theirs).per_frame
+        found = self.sample.stage1(self.theirs).per_frame
         for name in self.sample.rig.cameras:
             if not len(found.get(name, ())):
                 raise CorrespondenceError(f"PnP gives camera {name!r} no pose", camera=name)
@@ -90,7 +80,7 @@ class Bench:
     def one_frame(self) -> Poses:
         """PnP of the first frame that it gives a pose of."""
         _ = self.aggregated("median")  # there is one
-        solved = self.pairwise_estimates(self.theirs).solved
+        solved = self.sample.stage1(self.theirs).solved
         return {name: poses[min(poses)] for name, poses in solved.items()}
 
     def of_paper(self, terms: Terms) -> Poses:
@@ -100,13 +90,13 @@ class Bench:
 
     def of_ours(self, terms: Terms, rig: Rig | None = None) -> Poses:
         """Our solve with ``auto``, of the draw's rig or another."""
-        known = None if self.ours.stage1 == "rig" else self.pairwise_estimates(self.ours)
+        known = None if self.ours.stage1 == "rig" else self.sample.stage1(self.ours)
         rig = rig or self.sample.rig
         return fit(rig, self.sample.table, self.ours, terms, stage1=known).poses
 
     def each_alone(self) -> Poses:
         """Each camera alone, with the paper's scales."""
-        known = self.pairwise_estimates(self.theirs)
+        known = self.sample.stage1(self.theirs)
         return per_camera_adjustment(self.sample.rig, self.sample.table, self.theirs, stage1=known)
 
     def with_relative_poses(self) -> Poses:
@@ -160,7 +150,7 @@ def run_all(bench: Bench, *, trf: bool) -> Iterator[tuple[str, Poses | None, flo
     """
     for config in (bench.theirs, bench.ours):
         if config.stage1 == "pnp":
-            bench.pairwise_estimates(config)
+            bench.sample.stage1(config)
     for row, way in WAYS.items():
         if (row in TRF_TERMS and not trf) or (row == ORACLE and not bench.sample.simulated):
             continue

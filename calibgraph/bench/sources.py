@@ -17,8 +17,10 @@ from calibgraph.kitti import CALIBRATION_NAME, load_kitti_rig
 from calibgraph.load import load_rig
 from calibgraph.perturbation import perturb
 from calibgraph.pipeline import match_in_rounds
+from calibgraph.preprocess import preprocess
 from calibgraph.rig import Rig
 from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
+from calibgraph.stage1 import Stage1, estimate_stage1
 
 KITTI_PREFIX = "kitti:"
 REFERENCE_FILE = "reference.yaml"
@@ -57,6 +59,18 @@ class Sample:
     references: Mapping[str, Rig]
     simulated: bool = True
     matched: bool = False
+    _stage1: dict[float, Stage1] = field(default_factory=dict)
+
+    def stage1(self, config: Config) -> Stage1:
+        """Stage 1 of what these settings let through, computed once.
+
+        Of the settings that are compared here it depends on ``confidence_min`` alone.
+        """
+        least = config.confidence_min
+        if least not in self._stage1:
+            kept = preprocess(self.rig, self.table, config).table
+            self._stage1[least] = estimate_stage1(self.rig, kept, config)
+        return self._stage1[least]
 
 
 class Source(Protocol):

@@ -17,8 +17,6 @@ from calibgraph.config import Config, preset
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_yaml
 from calibgraph.metrics import evaluate
-from calibgraph.preprocess import preprocess
-from calibgraph.stage1 import Stage1, estimate_stage1
 from calibgraph.two_pass import fit
 
 UNIT_DEG, UNIT_CM = 1.0, 10.0
@@ -152,44 +150,29 @@ def tune(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Draw:
-    """A draw, and its Stage 1 by ``confidence_min``, which alone that depends on here."""
-
-    sample: Sample
-    stage1: dict[float, Stage1]
-
-    def error(self, config: Config) -> float:
-        """Score of one draw: the mean over its cameras; infinite if the solve failed."""
-        sample = self.sample
-        if sample.matched:
-            config = config.changed(stage1="rig")
-        try:
-            found = fit(sample.rig, sample.table, config, stage1=self._known(config)).solved_rig
-        except CorrespondenceError:
-            return math.inf
-        errors = evaluate(found, next(iter(sample.references.values()))).cameras.values()
-        return float(
-            np.mean([
-                e.rotation_error_deg / UNIT_DEG + e.translation_error_cm / UNIT_CM for e in errors
-            ])
-        )  # fmt: skip
-
-    def _known(self, config: Config) -> Stage1 | None:
-        if config.stage1 == "rig":
-            return None
-        if config.confidence_min not in self.stage1:
-            kept = preprocess(self.sample.rig, self.sample.table, config).table
-            self.stage1[config.confidence_min] = estimate_stage1(self.sample.rig, kept, config)
-        return self.stage1[config.confidence_min]
-
-
-def score(draws: Sequence[_Draw], config: Config) -> float:
+def score(draws: Sequence[Sample], config: Config) -> float:
     """E_R / 1 deg + E_t / 10 cm of the full method, the mean over cameras and draws."""
-    return float(np.mean([draw.error(config) for draw in draws]))
+    return float(np.mean([_error(draw, config) for draw in draws]))
 
 
-def _drawn(source: Source, frames: int, draws: int, seed: int) -> list[_Draw]:
-    return [
-        _Draw(source.draw(frames, draw_seed(seed, frames, index)), {}) for index in range(draws)
-    ]
+def _error(draw: Sample, config: Config) -> float:
+    """Score of one draw: the mean over its cameras; infinite if the solve failed."""
+    known = None
+    if draw.matched:
+        config = config.changed(stage1="rig")
+    else:
+        known = draw.stage1(config)
+    try:
+        found = fit(draw.rig, draw.table, config, stage1=known).solved_rig
+    except CorrespondenceError:
+        return math.inf
+    errors = evaluate(found, next(iter(draw.references.values()))).cameras.values()
+    return float(
+        np.mean([
+            e.rotation_error_deg / UNIT_DEG + e.translation_error_cm / UNIT_CM for e in errors
+        ])
+    )  # fmt: skip
+
+
+def _drawn(source: Source, frames: int, draws: int, seed: int) -> list[Sample]:
+    return [source.draw(frames, draw_seed(seed, frames, index)) for index in range(draws)]
