@@ -33,6 +33,7 @@ _DAMPING = 1e-6  # of a frame that leaves a direction free
 _NEAREST_SHARE = 0.15  # of the frames, whose distance is the unit of nearness
 _NARROW = 3.0  # units of reach while where frames are densest is looked for
 _REACH = 4.0  # units from there at which a frame does not count any more
+_ALONE = 4.0  # times farther off: the third of three frames does not belong to the two
 _FLAT = 2.0  # frames count in full up to half the reach
 _WIDER = 2.2  # nearness to spread: the median of a Rayleigh law over its quantile of that share
 _MOVING_STEPS, _STEPS = 5, 15  # of the mean shift: looking, and in all
@@ -148,13 +149,15 @@ def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
     """How far off frames may be to count, in units of how far off the nearest are.
 
     So frames that all err alike are all near. The wider reach goes by the spread of all that
-    belong together, where that can be told.
+    belong together, where that can be told; the nearest are then three at least, not to be misled
+    by two that happen to agree, unless the third is far from them.
     """
     least = math.sqrt(float(np.median(noise)))
+    two, three = (max(math.sqrt(_of_nearest(shift, fewest=n)), least) for n in (2, 3))
     if not widened:
-        return _NARROW * max(math.sqrt(_of_nearest(shift, fewest=2)), least)
-    nearest = _WIDER * math.sqrt(_of_nearest(shift, fewest=3))
-    return _REACH * max(min(robust_spread(np.sqrt(shift)), nearest), least)
+        return _NARROW * two
+    nearest = two if three > _ALONE * two else three
+    return _REACH * max(min(robust_spread(np.sqrt(shift)), _WIDER * nearest), least)
 
 
 def _densest_start(matches: Matches, frames: _Frames, T_camera_lidar: Array) -> gtsam.Pose3:
