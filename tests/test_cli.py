@@ -248,6 +248,13 @@ def test_help_imports_nothing_heavy() -> None:
         assert command in done.stdout
 
 
+def test_it_runs_as_a_module_too() -> None:
+    command = [sys.executable, "-m", "calibgraph", "evaluate", "nothing.yaml", "nothing.yaml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("calibgraph: nothing.yaml") and done.stderr.count("\n") == 1
+
+
 def test_one_camera_is_a_rig_too(tmp_path: Path, call: Call) -> None:
     rig = Rig(cameras={"only": make_camera()})
     rig.save(tmp_path / "rig.yaml")

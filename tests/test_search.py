@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,9 +124,11 @@ class TestParts:
 
 class TestSample:
     def test_it_is_found_from_far_away(self, truth: Rig) -> None:
-        data = calibgraph.load_dataset(SAMPLE, far_from(truth, seed=1))
-        start = StructureMatcher().locate(data, data.rig, out_of_time=never, progress=silent)
-        assert start.metadata["found"].keys() == truth.cameras.keys()
+        far = far_from(truth, seed=1)
+        rig = Rig(cameras={name: far.cameras[name] for name in ("front_left", "left")})
+        data = calibgraph.load_dataset(SAMPLE, rig)
+        start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
+        assert start.metadata["found"].keys() == rig.cameras.keys()
         assert start.first_round == 3
         for name, error in calibgraph.evaluate(start.rig, truth).cameras.items():
             assert error.rotation_error_deg < 0.7, name  # what the next round reaches
@@ -195,6 +198,42 @@ class TestSample:
         assert names[1] in start.metadata["found"]
         error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
         assert error.rotation_error_deg < 0.7
+
+    def test_of_the_lengths_that_views_leave_open_the_best_is_taken(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Poses that are right but for the length of their translation may be accepted too."""
+        names = ("front_left", "front_right")
+        rig = Rig(cameras={name: truth.cameras[name] for name in names})
+        right = rig.T_camera_lidar[names[1]] @ np.linalg.inv(rig.T_camera_lidar[names[0]])
+        right[:3, 3] *= 1.25 / np.linalg.norm(right[:3, 3])
+        goal = right @ rig.T_camera_lidar[names[0]]
+        direction = right.copy()
+        direction[:3, 3] /= 1.25
+
+        def settle(view: locate.View, camera: Camera) -> locate.Found:
+            if np.array_equal(camera.T_camera_lidar, rig.T_camera_lidar[names[0]]):
+                return locate.Found(camera, 50.0, True)
+            if np.array_equal(camera.T_camera_lidar, rig.T_camera_lidar[names[1]]):
+                return locate.Found(camera, 5.0, False)
+            off = np.linalg.norm((camera.T_camera_lidar - goal)[:3, 3])
+            contrast = 80.0 if off < 0.1 else 18.0 if 0.4 < off < 0.9 else 5.0
+            return locate.Found(camera, contrast, contrast >= locate.ACCEPTED)
+
+        monkeypatch.setattr(locate, "settle", settle)
+        monkeypatch.setattr(locate, "overlap_pose", lambda *_, **__: direction)
+        with ThreadPoolExecutor(1) as pool:
+            found = locate.locate(
+                rig,
+                {name: locate.View([], []) for name in names},
+                locate.Range(0.3, 1.5),
+                seed=0,
+                out_of_time=never,
+                pool=pool,
+                progress=silent,
+            )[names[1]]
+        assert found.contrast == 80.0
+        np.testing.assert_allclose(found.camera.T_camera_lidar, goal, atol=1e-9)
 
     def test_what_is_not_found_fails(
         self, truth: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

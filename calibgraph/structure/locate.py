@@ -205,38 +205,51 @@ class _Seeker:
         )
         if not len(responses.maps):
             return Found(camera, -math.inf, False)
-        return self._best(name, search_box(responses, self._box(name), effort=effort, seed=seed))
+        found = search_box(responses, self._box(name), effort=effort, seed=seed)
+        return self._first(name, ([T] for T in found))
 
     def propose(self, accepted: Mapping[str, Found], name: str) -> Found:
         """Try a camera where accepted cameras put it."""
         poses = {other: found.camera.T_camera_lidar for other, found in accepted.items()}
-        return self._best(name, self._proposals(poses, name))
+        return self._first(name, self._proposals(poses, name))
 
-    def _best(self, name: str, poses: Iterable[Array]) -> Found:
-        """The first that is accepted of what some poses settle to, else the best."""
+    def _first(self, name: str, groups: Iterable[Iterable[Array]]) -> Found:
+        """The best of the first group of poses that has one which settles to an accepted one.
+
+        If none has, the best of all.
+        """
         camera = self.rig.cameras[name]
         best = Found(camera, -math.inf, False)
-        for T in poses:
-            best = max(best, settle(self.views[name], camera.moved_to(T)), key=lambda f: f.contrast)
-            if best.accepted or self.out_of_time():
+        for group in groups:
+            for T in group:
+                settled = settle(self.views[name], camera.moved_to(T))
+                best = max(best, settled, key=lambda found: found.contrast)
+                if self.out_of_time():
+                    return best
+            if best.accepted:
                 break
         return best
 
-    def _proposals(self, poses: Mapping[str, Array], name: str) -> Iterator[Array]:
-        """By known relative poses, by what both see, and by the guess's relative poses."""
+    def _proposals(self, poses: Mapping[str, Array], name: str) -> Iterator[Iterable[Array]]:
+        """By known relative poses, by what both see, and by the guess's relative poses.
+
+        What both see leaves the length of a translation open. Right but for that, a pose may be
+        accepted; so all lengths are one group.
+        """
         camera = self.rig.cameras[name]
         for pair in self.rig.relative_poses:
             if pair.a == name and pair.b in poses:
-                yield pair.T_a_b @ poses[pair.b]
+                yield [pair.T_a_b @ poses[pair.b]]
             elif pair.b == name and pair.a in poses:
-                yield np.linalg.inv(pair.T_a_b) @ poses[pair.a]
+                yield [np.linalg.inv(pair.T_a_b) @ poses[pair.a]]
         for other, T in poses.items():
             grays = self.views[other].grays, self.views[name].grays
             T_this_other = overlap_pose(self.rig.cameras[other], camera, *grays, seed=self.seed)
             if T_this_other is not None:
-                yield from _at_lengths(T_this_other, T, self._box(name))
+                yield _at_lengths(T_this_other, T, self._box(name))
         for other, T in poses.items():
-            yield camera.T_camera_lidar @ np.linalg.inv(self.rig.cameras[other].T_camera_lidar) @ T
+            T_guess_other = self.rig.cameras[other].T_camera_lidar
+            yield [camera.T_camera_lidar @ np.linalg.inv(T_guess_other) @ T]
 
     def _box(self, name: str) -> Box:
         within = self.within
