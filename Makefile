@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
@@ -27,10 +28,10 @@ run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
 	$(BIN)/calibgraph evaluate out/sample data/sample/reference.yaml
 
 test: $(VENV)/test ## Run the tests
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-slow: $(VENV)/test ## Run the tests on real data and the statistics (minutes)
-	$(BIN)/python -m pytest -m "realdata or statistics"
+	$(PYTEST) --dist worksteal -m "realdata or statistics"
 
 lint: type ## Check style and types
 	$(BIN)/ruff check .

@@ -9,37 +9,74 @@ import numpy as np
 import pytest
 
 import calibgraph
+from calibgraph.structure.level import LEVELS
 from tests.conftest import ROOT, SAMPLE
 
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_python_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    first, own_matcher, tracker = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    (tmp_path / "data").symlink_to(ROOT / "data")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"your_matches": true_matches}
-    exec(compile(first, "README.md", "exec"), names)
+FIRST, OWN_MATCHER, TRACKER = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the examples are run."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "data").symlink_to(ROOT / "data")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> calibgraph.Calibration:
+    """The sample as the first example calibrates it, from 2 deg and 0.2 m."""
+    names: dict[str, object] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(compile(FIRST, "README.md", "exec"), names)
     result = names["result"]
     assert isinstance(result, calibgraph.Calibration)
-    assert result.verdict.status == "PASS"
-    assert (tmp_path / "out" / "python" / "calibration.yaml").is_file()
-    exec(compile(own_matcher, "README.md", "exec"), names)
-    table = calibgraph.load_correspondences(tmp_path / "matches.parquet")
+    return result
+
+
+def test_the_sample_is_calibrated(result: calibgraph.Calibration, folder: Path) -> None:
+    """With exact truth, to the resolution of a 640 px image."""
+    for name, error in calibgraph.evaluate(result.rig, TRUTH).cameras.items():
+        assert error.rotation_error_deg < 0.12, name  # 1 px is 0.12 deg
+        assert error.translation_error_cm < 3, name
+    assert result.verdict.status == "PASS", result.verdict.reasons
+    assert len(result.rounds) == len(LEVELS) - 3  # the search has done the first
+    assert (folder / "out" / "python" / "calibration.yaml").is_file()
+
+
+def test_the_table_of_the_last_round_repeats_the_solve(result: calibgraph.Calibration) -> None:
+    assert result.correspondences is not None
+    again = calibgraph.solve(result.rig, result.correspondences)
+    for name, T in result.T_camera_lidar.items():
+        delta = calibgraph.evaluate(again.rig, result.rig).cameras[name]
+        assert delta.rotation_error_deg < 0.01, name
+        assert delta.translation_error_cm < 0.2, name
+        assert T.shape == (4, 4)
+
+
+def test_a_matcher_and_a_tracker_as_in_the_examples(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    monkeypatch.chdir(folder)
+    names: dict[str, object] = {"calibgraph": calibgraph, "your_matches": true_matches}
+    exec(compile(OWN_MATCHER, "README.md", "exec"), names)
+    table = calibgraph.load_correspondences(folder / "matches.parquet")
     assert table.point_index is not None and len(np.unique(table.frame)) == 6
     result = names["result"]
     assert isinstance(result, calibgraph.Calibration)
     for error in calibgraph.evaluate(result.rig, TRUTH).cameras.values():
         assert error.rotation_error_deg < 0.1
     names["frame_tables"] = [table.select(table.frame == frame) for frame in range(6)]
-    exec(compile(tracker, "README.md", "exec"), names)
+    exec(compile(TRACKER, "README.md", "exec"), names)
     update = names["update"]
     assert isinstance(update, calibgraph.Update)
     assert update.verdicts["left"].status in ("PASS", "WARN")
     assert calibgraph.IncrementalCalibrator.load("out/tracker").frame == 5
-
-
-TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
 def true_matches(

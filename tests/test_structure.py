@@ -1,4 +1,4 @@
-"""The matcher `structure`: its parts on worked cases, the whole on the sample with exact truth."""
+"""The matcher `structure`: its parts on worked cases. The whole, on the sample: test_readme.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import pytest
 
 import calibgraph
 from calibgraph import (
-    Calibration,
     Camera,
     CorrespondenceError,
     Dataset,
@@ -38,11 +37,6 @@ def local(levels: Sequence[Level]) -> StructureMatcher:
 @pytest.fixture(scope="module")
 def truth() -> Rig:
     return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
-def result() -> Calibration:
-    return calibgraph.calibrate(SAMPLE)
 
 
 def blobs(centres: np.ndarray, reach: int = 12, width: float = 2.0) -> np.ndarray:
@@ -159,26 +153,6 @@ def test_windows_come_from_clouds_with_and_without_intensity() -> None:
         np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-4)
         gram = basis.T @ basis
         np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-4)
-
-
-def test_the_sample_is_calibrated(result: Calibration, truth: Rig) -> None:
-    """From 2 deg and 0.2 m; with exact truth, to the resolution of a 640 px image."""
-    for name, error in calibgraph.evaluate(result.rig, truth).cameras.items():
-        assert error.rotation_error_deg < 0.12, name  # 1 px is 0.12 deg
-        assert error.translation_error_cm < 3, name
-    assert result.verdict.status == "PASS", result.verdict.reasons
-    assert len(result.rounds) == len(LEVELS) - 3  # the search has done the first
-    assert result.correspondences is not None
-
-
-def test_the_table_of_the_last_round_repeats_the_solve(result: Calibration) -> None:
-    assert result.correspondences is not None
-    again = calibgraph.solve(result.rig, result.correspondences)
-    for name, T in result.T_camera_lidar.items():
-        delta = calibgraph.evaluate(again.rig, result.rig).cameras[name]
-        assert delta.rotation_error_deg < 0.01, name
-        assert delta.translation_error_cm < 0.2, name
-        assert T.shape == (4, 4)
 
 
 def shuffled(data: Dataset, folder: Path) -> Dataset:
