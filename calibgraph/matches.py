@@ -60,6 +60,10 @@ class Scale:
     gate_px: float
     sigma_px: float
 
+    def narrowed(self, factor: float) -> Scale:
+        """With a smaller loss: so many times the sigma and the loss's scale."""
+        return replace(self, sigma=factor * self.sigma, loss_scale=factor * self.loss_scale)
+
 
 @dataclass(frozen=True, eq=False)
 class Matches:

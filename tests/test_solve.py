@@ -15,11 +15,13 @@ from calibgraph import (
     evaluate,
     perturb,
     preset,
+    problem,
     simulate_correspondences,
     solve,
 )
 from calibgraph.config import TERMS
 from calibgraph.matches import robust_spread
+from calibgraph.two_pass import fit
 from tests.conftest import stereo_relative_pose
 
 CLEAN = MatcherErrors(noise_px=0.0)
@@ -272,6 +274,21 @@ def test_seven_of_ten_outliers_and_a_guess_20_deg_off_are_survived(mixed_rig: Ri
         assert centimetres < 3
         assert result.residuals["front"].sigma_px == pytest.approx(1.0, rel=0.1)
         assert result.verdict.status != "PASS"  # so few inliers are worth a word
+
+
+def test_without_pnp_a_narrowing_loss_leads_to_where_matches_are_densest(
+    pair: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 20 deg and 1.5 m off, with the guess as Stage 1 and 70 % outliers."""
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.7)
+    table = simulate_correspondences(pair, frames=5, matches=300, errors=errors)
+    start = perturb(pair, rotation_deg=20, translation_m=1.5)
+    found = fit(start, table, Config(stage1="rig"))
+    degrees, centimetres = worst(found.solved_rig, pair)
+    assert degrees < 0.1 and centimetres < 5
+    monkeypatch.setattr(problem, "_NARROWINGS", 0)
+    stuck, _ = worst(fit(start, table, Config(stage1="rig")).solved_rig, pair)
+    assert stuck > 1
 
 
 def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:
