@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
@@ -30,8 +30,8 @@ run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
 test: $(VENV)/test ## Run the tests
 	$(PYTEST)
 
-test-slow: $(VENV)/test ## Run the tests on real data and the statistics (minutes)
-	$(PYTEST) --dist worksteal -m "realdata or statistics"
+test-slow: $(VENV)/test ## Run the slow tests, on real data too, and the statistics (many minutes)
+	$(PYTEST) --dist worksteal -m "slow or realdata or statistics"
 
 lint: type ## Check style and types
 	$(BIN)/ruff check .

@@ -169,6 +169,7 @@ def test_bad_rigs_and_tables_are_one_line(problem: Path, call: Call) -> None:
     assert not (problem / "never").exists()
 
 
+@pytest.mark.slow
 def test_cameras_that_see_nothing_of_the_cloud_are_one_line(call: Call, tmp_path: Path) -> None:
     rig = load_rig(SAMPLE)
     backwards = np.diag([-1.0, 1.0, -1.0, 1.0]) @ rig.T_camera_lidar["front_left"]

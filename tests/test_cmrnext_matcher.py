@@ -232,6 +232,7 @@ def test_true_flow_gives_the_true_poses(
     assert table.metadata["schedule"][0]["sha256"]
 
 
+@pytest.mark.slow
 def test_a_network_that_knows_its_rig_by_heart_is_found_out(
     sample: Dataset, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +245,7 @@ def test_a_network_that_knows_its_rig_by_heart_is_found_out(
     assert all("even without the image" in reason for reason in result.verdict.reasons)
 
 
+@pytest.mark.slow
 def test_frames_beyond_the_range_of_training_are_dropped(
     sample: Dataset, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,6 +262,7 @@ def test_frames_beyond_the_range_of_training_are_dropped(
     assert any("100% of the frames failed" in r for r in result.camera_verdicts["left"].reasons)
 
 
+@pytest.mark.slow
 def test_an_untrained_network_is_found_out(sample: Dataset, weights: Path) -> None:
     """It gives back its start, consistently over all frames: only the displaced start tells."""
     result = calibgraph.calibrate(
@@ -328,6 +331,7 @@ def test_intensities_of_bytes_become_unit() -> None:
     np.testing.assert_allclose(same.intensity, unit.intensity, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_gives_what_single_images_give(sample: Dataset, weights: Path) -> None:
     one, four = (
         CmrNextMatcher([weights], batch=size, iterations=1).match(
@@ -412,6 +416,7 @@ def test_the_verdict_heeds_the_matcher(matching: Matching, status: str) -> None:
     assert len(verdict.reasons) == (status != "PASS")
 
 
+@pytest.mark.slow
 def test_perturbed_starts_are_matched_like_others(sample: Dataset, weights: Path) -> None:
     """A guess from which a camera sees nothing of the cloud is said to be one."""
     turned = perturb(sample.rig, rotation_deg=180, translation_m=0, seed=3)

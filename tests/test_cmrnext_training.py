@@ -123,6 +123,7 @@ def test_the_flow_of_a_sample_leads_to_the_true_pixel(trusted: Dataset) -> None:
     assert sample.rgb.shape[1:] == sample.lidar.shape[1:]
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_as_if_it_had_not_been(
     parts: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:
@@ -182,6 +183,7 @@ def nll_content() -> dict[str, object]:
     return content
 
 
+@pytest.mark.slow
 def test_encoders_learn_to_find_each_other(trusted: Dataset, tmp_path: Path) -> None:
     """On one picture, over and over: the correlation loss falls below ignorance, ln 49."""
     settings = TINY.changed(

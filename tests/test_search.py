@@ -123,6 +123,7 @@ class TestParts:
 
 
 class TestSample:
+    @pytest.mark.slow
     def test_it_is_found_from_far_away(self, truth: Rig) -> None:
         far = far_from(truth, seed=1)
         rig = Rig(cameras={name: far.cameras[name] for name in ("front_left", "left")})
@@ -134,6 +135,7 @@ class TestSample:
             assert error.rotation_error_deg < 0.7, name  # what the next round reaches
             assert error.translation_error_cm < 20, name
 
+    @pytest.mark.slow
     def test_the_same_seed_finds_the_same(self, truth: Rig) -> None:
         far = far_from(truth, seed=1)
         rig = Rig(cameras={"front_left": far.cameras["front_left"]})
@@ -186,6 +188,7 @@ class TestSample:
             at, of = (lenses[n] for n in pair), (grays[n] for n in pair)
             assert overlap_pose(*at, *of, seed=0) is None
 
+    @pytest.mark.slow
     def test_a_camera_is_found_by_what_it_sees_of_another(
         self, truth: Rig, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -248,6 +251,7 @@ class TestSample:
         )
         assert start.first_round == 0
 
+    @pytest.mark.slow
     def test_what_is_not_found_fails_in_later_solves(
         self, truth: Rig, tmp_path: Path, call: Call
     ) -> None:

@@ -75,6 +75,7 @@ def test_images_that_nobody_needed_do_not_cost_the_result(tmp_path: Path, truth:
     assert any("the images could not be asked" in reason for reason in result.verdict.reasons)
 
 
+@pytest.mark.slow
 def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, truth: Rig) -> None:
     """Random correspondences: FAIL in the result, in the table, in the pictures, on the page."""
     nonsense = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=1.0))

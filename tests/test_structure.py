@@ -190,6 +190,7 @@ def test_a_frame_given_twice_is_pointed_out() -> None:
     assert frames_checks(replace(data, frames=data.frames[:2]), hashes) == []
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
     one, two = (calibgraph.calibrate(data, matcher=local(LEVELS[:1])) for _ in range(2))

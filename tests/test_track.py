@@ -961,6 +961,7 @@ def kill_often(folder: Path, kills: int, longest_s: float, seed: int) -> int:
     return drives
 
 
+@pytest.mark.slow
 def test_random_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
     assert kill_often(tmp_path, kills=5, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1
 
@@ -996,6 +997,7 @@ def running(world: World, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.kill()
 
 
+@pytest.mark.slow
 def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
     world: World, running: subprocess.Popen[bytes]
 ) -> None:
