@@ -22,7 +22,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.files import sha256
 from calibgraph.problem import Clock, Fit
 from calibgraph.rig import Rig, angle_deg
-from calibgraph.second_look import Matched, better_reading, second_look
+from calibgraph.second_look import Matched, better_reading, matched_again, second_look
 from calibgraph.two_pass import fit, judged
 
 Array = NDArray[np.float64]
@@ -168,7 +168,8 @@ def match_in_rounds(
 ) -> Matched:
     """Match, solve, and match again from the estimate, as often as the matcher wants.
 
-    Nothing is judged. Arguments and errors as of :func:`calibrate`.
+    Then once more from a displaced start, see ``matched_again``. Nothing is judged. Arguments and
+    errors as of :func:`calibrate`.
     """
     config = config or Config()
     chosen = matcher_named(matcher, seed=config.seed)
@@ -192,7 +193,7 @@ def match_in_rounds(
         estimate = found.solved_rig
         if out_of_time():
             break
-    return Matched(
+    matched = Matched(
         data,
         chosen,
         guess,
@@ -203,6 +204,8 @@ def match_in_rounds(
         missed_rounds=chosen.rounds - 1 - index,
         out_of_time=out_of_time(),
     )
+    with clock("match_again"):
+        return matched_again(matched, progress)
 
 
 def _after(seconds: float | None) -> Callable[[], bool]:

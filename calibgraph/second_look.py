@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.check import Check, above
 from calibgraph.conventions import range_checks, reread
-from calibgraph.correspondences import Correspondences
+from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.dataset import Dataset, spread_out
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.perturbation import perturb
@@ -38,8 +38,26 @@ BACK_WARN_DEG, BACK_FAIL_DEG = 0.15, 0.5
 BACK_WARN_CM, BACK_FAIL_CM = 5.0, 15.0
 """From where a matcher must find back to its result, and how near."""
 
+BETTER = 1.03
+"""Times the contrast of a result: so much more is clear. At the same place it varies by less."""
+
 _READING_FRAMES = 2
 _CLEARER = 1.3  # times the contrast of the guess as it is
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where matching ended from two starts, the second displaced from the end of the first.
+
+    Attributes:
+        first: the end of the rounds.
+        again: the end of matching again; None if it gave nothing.
+        why_none: why it gave nothing.
+    """
+
+    first: Rig
+    again: Rig | None
+    why_none: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +68,14 @@ class Matched:
         dataset: images and clouds.
         matcher: what found the correspondences.
         guess: where the first round started.
-        table: the correspondences of the last round.
+        table: the correspondences of the last round; of cameras that were taken from matching
+            again, those.
         fit: the solution from them.
         rounds: per round and camera, how many matches, and how far they moved it.
         clock: what took how long.
         missed_rounds: how many rounds there was no time for.
         out_of_time: whether the time limit has passed.
+        ends: of matching again; None if it was not.
     """
 
     dataset: Dataset
@@ -67,6 +87,43 @@ class Matched:
     clock: Clock
     missed_rounds: int = 0
     out_of_time: bool = False
+    ends: Ends | None = None
+
+
+def matched_again(matched: Matched, progress: Progress) -> Matched:
+    """Match again from a start displaced from the result, if the matcher names rounds for it.
+
+    Where an objective is flat, as along the axis of a camera in a straight street, rounds may stand
+    still before its top. Cameras in whose images the second end has a clearly higher contrast are
+    taken from there.
+    """
+    rounds = getattr(matched.matcher, "tracking_rounds", ())
+    if not rounds or matched.out_of_time or not matched.fit.problem.fits_matches:
+        return matched
+    rig, config, terms = matched.fit.solved_rig, matched.fit.config, matched.fit.problem.terms
+    estimate = perturb(rig, rotation_deg=BACK_DEG, translation_m=BACK_M, seed=config.seed)
+    for index in dict.fromkeys((*rounds, matched.matcher.rounds - 1)):
+        table = matched.matcher.match(
+            matched.dataset,
+            estimate,
+            round_index=index,
+            progress=lambda what, done, total: progress("matching again", done, total),
+        )
+        try:
+            estimate = fit(estimate, table, config, terms).solved_rig
+        except CorrespondenceError as error:
+            return replace(matched, ends=Ends(rig, None, str(error)))
+    matched = replace(matched, ends=Ends(rig, estimate))
+    before, now = (t.metadata.get("contrast", {}) for t in (matched.table, table))
+    better = {name for name in now if now[name] > BETTER * before.get(name, np.inf)}
+    if not better:
+        return matched
+    parts = [(table if n in better else matched.table).of_camera(n) for n in rig.cameras]
+    contrast = {**before, **{name: now[name] for name in better}}
+    mixed = concatenate(parts)
+    mixed = replace(mixed, metadata={**matched.table.metadata, "contrast": contrast})
+    start = rig.moved_to({name: estimate.T_camera_lidar[name] for name in better})
+    return replace(matched, table=mixed, fit=fit(start, mixed, config, terms))
 
 
 def second_look(
@@ -97,7 +154,7 @@ def second_look(
 def _asked_again(matched: Matched, progress: Progress) -> tuple[Checks, Checks]:
     """What matching again says, and what the images say; in short, if there is no time for it."""
     if not matched.out_of_time:
-        return return_checks(matched, progress), image_checks_of(matched, progress)
+        return return_checks(matched.ends), image_checks_of(matched, progress)
     missed = f"{matched.missed_rounds} rounds of matching and " if matched.missed_rounds else ""
     text = f"partial: there was no time for {missed}a second look at the images"
     check = Check("time limit", "WARN", text, matched.missed_rounds)
@@ -127,31 +184,15 @@ def frames_checks(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
     return []
 
 
-def return_checks(matched: Matched, progress: Progress) -> Checks:
-    """Per camera, whether matching comes back to a result from a start displaced from it.
-
-    Asked of matchers that name rounds for near starts, ``tracking_rounds``.
-    """
-    rounds = getattr(matched.matcher, "tracking_rounds", ())
-    if not rounds or not matched.fit.problem.fits_matches:
+def return_checks(ends: Ends | None) -> Checks:
+    """Per camera, whether matching again from a displaced start ended at the same place."""
+    if ends is None:
         return {}
-    rig, config, terms = matched.fit.solved_rig, matched.fit.config, matched.fit.problem.terms
-    estimate = perturb(rig, rotation_deg=BACK_DEG, translation_m=BACK_M, seed=config.seed)
-    for index in rounds:
-        table = matched.matcher.match(
-            matched.dataset,
-            estimate,
-            round_index=index,
-            progress=lambda what, done, total: progress("checking: matching again", done, total),
-        )
-        try:
-            estimate = fit(estimate, table, config, terms).solved_rig
-        except CorrespondenceError as error:
-            text = f"matching again from {_start()} gave nothing: {error}"
-            return {name: [Check("matching again", "FAIL", text)] for name in rig.cameras}
-    return {
-        name: _apart(T, estimate.T_camera_lidar[name]) for name, T in rig.T_camera_lidar.items()
-    }
+    if ends.again is None:
+        text = f"matching again from {_start()} gave nothing: {ends.why_none}"
+        return {name: [Check("matching again", "FAIL", text)] for name in ends.first.cameras}
+    again = ends.again.T_camera_lidar
+    return {name: _apart(T, again[name]) for name, T in ends.first.T_camera_lidar.items()}
 
 
 def _start() -> str:

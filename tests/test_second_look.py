@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,15 +39,39 @@ def truth() -> Rig:
 
 def test_a_matcher_that_comes_back_passes(truth: Rig) -> None:
     matched = match_in_rounds(SAMPLE, truth, Simulated([truth, truth]), progress=silent)
-    for checks in return_checks(matched, silent).values():
+    for checks in return_checks(matched.ends).values():
         assert [check.status for check in checks] == ["PASS", "PASS"]
 
 
 def test_a_matcher_that_ends_elsewhere_fails(truth: Rig) -> None:
     other = calibgraph.perturb(truth, rotation_deg=1, translation_m=0.1, seed=1)
     matched = match_in_rounds(SAMPLE, truth, Simulated([truth, other]), progress=silent)
-    for checks in return_checks(matched, silent).values():
+    for checks in return_checks(matched.ends).values():
         assert checks[0].status == "FAIL" and checks[0].value == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth: Rig) -> None:
+    """Two cameras stood still 8 cm off; only of one is the other end better."""
+    off = calibgraph.perturb(truth, rotation_deg=0.1, translation_m=0.08, seed=1)
+    agreed = [
+        {"front_left": 16.0, "front_right": 20.0, "left": 18.0},
+        {"front_left": 18.0, "front_right": 20.1, "left": 17.0},
+    ]
+
+    class Contrasting(Simulated):
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
+            table = super().match(dataset, rig, round_index=round_index, progress=progress)
+            return replace(table, metadata={"contrast": agreed.pop(0)})
+
+    matched = match_in_rounds(SAMPLE, truth, Contrasting([off, truth]), progress=silent)
+    errors = calibgraph.evaluate(matched.fit.solved_rig, truth).cameras
+    assert errors["front_left"].translation_error_cm < 1
+    for name in ("front_right", "left"):
+        assert errors[name].translation_error_cm == pytest.approx(8, abs=1)
+    expected = {"front_left": 18.0, "front_right": 20.0, "left": 18.0}
+    assert matched.table.metadata["contrast"] == expected
+    for checks in return_checks(matched.ends).values():  # two ends are worth a warning
+        assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
 
 
 def test_the_last_round_is_judged_only_if_there_are_others() -> None:
