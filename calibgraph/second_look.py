@@ -39,7 +39,8 @@ BACK_WARN_CM, BACK_FAIL_CM = 5.0, 15.0
 """From where a matcher must find back to its result, and how near."""
 
 BETTER = 1.03
-"""Times the contrast of a result: so much more is clear. At the same place it varies by less."""
+"""Times the contrast of a result. On KITTI, ends 8 to 12 cm off had 8 to 16 % less contrast than
+those at 3 cm; ends at the same place differ by some percent, and are as good."""
 
 _READING_FRAMES = 2
 _CLEARER = 1.3  # times the contrast of the guess as it is
