@@ -96,7 +96,7 @@ def matched_again(matched: Matched, progress: Progress) -> Matched:
 
     Where an objective is flat, as along the axis of a camera in a straight street, rounds may stand
     still before its top. Cameras in whose images the second end has a clearly higher contrast are
-    taken from there.
+    taken from there; not if the ends are so far apart that the camera fails.
     """
     rounds = getattr(matched.matcher, "tracking_rounds", ())
     if not rounds or matched.out_of_time or not matched.fit.problem.fits_matches:
@@ -115,8 +115,13 @@ def matched_again(matched: Matched, progress: Progress) -> Matched:
         except CorrespondenceError as error:
             return replace(matched, ends=Ends(rig, None, str(error)))
     matched = replace(matched, ends=Ends(rig, estimate))
+    passing = {
+        name
+        for name, of in return_checks(matched.ends).items()
+        if all(check.status != "FAIL" for check in of)
+    }
     before, now = (t.metadata.get("contrast", {}) for t in (matched.table, table))
-    better = {name for name in now if now[name] > BETTER * before.get(name, np.inf)}
+    better = {n for n in passing if now.get(n, -np.inf) > BETTER * before.get(n, np.inf)}
     if not better:
         return matched
     parts = [(table if n in better else matched.table).of_camera(n) for n in rig.cameras]

@@ -32,6 +32,18 @@ class Simulated:
         return simulate_correspondences(self.seen.pop(0), frames=6, matches=100)
 
 
+class Contrasting(Simulated):
+    """One that also says how far image and cloud agree."""
+
+    def __init__(self, seen: list[Rig], contrasts: list[dict[str, float]]) -> None:
+        super().__init__(seen)
+        self.contrasts = contrasts
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
+        table = super().match(dataset, rig, round_index=round_index, progress=progress)
+        return replace(table, metadata={"contrast": self.contrasts.pop(0)})
+
+
 @pytest.fixture
 def truth() -> Rig:
     return calibgraph.load_rig(SAMPLE / "reference.yaml")
@@ -58,12 +70,7 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
         {"front_left": 18.0, "front_right": 20.1, "left": 17.0},
     ]
 
-    class Contrasting(Simulated):
-        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
-            table = super().match(dataset, rig, round_index=round_index, progress=progress)
-            return replace(table, metadata={"contrast": agreed.pop(0)})
-
-    matched = match_in_rounds(SAMPLE, truth, Contrasting([off, truth]), progress=silent)
+    matched = match_in_rounds(SAMPLE, truth, Contrasting([off, truth], agreed), progress=silent)
     errors = calibgraph.evaluate(matched.fit.solved_rig, truth).cameras
     assert errors["front_left"].translation_error_cm < 1
     for name in ("front_right", "left"):
@@ -72,6 +79,16 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
     assert matched.table.metadata["contrast"] == expected
     for checks in return_checks(matched.ends).values():  # two ends are worth a warning
         assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
+
+
+def test_of_ends_too_far_apart_the_first_is_kept(truth: Rig) -> None:
+    """The camera fails; what is better on a flat objective says nothing then."""
+    other = calibgraph.perturb(truth, rotation_deg=0.9, translation_m=0.08, seed=1)
+    agreed = [dict.fromkeys(truth.cameras, contrast) for contrast in (6.0, 7.5)]
+
+    matched = match_in_rounds(SAMPLE, truth, Contrasting([truth, other], agreed), progress=silent)
+    for error in calibgraph.evaluate(matched.fit.solved_rig, truth).cameras.values():
+        assert error.rotation_error_deg < 0.1
 
 
 def test_the_last_round_is_judged_only_if_there_are_others() -> None:
