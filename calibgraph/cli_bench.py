@@ -152,10 +152,10 @@ def tune(
         str, typer.Option("--mu", metavar="X,X", help="mu.", rich_help_panel=_SETS)
     ] = "0,1,2,5,10,20",
     loss_scale_px: Annotated[
-        str, typer.Option("--delta", metavar="X,X", help="delta [px].", rich_help_panel=_SETS)
+        str, typer.Option("--delta", metavar="X,X", help="delta, in pixels.", rich_help_panel=_SETS)
     ] = "1,2,4,8,16",
     gate_px: Annotated[
-        str, typer.Option("--tau", metavar="X,X", help="tau [px].", rich_help_panel=_SETS)
+        str, typer.Option("--tau", metavar="X,X", help="tau, in pixels.", rich_help_panel=_SETS)
     ] = "2,3,5,8,16,32",
     rotation_deg: RotationOption = 20.0,
     translation_m: TranslationOption = 1.5,
