@@ -34,9 +34,8 @@ def simulate(
         str | None,
         typer.Option(
             metavar="NAME|RIG",
-            show_default=RIG,
             help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
-            "file of your own; its poses are the truth.",
+            f"file of your own; its poses are the truth. (default: {RIG})",
             rich_help_panel=_STREET,
         ),
     ] = None,
@@ -52,16 +51,14 @@ def simulate(
         int | None,
         typer.Option(
             metavar="16|64|128",
-            show_default=str(BEAMS),
-            help="Of the LiDAR.",
+            help=f"Of the LiDAR. (default: {BEAMS})",
             rich_help_panel=_STREET,
         ),
     ] = None,
     step_m: Annotated[
         float | None,
         typer.Option(
-            show_default=str(STEP_M),
-            help="Between two frames, on average.",
+            help=f"Between two frames, on average. (default: {STEP_M:g})",
             rich_help_panel=_STREET,
         ),
     ] = None,
