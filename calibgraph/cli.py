@@ -119,6 +119,7 @@ def calibrate(
             seed=seed,
             search_deg=search_deg,
             search_m=search_m,
+            chosen_frames=frames is not None,
             device=device,
             estimate=estimate,
             iterations=iterations,
@@ -140,6 +141,7 @@ def calibrate(
         shown = data.frames[len(data.frames) // 2]
         written += write_overlays(shown, result.initial_rig, result.rig, out, mark=_mark(result))
         written.append(write_report(result, out / "report.html"))
+    _say_frames(len(result.frames), data)
     _finish(result, written, as_json)
 
 
@@ -179,6 +181,7 @@ def match(
             seed=seed,
             search_deg=search_deg,
             search_m=search_m,
+            chosen_frames=frames is not None,
             device=device,
             estimate=estimate,
             iterations=iterations,
@@ -188,10 +191,12 @@ def match(
         )
     data = _dataset(dataset, rig, frames)
     with progress_bar() as progress:
-        table = match_in_rounds(
+        matched = match_in_rounds(
             data, matcher=chosen, time_limit_s=time_limit_s, progress=progress
-        ).table
+        )
+    table = matched.table
     table.save(out)
+    _say_frames(len(matched.dataset.frames), data)
     missed = list(table.metadata.get("missed", ()))
     if as_json:
         from calibgraph.json_output import print_json
@@ -460,13 +465,21 @@ def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Datas
         return data.select(frames) if frames is not None else data
 
 
-def _matcher(name: str, weights: list[Path] | None, *, seed: int, **options: Any) -> Matcher:
+def _matcher(
+    name: str,
+    weights: list[Path] | None,
+    *,
+    seed: int,
+    chosen_frames: bool = False,
+    **options: Any,
+) -> Matcher:
     """The matcher of that name or file.
 
     Args:
         name: of the matcher, or a file.
         weights: of cmrnext.
         seed: of everything random.
+        chosen_frames: the user chose the frames; then all of them count.
         options: of cmrnext, and the search_deg and search_m of structure; None if not given.
 
     Raises:
@@ -483,12 +496,13 @@ def _matcher(name: str, weights: list[Path] | None, *, seed: int, **options: Any
     for option in ("weights", *(given.keys() - {"device"})):
         if option != "weights" or weights:
             raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
-    if searched:
+    if name == "structure":
         from calibgraph.structure import StructureMatcher
 
         none = dict.fromkeys(_SEARCH) if None in searched.values() else {}
-        ranges: dict[str, Any] = {**searched, **none}
-        return StructureMatcher(seed=seed, **ranges)
+        frames = {"most_frames": None} if chosen_frames else {}
+        settings: dict[str, Any] = {**searched, **none, **frames}
+        return StructureMatcher(seed=seed, **settings)
     from calibgraph.pipeline import matcher_named
 
     return matcher_named(name, seed=seed)
@@ -529,6 +543,13 @@ def _terms(name: str) -> Any:
     if name not in TERMS:
         raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")
     return name
+
+
+def _say_frames(used: int, data: Dataset) -> None:
+    """Say so if not all frames were matched."""
+    if used < len(data.frames):
+        text = f"{used} of {len(data.frames)} frames, evenly spread; --frames takes others"
+        terminal().print(text, soft_wrap=True, highlight=False)
 
 
 def _mark(result: Calibration) -> str:

@@ -107,7 +107,8 @@ FramesOption = Annotated[
     str | None,
     typer.Option(
         metavar="A:B:STEP",
-        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.",
+        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
+        "all; of more than 30 the matcher structure takes 30, evenly spread)",
     ),
 ]
 ConfigOption = Annotated[

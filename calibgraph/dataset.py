@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -64,11 +65,27 @@ class Dataset:
         rig: the rig that lies with the data: its poses are a guess, or (KITTI) the reference.
         frames: in order of time.
         folders: where they come from.
+        recorded: all frames of the folders, where only some of them were selected.
     """
 
     rig: Rig
     frames: tuple[Frame, ...]
     folders: tuple[Path, ...]
+    recorded: tuple[Frame, ...] = ()
+
+    def neighbour(self, frame: Frame, later: int) -> Frame | None:
+        """The frame recorded so many frames later in the same folder, selected or not."""
+        other = self._by_index.get(frame.index + later)
+        same = other is not None and other.cloud_path.parent == frame.cloud_path.parent
+        return other if same else None
+
+    @cached_property
+    def _by_index(self) -> dict[int, Frame]:
+        return {frame.index: frame for frame in (*self.recorded, *self.frames)}
+
+    def spread_out(self, most: int) -> Dataset:
+        """At most so many of the frames, evenly spread over them."""
+        return self._only(spread_out(self.frames, most))
 
     def select(self, frames: str) -> Dataset:
         """Keep some frames, by their position among the frames sorted by name, from 0.
@@ -88,7 +105,10 @@ class Dataset:
             ) from error
         if not kept:
             raise ValueError(f"frames {frames!r} selects none of the {len(self.frames)} frames")
-        return replace(self, frames=tuple(kept))
+        return self._only(kept)
+
+    def _only(self, frames: Sequence[Frame]) -> Dataset:
+        return replace(self, frames=tuple(frames), recorded=self.recorded or self.frames)
 
 
 def load_dataset(folders: Path | str | Sequence[Path | str], rig: Rig | None = None) -> Dataset:

@@ -41,6 +41,8 @@ _CANDIDATES = 200  # where to start looking
 _MOST = 1e6  # of a spread: a frame that is all behind its camera has none
 _SETTLED = 1e-6  # rad, m
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100
+_TOLD_BY = 10  # matches: of fewer, their residuals about their own pose tell no spread
+_CHANCE = 2.0  # times what noise moves a frame's pose by, in mean squares: rarely more (5 %)
 _LEAST_SIZE = 0.05  # of a frame's spread, which is not below MIN_SIGMA_PX
 
 
@@ -95,7 +97,7 @@ class _Frames:
     Attributes:
         poses: (f,) T_lidar_camera.
         counts: (f,) matches.
-        spreads: (f,) of whitened residuals about the own pose.
+        spreads: (f,) of whitened residuals, by those about the own pose.
         spreads_px: (f,) of unweighted ones.
         hessians: (f, 6, 6) of whitened residuals there.
         sizes: (n,) of the residuals there, relative to the frame's spread; in medians of a standard
@@ -119,14 +121,17 @@ def _consensus(frames: _Frames, start: gtsam.Pose3) -> tuple[Array, Array]:
     """Where frames are densest, (4, 4) T_camera_lidar, and (f,) their weights, at most 1.
 
     Mean shift over the frames' own poses, with a kernel that is zero beyond a reach. Once it stands
-    still the reach is widened, not to lose good frames.
+    still the reach is widened, not to lose good frames. Frames with fewer matches than others may
+    be farther off, by what noise moves their own poses.
     """
     pose = start
     for step in range(_STEPS):
         away, shift = _shifts(frames, pose)
+        typical = np.median(frames.noise)
+        apart = np.maximum(shift - _CHANCE * np.maximum(frames.noise - typical, 0), 0)
         if step <= _MOVING_STEPS:
-            reach = _reach(shift, frames.noise, widened=step == _MOVING_STEPS)
-        near = np.clip(_FLAT * (1 - np.sqrt(shift) / reach), 0, 1)
+            reach = _reach(apart, frames.noise, widened=step == _MOVING_STEPS)
+        near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
         if not near.any():  # no two frames agree: there is nothing to learn
             return start.inverse().matrix(), np.ones(len(near))
         scatter = max(float(near @ (shift - frames.noise) / near.sum()), 0.0)
@@ -190,16 +195,29 @@ def _at_own_poses(parts: list[Matches], starts: list[Array]) -> _Frames:
         spreads.append(spread)
         spreads_px.append(robust_spread(part.sizes(pose.inverse().matrix())[0]))
         hessians.append(sums.hessian)
-        sizes.append(own / spread)
-    counts = np.array([len(part.frame) for part in parts], dtype=np.float64)
+        sizes.append(own)
+    counts = np.array([len(part.frame) for part in parts])
+    corrected = _about_common_pose(np.array(spreads), counts)
     return _Frames(
         poses=tuple(poses),
-        counts=counts,
-        spreads=np.array(spreads),
+        counts=counts.astype(np.float64),
+        spreads=corrected,
         spreads_px=np.array(spreads_px),
         hessians=np.array(hessians),
-        sizes=np.concatenate(sizes),
+        sizes=np.concatenate(sizes) / np.repeat(corrected, counts),
     )
+
+
+def _about_common_pose(spreads: Array, counts: NDArray[np.int_]) -> Array:
+    """(f,) spreads of residuals, by those about poses that were fitted to them.
+
+    Six unknowns take their share of 2 n residuals; where they take most, the frame's matches are
+    as good as other frames'.
+    """
+    grown = spreads * np.sqrt(2 * counts / np.maximum(2 * counts - 6, 1))
+    told = counts >= _TOLD_BY
+    typical = float(np.median(grown[told] if told.any() else grown))
+    return np.asarray(np.where(told, grown, np.maximum(grown, typical)))
 
 
 def _damped(hessian: Array) -> Array:

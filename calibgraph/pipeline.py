@@ -21,8 +21,14 @@ from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import sha256
 from calibgraph.problem import Clock, Fit
-from calibgraph.rig import Rig, angle_deg
-from calibgraph.second_look import Matched, better_reading, matched_again, second_look
+from calibgraph.rig import Rig
+from calibgraph.second_look import (
+    Matched,
+    better_reading,
+    matched_again,
+    round_of,
+    second_look,
+)
 from calibgraph.two_pass import fit, judged
 
 Array = NDArray[np.float64]
@@ -61,6 +67,9 @@ class Matcher(Protocol):
     It may have an attribute ``tracking_rounds``: which of its rounds to go through near a good
     estimate. Single frames of a drive go through these (otherwise through all), and a result is
     tried by matching again with them from a start displaced from it.
+
+    It may have an attribute ``most_frames``: how many frames it is given at most, evenly spread
+    over the dataset; None for all.
 
     It may have a method ``locate(dataset, rig, *, out_of_time, progress)`` that says where the
     rounds begin, a ``Start``, given the guess and a function that says when to hurry.
@@ -175,8 +184,10 @@ def match_in_rounds(
     chosen = matcher_named(matcher, seed=config.seed)
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
+    if getattr(chosen, "most_frames", None):
+        data = data.spread_out(chosen.most_frames)
     if chosen.stage1 == "rig":
-        config = config.changed(stage1="rig")
+        config = config.changed(stage1="rig", learnt_weights=False)  # weights need frames' poses
     if chosen.rounds < 1:
         raise ValueError(f"the matcher wants {chosen.rounds} rounds, expected at least 1")
     clock, rounds, out_of_time = Clock(), list[dict[str, Any]](), _after(time_limit_s)
@@ -189,7 +200,7 @@ def match_in_rounds(
             table = replace(table, metadata={**table.metadata, **start.metadata})
         with clock("solve"):
             found = _fit(data, guess, (estimate, table), config, terms)
-        rounds.append(_round(table, estimate, found.solved_rig))
+        rounds.append(round_of(table, estimate, found.solved_rig))
         estimate = found.solved_rig
         if out_of_time():
             break
@@ -202,10 +213,11 @@ def match_in_rounds(
         tuple(rounds),
         clock,
         missed_rounds=chosen.rounds - 1 - index,
-        out_of_time=out_of_time(),
     )
-    with clock("match_again"):
-        return matched_again(matched, progress)
+    if not out_of_time():
+        with clock("match_again"):
+            matched = matched_again(matched, progress, out_of_time)
+    return replace(matched, out_of_time=out_of_time())
 
 
 def _after(seconds: float | None) -> Callable[[], bool]:
@@ -278,20 +290,6 @@ def matcher_named(matcher: Matcher | Correspondences | Path | str, *, seed: int 
         f"unknown matcher {str(matcher)!r}; known are 'structure', 'cmrnext' and a table of "
         "correspondences (.parquet or .csv)"
     )
-
-
-def _round(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
-    """What one round found, and how far it moved each camera."""
-    counts = table.counts()
-    cameras = {}
-    for name, old in before.T_camera_lidar.items():
-        delta = after.T_camera_lidar[name] @ np.linalg.inv(old)
-        cameras[name] = {
-            "matches": counts.get(name, 0),
-            "moved_deg": angle_deg(delta[:3, :3]),
-            "moved_cm": 100.0 * float(np.linalg.norm(delta[:3, 3])),
-        }
-    return cameras
 
 
 def _fit(

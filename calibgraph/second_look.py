@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from calibgraph.check import Check, above
 from calibgraph.conventions import range_checks, reread
 from calibgraph.correspondences import Correspondences, concatenate
-from calibgraph.dataset import Dataset, spread_out
+from calibgraph.dataset import Dataset
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.perturbation import perturb
 from calibgraph.problem import Clock, Fit
-from calibgraph.rig import Rig
+from calibgraph.rig import Rig, angle_deg
 from calibgraph.trials import distance
 from calibgraph.two_pass import fit
 from calibgraph.verdict import (
@@ -91,7 +91,7 @@ class Matched:
     ends: Ends | None = None
 
 
-def matched_again(matched: Matched, progress: Progress) -> Matched:
+def matched_again(matched: Matched, progress: Progress, out_of_time: Callable[[], bool]) -> Matched:
     """Match again from a start displaced from the result, if the matcher names rounds for it.
 
     Where an objective is flat, as along the axis of a camera in a straight street, rounds may stand
@@ -99,37 +99,94 @@ def matched_again(matched: Matched, progress: Progress) -> Matched:
     taken from there; not if the ends are so far apart that the camera fails.
     """
     rounds = getattr(matched.matcher, "tracking_rounds", ())
-    if not rounds or matched.out_of_time or not matched.fit.problem.fits_matches:
+    if not rounds or not matched.fit.problem.fits_matches:
         return matched
-    rig, config, terms = matched.fit.solved_rig, matched.fit.config, matched.fit.problem.terms
+    first = matched.fit.solved_rig
+    try:
+        again = _again(matched, (*rounds, matched.matcher.rounds - 1), progress, out_of_time)
+        if again is None:
+            return matched
+        matched = replace(matched, ends=Ends(first, again.fit.solved_rig))
+        better = _better(matched, again)
+        return _with_cameras_of(matched, again, better) if better else matched
+    except CorrespondenceError as error:
+        return replace(matched, ends=Ends(first, None, str(error)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Again:
+    """The last round of matching again: its table, the solution from it, how far it moved."""
+
+    table: Correspondences
+    fit: Fit
+    moved: dict[str, Any]
+
+
+def _again(
+    matched: Matched, rounds: Sequence[int], progress: Progress, out_of_time: Callable[[], bool]
+) -> _Again | None:
+    """Go through the rounds from a displaced start; None if the time is over before their end."""
+    config, terms = matched.fit.config, matched.fit.problem.terms
+    rig = matched.fit.solved_rig
     estimate = perturb(rig, rotation_deg=BACK_DEG, translation_m=BACK_M, seed=config.seed)
-    for index in dict.fromkeys((*rounds, matched.matcher.rounds - 1)):
+    found = None
+    for index in dict.fromkeys(rounds):
+        if out_of_time():
+            return None
         table = matched.matcher.match(
             matched.dataset,
             estimate,
             round_index=index,
             progress=lambda what, done, total: progress("matching again", done, total),
         )
-        try:
-            estimate = fit(estimate, table, config, terms).solved_rig
-        except CorrespondenceError as error:
-            return replace(matched, ends=Ends(rig, None, str(error)))
-    matched = replace(matched, ends=Ends(rig, estimate))
-    passing = {
+        again = fit(estimate, table, config, terms)
+        found = _Again(table, again, round_of(table, estimate, again.solved_rig))
+        estimate = again.solved_rig
+    return found
+
+
+def _better(matched: Matched, again: _Again) -> set[str]:
+    """The cameras in whose images the second end stands out more, and is not far from the first."""
+    before, now = (t.metadata.get("contrast", {}) for t in (matched.table, again.table))
+    near = {
         name
-        for name, of in return_checks(matched.ends).items()
-        if all(check.status != "FAIL" for check in of)
+        for name, checks in return_checks(matched.ends).items()
+        if all(check.status != "FAIL" for check in checks)
     }
-    before, now = (t.metadata.get("contrast", {}) for t in (matched.table, table))
-    better = {n for n in passing if now.get(n, -np.inf) > BETTER * before.get(n, np.inf)}
-    if not better:
-        return matched
-    parts = [(table if n in better else matched.table).of_camera(n) for n in rig.cameras]
+    return {n for n in near if now.get(n, -np.inf) > BETTER * before.get(n, np.inf)}
+
+
+def _with_cameras_of(matched: Matched, again: _Again, better: set[str]) -> Matched:
+    """The result with some cameras' matches, starts and last rounds of the second end."""
+    parts = [
+        (again.table if name in better else matched.table).of_camera(name)
+        for name in matched.guess.cameras
+    ]
+    before, now = (t.metadata["contrast"] for t in (matched.table, again.table))
     contrast = {**before, **{name: now[name] for name in better}}
-    mixed = concatenate(parts)
-    mixed = replace(mixed, metadata={**matched.table.metadata, "contrast": contrast})
-    start = rig.moved_to({name: estimate.T_camera_lidar[name] for name in better})
-    return replace(matched, table=mixed, fit=fit(start, mixed, config, terms))
+    mixed = replace(concatenate(parts), metadata={**matched.table.metadata, "contrast": contrast})
+    start = matched.fit.rig.moved_to({n: again.fit.rig.T_camera_lidar[n] for n in better})
+    last = {**matched.rounds[-1], **{name: again.moved[name] for name in better}}
+    return replace(
+        matched,
+        table=mixed,
+        fit=fit(start, mixed, matched.fit.config, matched.fit.problem.terms),
+        rounds=(*matched.rounds[:-1], last),
+    )
+
+
+def round_of(table: Correspondences, before: Rig, after: Rig) -> dict[str, Any]:
+    """What one round found, and how far it moved each camera."""
+    counts = table.counts()
+    cameras = {}
+    for name, old in before.T_camera_lidar.items():
+        delta = after.T_camera_lidar[name] @ np.linalg.inv(old)
+        cameras[name] = {
+            "matches": counts.get(name, 0),
+            "moved_deg": angle_deg(delta[:3, :3]),
+            "moved_cm": 100.0 * float(np.linalg.norm(delta[:3, 3])),
+        }
+    return cameras
 
 
 def second_look(
@@ -159,12 +216,13 @@ def second_look(
 
 def _asked_again(matched: Matched, progress: Progress) -> tuple[Checks, Checks]:
     """What matching again says, and what the images say; in short, if there is no time for it."""
+    again = return_checks(matched.ends)
     if not matched.out_of_time:
-        return return_checks(matched.ends), image_checks_of(matched, progress)
+        return again, image_checks_of(matched, progress)
     missed = f"{matched.missed_rounds} rounds of matching and " if matched.missed_rounds else ""
     text = f"partial: there was no time for {missed}a second look at the images"
     check = Check("time limit", "WARN", text, matched.missed_rounds)
-    return {name: [check] for name in matched.fit.solved_rig.cameras}, {}
+    return {name: [*again.get(name, ()), check] for name in matched.fit.solved_rig.cameras}, {}
 
 
 def last_round_checks(rounds: Sequence[dict[str, Any]], camera: str) -> list[Check]:
@@ -225,7 +283,8 @@ def image_checks_of(matched: Matched, progress: Progress) -> Checks:
 
     rig = matched.fit.solved_rig
     try:
-        checks = image_checks(matched.dataset, rig, matched.table, progress=progress)
+        seed = matched.fit.config.seed
+        checks = image_checks(matched.dataset, rig, matched.table, seed=seed, progress=progress)
     except (CalibrationError, OSError) as error:  # what its matcher did not need to read
         text = f"the images could not be asked about the result: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
@@ -247,7 +306,7 @@ def better_reading(dataset: Dataset, guess: Rig) -> str | None:
     from calibgraph.structure import StructureMatcher
 
     matcher = StructureMatcher()
-    few = replace(dataset, frames=tuple(spread_out(dataset.frames, _READING_FRAMES)))
+    few = dataset.spread_out(_READING_FRAMES)
     try:
         least = max(CONTRAST_FAIL, _CLEARER * _contrast(few, matcher, guess))
         contrasts = {words: _contrast(few, matcher, rig) for words, rig in reread(guess).items()}

@@ -104,12 +104,12 @@ def image_motion(dataset: Dataset, name: str, camera: Camera, table: Corresponde
     Half the way from the image before to the image after, or to the one of them that there is.
     """
     motion = np.full((len(table), 2), np.nan)
-    by_index = {frame.index: frame for frame in dataset.frames}
-    used = [by_index[number] for number in np.unique(table.frame).tolist() if number in by_index]
-    moving = [frame for frame in used if _neighbours(frame, name, by_index)]
+    with_rows = set(np.unique(table.frame).tolist())
+    used = [frame for frame in dataset.frames if frame.index in with_rows]
+    moving = [frame for frame in used if _neighbours(dataset, frame)]
     images: dict[int, Gray] = {}
     for frame in spread_out(moving, MAX_FRAMES):
-        near = _neighbours(frame, name, by_index)
+        near = _neighbours(dataset, frame)
         wanted = {frame.index: frame, **{other.index: other for other, _ in near}}
         images = {
             index: images[index] if index in images else _gray(other, name, camera)
@@ -124,15 +124,10 @@ def image_motion(dataset: Dataset, name: str, camera: Camera, table: Corresponde
     return motion
 
 
-def _neighbours(frame: Frame, name: str, by_index: dict[int, Frame]) -> list[tuple[Frame, int]]:
+def _neighbours(dataset: Dataset, frame: Frame) -> list[tuple[Frame, int]]:
     """The frames before (-1) and after (1) of the same folder, where there are any."""
-    near = [(by_index.get(frame.index + sign), sign) for sign in (-1, 1)]
-    folder = frame.image_paths[name].parent
-    return [
-        (other, sign)
-        for other, sign in near
-        if other is not None and other.image_paths[name].parent == folder
-    ]
+    near = [(dataset.neighbour(frame, sign), sign) for sign in (-1, 1)]
+    return [(other, sign) for other, sign in near if other is not None]
 
 
 def _gray(frame: Frame, name: str, camera: Camera) -> Gray:

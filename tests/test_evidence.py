@@ -222,6 +222,16 @@ def test_image_motion_is_that_of_the_images(tmp_path: Path) -> None:
     )
     motion = image_motion(data, "front", camera, table)
     np.testing.assert_allclose(motion, np.tile([4.0, 0.0], (30, 1)), atol=0.1)
+    alone = image_motion(data.select("1"), "front", camera, table)  # neighbours were recorded
+    np.testing.assert_array_equal(alone, motion)
+
+
+def test_mispaired_clouds_are_seen_though_their_neighbours_were_not_selected(
+    dataset: Dataset, truth: Rig
+) -> None:
+    late = with_clouds_of(dataset, [1, 2, 3, 4, 5, 5]).select("0:5:2")
+    found = look_again(late, truth)["front_left"]
+    assert found.pair_offset == -1 and found.pair_margin < 0
 
 
 def test_augmented_fit_is_exact_without_noise() -> None:

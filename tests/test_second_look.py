@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +80,22 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
     assert matched.table.metadata["contrast"] == expected
     for checks in return_checks(matched.ends).values():  # two ends are worth a warning
         assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
+    began = calibgraph.evaluate(matched.fit.rig, truth).cameras
+    assert began["left"].translation_error_cm < 1e-6  # the guess, of the first rounds
+    assert began["front_left"].translation_error_cm > 1  # of the second, displaced from an end
+
+
+def test_no_round_of_matching_again_begins_when_time_is_over(truth: Rig) -> None:
+    matcher = Simulated([truth, truth])
+    match = matcher.match
+
+    def slow(*arguments, **named):  # noqa: ANN002, ANN003, ANN202
+        time.sleep(0.3)
+        return match(*arguments, **named)
+
+    matcher.match = slow  # type: ignore[method-assign]
+    matched = match_in_rounds(SAMPLE, truth, matcher, time_limit_s=0.2, progress=silent)
+    assert matched.out_of_time and matched.ends is None and len(matcher.seen) == 1
 
 
 def test_of_ends_too_far_apart_the_first_is_kept(truth: Rig) -> None:

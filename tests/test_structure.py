@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from calibgraph.files import sha256
 from calibgraph.pipeline import match_in_rounds
 from calibgraph.second_look import frames_checks
 from calibgraph.structure.consensus import find_consensus, summed_score
+from calibgraph.structure.decoded import Decoded
 from calibgraph.structure.level import LEVELS, Level
 from calibgraph.structure.peaks import local_peaks
 from calibgraph.structure.scores import Scores
@@ -188,6 +190,60 @@ def test_a_frame_given_twice_is_pointed_out() -> None:
     (check,) = frames_checks(data, hashes)
     assert check.status == "WARN" and "000000 and copy have the same cloud" in check.text
     assert frames_checks(replace(data, frames=data.frames[:2]), hashes) == []
+
+
+def repeated(data: Dataset, count: int) -> Dataset:
+    """So many frames, again and again the same: of the dataset, and recorded as one drive."""
+    given = data.frames
+    frames = tuple(replace(given[i % len(given)], index=i, name=str(i)) for i in range(count))
+    return replace(data, frames=frames)
+
+
+def test_more_frames_do_not_give_fewer_matches(truth: Rig) -> None:
+    """Frames share the windows that bound the time, and a group needs some in one frame."""
+    rig = Rig(cameras={"left": truth.cameras["left"]})
+    data = calibgraph.load_dataset(SAMPLE, rig)
+    matcher = StructureMatcher()
+    matches = [
+        len(matcher.match(repeated(data, count), rig, round_index=5, progress=lambda *_: None))
+        for count in (6, 60)
+    ]
+    assert matches[1] > matches[0]
+
+
+def test_a_long_drive_is_thinned_unless_it_is_asked_for(truth: Rig) -> None:
+    drive = repeated(calibgraph.load_dataset(SAMPLE, truth), 100)
+    seen = []
+
+    class Counting(StructureMatcher):
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            seen.append([frame.index for frame in dataset.frames])
+            return calibgraph.simulate_correspondences(rig, matches=100)
+
+    local_only = {"search_deg": None, "search_m": None, "levels": LEVELS[:1]}
+    for most in (None, 30):
+        settings = local_only if most else {**local_only, "most_frames": None}
+        match_in_rounds(drive, matcher=Counting(**settings), progress=lambda *_: None)  # type: ignore[arg-type]
+    assert seen[0] == list(range(100))
+    assert len(seen[-1]) == 30 and seen[-1][0] == 0 and seen[-1][-1] == 99
+    assert set(np.diff(seen[-1])) == {3, 4}
+
+
+def test_what_is_decoded_is_of_the_frames_at_hand_as_they_are_now(tmp_path: Path) -> None:
+    data = calibgraph.load_dataset(SAMPLE)
+    camera = data.rig.cameras["left"]
+    path = tmp_path / "image.png"
+    cv2.imwrite(str(path), np.full((camera.height_px, camera.width_px), 100, np.uint8))
+    frame = replace(data.frames[0], image_paths={"left": path})
+    decoded = Decoded()
+    assert decoded.image(frame, "left", camera).mean() == 100
+    cv2.imwrite(str(path), np.zeros((camera.height_px, camera.width_px), np.uint8))
+    assert decoded.image(frame, "left", camera).mean() == 0
+    cloud = decoded.cloud(frame)
+    decoded.keep_only([frame])
+    assert decoded.cloud(frame) is cloud
+    decoded.keep_only(data.frames[1:])
+    assert decoded.cloud(frame) is not cloud
 
 
 @pytest.mark.slow

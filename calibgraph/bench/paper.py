@@ -184,11 +184,13 @@ def one_draw(task: Task) -> Drawn:
     bench = Bench.of(sample, task.config, task.seed)
     matches = matches_by_camera(sample.rig, bench.table, task.config)
     numbers: dict[str, dict[str, Numbers | None]] = {name: {} for name in sample.references}
-    seconds, base = {}, dict[str, float]()
-    for row, poses, took in run_all(bench, trf=task.trf):
-        seconds[row] = took
-        medians = {} if poses is None else reprojection_px(matches, poses)
-        base = medians if row == STAGE1 else base
+    runs = list(run_all(bench, trf=task.trf))
+    medians_px = {
+        row: {} if poses is None else reprojection_px(matches, poses) for row, poses, _ in runs
+    }
+    base, seconds = medians_px[STAGE1], {row: took for row, _, took in runs}
+    for row, poses, _ in runs:
+        medians = medians_px[row]
         for name, reference in sample.references.items():
             found = None if poses is None else judged(sample.rig, poses, reference, medians, base)
             numbers[name][row] = found

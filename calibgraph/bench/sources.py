@@ -21,6 +21,7 @@ from calibgraph.preprocess import preprocess
 from calibgraph.rig import Rig
 from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
 from calibgraph.stage1 import Stage1, estimate_stage1
+from calibgraph.structure import StructureMatcher
 
 KITTI_PREFIX = "kitti:"
 REFERENCE_FILE = "reference.yaml"
@@ -205,7 +206,11 @@ class Recorded:
         data = load_dataset(self.folders, rig).select(",".join(map(str, np.sort(chosen))))
         try:
             found = match_in_rounds(
-                data, rig, config=Config(seed=draw), progress=lambda what, done, total: None
+                data,
+                rig,
+                StructureMatcher(seed=draw, most_frames=None),
+                Config(seed=draw),
+                progress=lambda what, done, total: None,
             )
         except CorrespondenceError:
             nothing = concatenate([_no_matches(name) for name in rig.cameras])

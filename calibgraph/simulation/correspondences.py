@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -104,7 +105,7 @@ def simulate_correspondences(
     rng = np.random.default_rng(seed)
     matchers = {
         name: _Matcher(camera, _errors_of(errors, name), [seed, number])
-        for number, (name, camera) in enumerate(rig.cameras.items())
+        for number, (name, camera) in enumerate(rig.cameras.items(), start=1)  # [s, 0] is as s
     }
     tables = [
         matcher.frame(rng, name, frame, count=matches, depth_m=depth_m)
@@ -149,6 +150,10 @@ def simulate_drive(
     errors = errors or MatcherErrors()
     rng = np.random.default_rng(seed)
     nonsense = replace(errors, outlier_share=1.0, informative_confidence=False)
+    matchers = {
+        name: _Matcher(camera, errors, [seed, number])
+        for number, (name, camera) in enumerate(rig_at(0).cameras.items(), start=1)
+    }
     for frame in range(frames):
         tables = []
         for name, camera in rig_at(frame).cameras.items():
@@ -157,7 +162,7 @@ def simulate_drive(
             failed, at_random = rng.random() < failed_share, rng.random() < _HALF
             seen = _elsewhere(rng, camera) if failed and not at_random else camera
             made = nonsense if failed and at_random else errors
-            matcher = _Matcher(seen, made, [seed, frame])
+            matcher = matchers[name].seeing(seen, made)
             tables.append(matcher.frame(rng, name, frame, count=matches, depth_m=depth_m))
         yield concatenate(tables)
 
@@ -184,6 +189,12 @@ class _Matcher:
         self.bias_pose = errors.bias_pose.draw(self.rng)
         self.stuck_pose = errors.stuck_pose.draw(self.rng)
         self.bias = errors.bias_px * _polynomial(self.rng)
+
+    def seeing(self, camera: Camera, errors: MatcherErrors) -> _Matcher:
+        """This matcher, its shared errors and its generator, with the camera as it is now."""
+        now = copy(self)
+        now.camera, now.errors = camera, errors
+        return now
 
     def frame(
         self,

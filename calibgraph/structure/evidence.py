@@ -109,7 +109,7 @@ class _View:
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames
-        self._all = {frame.index: frame for frame in dataset.frames}
+        self._dataset = dataset
         self._pool = pool
         self._clouds: dict[int, Cloud] = {}
 
@@ -133,8 +133,8 @@ class _View:
     def _score(
         self, gray: NDArray[np.uint8], frame: Frame, *, camera: Camera, level: Level, offset: int
     ) -> Scores | None:
-        other = self._all.get(frame.index + offset)
-        if other is None or other.cloud_path.parent != frame.cloud_path.parent:
+        other = self._dataset.neighbour(frame, offset) if offset else frame
+        if other is None:
             return None
         if other.index not in self._clouds:
             self._clouds[other.index] = Cloud.of(other.load_cloud())

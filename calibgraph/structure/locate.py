@@ -59,7 +59,9 @@ OUTSIDE = 0.2  # of a range's half-width: how far outside of it a proposal may b
 
 SEARCH_WINDOWS = 2100  # of the first search, per camera over all frames
 SEARCHES = 2  # per camera
-WIDER = 3  # times the windows and candidates of the search that follows one which found nothing
+WIDER = (
+    3  # times the candidates, and as far as memory allows windows, of a search after one in vain
+)
 SIDE_BY_SIDE = 4  # cameras; then those that were found propose for the others
 
 

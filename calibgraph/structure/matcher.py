@@ -7,23 +7,20 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.dataset import Dataset, Frame, spread_out
 from calibgraph.pipeline import Progress, Start
 from calibgraph.rig import Camera, Rig
 from calibgraph.structure.consensus import find_consensus
+from calibgraph.structure.decoded import Decoded
 from calibgraph.structure.level import LEVELS, Level
 from calibgraph.structure.locate import Range, View, locate
 from calibgraph.structure.peaks import correspondences_at_peaks
 from calibgraph.structure.scores import Scores, joined, score_frame
-from calibgraph.structure.windows import Cloud
 
 SYSTEMATIC_ROTATION_RAD = float(np.radians(0.09))
 SYSTEMATIC_TRANSLATION_M = 0.02
@@ -36,6 +33,10 @@ _AFTER_SEARCH, SURE = 3, 20.0
 LiDAR poses with less were 2 degrees off, and the first rounds brought them back."""
 
 FRAME_WINDOWS = 6_000  # bounds the time of a single frame
+SHARING_FRAMES = 20
+"""At most so many frames share a level's windows: with fewer windows in a frame than these leave,
+few of its groups have enough of them, and more frames would give fewer matches."""
+MOST_FRAMES = 30  # bounds time and memory, which are proportional from SHARING_FRAMES on
 LOCATE_FRAMES = 7
 SEARCH_DEG, SEARCH_M = 20.0, 1.5
 MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
@@ -44,13 +45,14 @@ MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
 class StructureMatcher:
     """Weight-free matching, by a search within a range of the guess and rounds from what it finds.
 
-    It remembers the decoded images and clouds of a dataset from round to round.
+    It remembers the decoded images and clouds of a dataset's frames from round to round.
 
     Args:
         seed: of the searches.
         search_deg: how far the guess may be off, per axis; None for no search: the rounds begin at
             the guess, which may be off by about 2.5 degrees and 25 cm.
         search_m: the same of the translation.
+        most_frames: how many frames of a dataset are heeded, evenly spread over it; None for all.
         levels: the rounds, coarse to fine.
 
     Raises:
@@ -65,14 +67,15 @@ class StructureMatcher:
         seed: int = 0,
         search_deg: float | None = SEARCH_DEG,
         search_m: float | None = SEARCH_M,
+        most_frames: int | None = MOST_FRAMES,
         levels: Sequence[Level] = LEVELS,
     ) -> None:
         self.seed = seed
         self.search = _range(search_deg, search_m)
+        self.most_frames = most_frames
         self.levels = levels
         self.rounds = len(levels)
-        self._clouds: dict[Path, Cloud] = {}
-        self._images: dict[Path, NDArray[np.uint8]] = {}
+        self._decoded = Decoded()
 
     @property
     def tracking_rounds(self) -> tuple[int, ...]:
@@ -90,13 +93,13 @@ class StructureMatcher:
         """Where the rounds begin: at the guess, or where a search finds the cameras."""
         if self.search is None:
             return Start(rig)
+        self._decoded.keep_only(dataset.frames)
         frames = spread_out(dataset.frames, LOCATE_FRAMES)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            clouds = list(pool.map(self._cloud, frames))
+            clouds = list(pool.map(self._decoded.cloud, frames))
+            image = self._decoded.image
             views = {
-                name: View(
-                    list(pool.map(partial(self._image, name=name, camera=camera), frames)), clouds
-                )
+                name: View(list(pool.map(partial(image, name=name, camera=camera), frames)), clouds)
                 for name, camera in rig.cameras.items()
             }
             found = locate(
@@ -128,7 +131,9 @@ class StructureMatcher:
     ) -> Correspondences:
         """Match every camera in every frame, from the rig's poses."""
         level = self.levels[round_index]
-        most = min(level.max_windows // len(dataset.frames), FRAME_WINDOWS)
+        sharing = min(len(dataset.frames), SHARING_FRAMES)
+        most = min(level.max_windows // sharing, FRAME_WINDOWS)
+        self._decoded.keep_only(dataset.frames)
         work = len(rig.cameras) * len(dataset.frames)
         tables, contrasts = [], {}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -154,22 +159,8 @@ class StructureMatcher:
         return replace(concatenate(tables), metadata=settings)
 
     def _score(self, name: str, camera: Camera, level: Level, most: int, frame: Frame) -> Scores:
-        gray = self._image(frame, name, camera)
-        return score_frame(gray, self._cloud(frame), camera, level, frame=frame.index, most=most)
-
-    def _cloud(self, frame: Frame) -> Cloud:
-        """The frame's cloud, decoded once."""
-        if frame.cloud_path not in self._clouds:
-            self._clouds[frame.cloud_path] = Cloud.of(frame.load_cloud())
-        return self._clouds[frame.cloud_path]
-
-    def _image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """The camera's gray image, decoded once."""
-        path = frame.image_paths[name]
-        if path not in self._images:
-            image = cv2.cvtColor(frame.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-            self._images[path] = np.asarray(image, dtype=np.uint8)
-        return self._images[path]
+        gray, cloud = self._decoded.image(frame, name, camera), self._decoded.cloud(frame)
+        return score_frame(gray, cloud, camera, level, frame=frame.index, most=most)
 
 
 def _range(search_deg: float | None, search_m: float | None) -> Range | None:
