@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 Report = Callable[[str, int, int], None]
 
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
-MAX_WINDOWS = 10_000  # per camera, over all frames
+MAX_WINDOWS, SHARING_FRAMES = 10_000, 10  # per camera, over so many frames; of more, as many each
 MIN_GROUPS = 30  # fewer say nothing
 
 WIDE, FINER = LEVELS[1], LEVELS[2]
@@ -138,7 +138,7 @@ class _View:
             return None
         if other.index not in self._clouds:
             self._clouds[other.index] = Cloud.of(other.load_cloud())
-        most = MAX_WINDOWS // len(self.frames)
+        most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
         cloud = self._clouds[other.index]
         return score_frame(gray, cloud, camera, level, frame=frame.index, most=most)
 
