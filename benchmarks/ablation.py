@@ -23,6 +23,7 @@ from scipy.stats import qmc
 
 from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
 from calibgraph.pipeline import match_in_rounds
+from calibgraph.progress import silent
 from calibgraph.structure import locate, matcher, scores, search, windows
 from calibgraph.structure.level import LEVELS
 from calibgraph.structure.responses import Responses
@@ -60,7 +61,7 @@ def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
     for seed in range(starts):
         guess = perturb(truth, rotation_deg=0.3, translation_m=0.06, seed=seed, uniform=True)
         rounds = StructureMatcher(search_deg=None, search_m=None, levels=matcher.LEVELS[3:])
-        matched = match_in_rounds(frames, guess, rounds, progress=_silent)
+        matched = match_in_rounds(frames, guess, rounds, progress=silent)
         contrasts += matched.table.metadata["contrast"].values()
         found.append(evaluate(matched.fit.solved_rig, truth))
     cameras = [_error(camera) for one in found for camera in one.cameras.values()]
@@ -80,7 +81,7 @@ def _search(data: tuple[Dataset, Rig], starts: int) -> str:
     for seed in range(starts):
         guess = perturb(truth, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
         structure = StructureMatcher(seed=seed)
-        start = structure.locate(frames, guess, out_of_time=lambda: False, progress=_silent)
+        start = structure.locate(frames, guess, out_of_time=lambda: False, progress=silent)
         errors = evaluate(start.rig, truth).cameras
         for name in start.metadata["found"]:
             degrees, centimetres = _error(errors[name])
@@ -93,10 +94,6 @@ def _search(data: tuple[Dataset, Rig], starts: int) -> str:
 
 def _error(error: Any) -> tuple[float, float]:
     return error.rotation_error_deg, error.translation_error_cm
-
-
-def _silent(what: str, done: int, total: int) -> None:
-    pass
 
 
 def _without_column(column: int) -> Part:

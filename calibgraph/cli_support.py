@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calibgraph.pipeline import Progress
+    from calibgraph.progress import Progress
 
 
 @contextmanager

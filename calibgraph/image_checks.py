@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from calibgraph.check import Check, above, below, grade
 from calibgraph.correspondences import Correspondences
 from calibgraph.dataset import Dataset
+from calibgraph.progress import Progress
 from calibgraph.rig import Rig
 from calibgraph.structure.evidence import ImageEvidence, look_again
 from calibgraph.timing import TimeOffset, time_offsets
-
-Report = Callable[[str, int, int], None]
 
 FOCAL_WARN, FOCAL_FAIL = 0.008, 0.025
 """Relative error of the focal length. On sequence 00 and the sample: up to 0.5 % where it is right,
@@ -28,7 +27,7 @@ and the sample: up to 0.013 where it is right, 0.026 and 0.04 where it is wrong 
 
 MAX_LENS_SIGMA = 0.5  # of the threshold: above, the images do not tell
 
-CONTRAST_WARN, CONTRAST_FAIL = 4.0, 2.5
+DISPLACED_WARN, DISPLACED_FAIL = 4.0, 2.5
 """On sequences 00 and 01 and the sample: right results 4.9 and more, wrong ones from a start too
 far away up to 3.8, mostly below 2.5. Mispaired images reach 5.1: see FRAMES_BEST. A 16-beam LiDAR
 at one place had 2.9 at 0.4 deg."""
@@ -58,7 +57,7 @@ def image_checks(
     table: Correspondences,
     *,
     seed: int = 0,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, tuple[Check, ...]]:
     """Look at images and clouds once more from the poses of a result.
 
@@ -109,7 +108,7 @@ def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
         return (Check("image evidence", "WARN", text, found.groups),)
     checks = [
         below(
-            "contrast to displaced poses", found.contrast, CONTRAST_WARN, CONTRAST_FAIL,
+            "contrast to displaced poses", found.contrast, DISPLACED_WARN, DISPLACED_FAIL,
             "standard deviations",
             "poses a degree or 40 cm away explain the images nearly as well; check the guess, "
             "or record where there is more structure",

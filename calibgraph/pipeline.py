@@ -21,6 +21,7 @@ from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import sha256
 from calibgraph.problem import Clock, Fit
+from calibgraph.progress import Progress, silent
 from calibgraph.rig import Rig
 from calibgraph.second_look import (
     Matched,
@@ -32,8 +33,6 @@ from calibgraph.second_look import (
 from calibgraph.two_pass import fit, judged
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
-"""Told of progress: what is being done, how much of it is done, out of how much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +141,7 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    report = progress or (lambda what, done, total: None)
+    report = progress or silent
     matched = match_in_rounds(
         dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
     )
@@ -184,8 +183,8 @@ def match_in_rounds(
     chosen = matcher_named(matcher, seed=config.seed)
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
-    if getattr(chosen, "most_frames", None):
-        data = data.spread_out(chosen.most_frames)
+    most = getattr(chosen, "most_frames", None)
+    data = data if most is None else data.spread_out(most)
     if chosen.stage1 == "rig":
         config = config.changed(stage1="rig", learnt_weights=False)  # weights need frames' poses
     if chosen.rounds < 1:

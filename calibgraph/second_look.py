@@ -16,6 +16,7 @@ from calibgraph.dataset import Dataset
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.perturbation import perturb
 from calibgraph.problem import Clock, Fit
+from calibgraph.progress import Progress, silent
 from calibgraph.rig import Rig, angle_deg
 from calibgraph.trials import distance
 from calibgraph.two_pass import fit
@@ -28,7 +29,7 @@ from calibgraph.verdict import (
 )
 
 if TYPE_CHECKING:
-    from calibgraph.pipeline import Matcher, Progress
+    from calibgraph.pipeline import Matcher
 
 Array = NDArray[np.float64]
 Checks = Mapping[str, Sequence[Check]]
@@ -318,6 +319,6 @@ def better_reading(dataset: Dataset, guess: Rig) -> str | None:
 
 def _contrast(dataset: Dataset, matcher: Matcher, rig: Rig) -> float:
     """The mean contrast over the cameras; 0 where nothing can be matched."""
-    table = matcher.match(dataset, rig, round_index=0, progress=lambda *_: None)
+    table = matcher.match(dataset, rig, round_index=0, progress=silent)
     found: Mapping[str, float] = table.metadata.get("contrast", {})
     return float(np.mean([found.get(name, 0.0) for name in rig.cameras]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -16,6 +16,7 @@ from calibgraph.config import Config
 from calibgraph.matches import Matches, matches_by_camera
 from calibgraph.metrics import PoseError, evaluate
 from calibgraph.problem import Poses
+from calibgraph.progress import Progress, silent
 from calibgraph.rig import Rig
 
 Numbers = dict[str, dict[str, float]]
@@ -112,9 +113,6 @@ class Report:
     blocks: tuple[Block, ...]
 
 
-Told = Callable[[str, int, int], None]
-
-
 def bench_paper(
     source: Source,
     *,
@@ -124,7 +122,7 @@ def bench_paper(
     seed: int = 0,
     jobs: int = 1,
     trf: bool = True,
-    progress: Told = lambda what, done, total: None,
+    progress: Progress = silent,
 ) -> Report:
     """Run the paper's protocol: so many draws, each with a new guess, judged by its metrics.
 
@@ -163,7 +161,7 @@ def draw_seed(seed: int, frames: int, index: int) -> int:
     return int(np.random.SeedSequence([seed, frames, index]).generate_state(1)[0] >> 1)
 
 
-def _run(tasks: Sequence[Task], jobs: int, progress: Told) -> list[Drawn]:
+def _run(tasks: Sequence[Task], jobs: int, progress: Progress) -> list[Drawn]:
     """All draws, in the order of the tasks."""
     if jobs == 1:
         done = []

@@ -18,6 +18,7 @@ from calibgraph.load import load_rig
 from calibgraph.perturbation import perturb
 from calibgraph.pipeline import match_in_rounds
 from calibgraph.preprocess import preprocess
+from calibgraph.progress import silent
 from calibgraph.rig import Rig
 from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
 from calibgraph.stage1 import Stage1, estimate_stage1
@@ -210,7 +211,7 @@ class Recorded:
                 rig,
                 StructureMatcher(seed=draw, most_frames=None),
                 Config(seed=draw),
-                progress=lambda what, done, total: None,
+                progress=silent,
             )
         except CorrespondenceError:
             nothing = concatenate([_no_matches(name) for name in rig.cameras])

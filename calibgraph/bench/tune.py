@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,6 +17,7 @@ from calibgraph.config import Config, preset
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_yaml
 from calibgraph.metrics import evaluate
+from calibgraph.progress import Progress, silent
 from calibgraph.two_pass import fit
 
 UNIT_DEG, UNIT_CM = 1.0, 10.0
@@ -111,7 +112,7 @@ def tune(
     draws: int = 5,
     candidates: Candidates | None = None,
     seed: int = 0,
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    progress: Progress = silent,
 ) -> Tuned:
     """Search for settings at random on some draws, and judge the best on others.
 

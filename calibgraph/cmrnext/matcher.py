@@ -33,7 +33,7 @@ from calibgraph.rig import Camera, Rig, angle_deg
 from calibgraph.stage1 import frame_pose
 
 if TYPE_CHECKING:
-    from calibgraph.pipeline import Progress
+    from calibgraph.progress import Progress
 
 Array = NDArray[np.float64]
 

@@ -40,9 +40,9 @@ from calibgraph.cmrnext.validation import (
 from calibgraph.dataset import Dataset
 from calibgraph.errors import CalibrationError, DatasetError, FileError
 from calibgraph.files import require_place_for_file, write_atomically
+from calibgraph.progress import Progress
 
 Array = NDArray[np.float64]
-Report = Callable[[str, int, int], None]
 
 _DISCOUNT = 0.8  # of each iteration's loss against the next one's
 _WEIGHT_DECAY = 5e-6
@@ -66,7 +66,7 @@ def train(
     start: Path | str | None = None,
     resume: bool = False,
     report: Callable[[Validation], None] | None = None,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> list[Validation]:
     """Train a network and write its checkpoint.
 

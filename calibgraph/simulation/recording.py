@@ -13,7 +13,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
 from calibgraph.load import RIG_FILE
 from calibgraph.perturbation import perturb
-from calibgraph.pipeline import Progress
+from calibgraph.progress import Progress, silent
 from calibgraph.rig import Rig
 from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
@@ -86,7 +86,7 @@ def simulate_street(
     _require_range(frames, step_m)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
-    tell = progress or (lambda what, done, total: None)
+    tell = progress or silent
     tell("building the street", 0, frames)
     drive = street_drive(frames=frames, step_m=step_m, seed=seed)
     _take_scans(out / "lidar", lidar, drive, seed, tell)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from calibgraph.augmented import AugmentedFit, fit_augmented, moved_by
 from calibgraph.dataset import Dataset, Frame, spread_out
+from calibgraph.progress import Progress, silent
 from calibgraph.rig import Camera, Rig
 from calibgraph.structure.consensus import chance_spread, search, summed_score
 from calibgraph.structure.level import LEVELS, Level
@@ -32,7 +33,6 @@ from calibgraph.structure.scores import Scores, joined, score_frame
 from calibgraph.structure.windows import Cloud
 
 Array = NDArray[np.float64]
-Report = Callable[[str, int, int], None]
 
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MAX_WINDOWS, SHARING_FRAMES = 10_000, 10  # per camera, over so many frames; of more, as many each
@@ -83,7 +83,7 @@ class ImageEvidence:
 
 
 def look_again(
-    dataset: Dataset, rig: Rig, *, seed: int = 0, progress: Report | None = None
+    dataset: Dataset, rig: Rig, *, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, ImageEvidence]:
     """Look at the images of all cameras from a rig's poses.
 
@@ -93,7 +93,7 @@ def look_again(
         seed: of the search.
         progress: to be told how far it is.
     """
-    report = progress or (lambda what, done, total: None)
+    report = progress or silent
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:

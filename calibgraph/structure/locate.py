@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.augmented import moved_by
+from calibgraph.progress import Progress
 from calibgraph.rig import Camera, Rig, angle_deg
 from calibgraph.structure.consensus import find_consensus
 from calibgraph.structure.level import LEVELS
@@ -28,7 +29,6 @@ from calibgraph.structure.search import Box, search_box
 from calibgraph.structure.windows import Cloud
 
 Array = NDArray[np.float64]
-Report = Callable[[str, int, int], None]
 
 ACCEPTED = 16.0
 """Least contrast after the last of the levels. On recorded scenes within 20 deg and 1.5 m of the
@@ -109,7 +109,7 @@ def locate(
     seed: int,
     out_of_time: Callable[[], bool],
     pool: ThreadPoolExecutor,
-    progress: Report,
+    progress: Progress,
 ) -> dict[str, Found]:
     """Find all cameras of a rig.
 

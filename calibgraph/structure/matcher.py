@@ -13,7 +13,8 @@ import numpy as np
 
 from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.dataset import Dataset, Frame, spread_out
-from calibgraph.pipeline import Progress, Start
+from calibgraph.pipeline import Start
+from calibgraph.progress import Progress
 from calibgraph.rig import Camera, Rig
 from calibgraph.structure.consensus import find_consensus
 from calibgraph.structure.decoded import Decoded

@@ -13,6 +13,7 @@ from calibgraph.correspondences import Correspondences
 from calibgraph.dataset import Dataset
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.pipeline import Matcher, calibrate
+from calibgraph.progress import silent
 from calibgraph.rig import Rig
 from calibgraph.tracking.stream import Item, Refused, StreamFrame
 from calibgraph.two_pass import fit
@@ -63,9 +64,9 @@ def _matched(alone: Dataset, matcher: Matcher, config: Config, rig: Rig) -> Corr
     *coarse, last = tracking_rounds(matcher)
     settings = config.changed(stage1=matcher.stage1)
     for index in coarse:
-        table = matcher.match(alone, rig, round_index=index, progress=_silent)
+        table = matcher.match(alone, rig, round_index=index, progress=silent)
         rig = _refined(rig, table, settings)
-    return matcher.match(alone, rig, round_index=last, progress=_silent)
+    return matcher.match(alone, rig, round_index=last, progress=silent)
 
 
 def tracking_rounds(matcher: Matcher) -> tuple[int, ...]:
@@ -89,7 +90,3 @@ def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
 def _stream_frame(number: int, table: Correspondences) -> StreamFrame:
     stamp = None if table.stamp_ns is None or not len(table) else int(table.stamp_ns.max())
     return StreamFrame(number, stamp, table)
-
-
-def _silent(what: str, done: int, total: int) -> None:
-    return None
