@@ -330,6 +330,10 @@ class TestArguments:
         with pytest.raises(ValueError, match=words):
             StructureMatcher(**ranges)  # type: ignore[arg-type]
 
+    def test_some_frame_is_heeded(self) -> None:
+        with pytest.raises(ValueError, match="at least one frame"):
+            StructureMatcher(most_frames=0)
+
     def test_a_time_limit_is_positive(self) -> None:
         with pytest.raises(ValueError, match="the time limit must be positive, found 0"):
             calibgraph.calibrate(SAMPLE, time_limit_s=0)

@@ -57,7 +57,7 @@ class StructureMatcher:
         levels: the rounds, coarse to fine.
 
     Raises:
-        ValueError: if only one of the ranges is None, or one is out of bounds.
+        ValueError: if only one of the ranges is None, or one is out of bounds, or no frame is left.
     """
 
     stage1: Literal["pnp", "rig"] = "rig"
@@ -71,6 +71,8 @@ class StructureMatcher:
         most_frames: int | None = MOST_FRAMES,
         levels: Sequence[Level] = LEVELS,
     ) -> None:
+        if most_frames is not None and most_frames < 1:
+            raise ValueError(f"at least one frame must be heeded, found most_frames={most_frames}")
         self.seed = seed
         self.search = _range(search_deg, search_m)
         self.most_frames = most_frames
