@@ -245,7 +245,7 @@ def load_calibration(path: Path | str) -> Calibration:
             path, f"has format {content.get('format')!r}, expected {CALIBRATION_FORMAT}"
         )
     try:
-        return Calibration(
+        found = Calibration(
             rig=checked_model(Rig, content["rig"], path),
             initial_rig=checked_model(Rig, content["initial_rig"], path),
             covariance={k: _array(v) for k, v in content["covariance"].items()},
@@ -265,6 +265,32 @@ def load_calibration(path: Path | str) -> Calibration:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FileError(path, f"is not a complete result ({error!r}); write it again") from error
+    _require_consistent(path, content, found)
+    return found
+
+
+def _require_consistent(path: Path, content: Mapping[str, Any], found: Calibration) -> None:
+    """The verdict is that of its checks, and all parts are of the same cameras.
+
+    Raises:
+        FileError: if not: somebody has changed the file.
+    """
+    said = content.get("verdict", {})
+    said = said.get("status") if isinstance(said, dict) else said
+    if said != found.verdict.status:
+        raise FileError(
+            path, f"says {said}, its checks {found.verdict.status}: it was edited; write it again"
+        )
+    names = set(found.rig.cameras)
+    parts = {
+        "initial_rig": found.initial_rig.cameras,
+        "camera_verdicts": found.camera_verdicts,
+        "counts": found.counts,
+        "residuals": found.residuals,
+    }
+    for part, of in parts.items():
+        if not isinstance(of, Mapping) or not names.issuperset(of):
+            raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
 
 
 _PLAIN = ("counts", "timings_s", "terms", "prior_share", "inputs", "versions")

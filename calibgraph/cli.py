@@ -267,8 +267,11 @@ def report(
     """Write what is known of a result as one HTML page that opens without a network."""
     from calibgraph.calibration import load_calibration
     from calibgraph.dataset import load_dataset
+    from calibgraph.files import require_place_for_file
     from calibgraph.report import with_files_of, write_report
 
+    if out is not None:
+        require_place_for_file(out, ".html", ".htm")
     loaded = load_calibration(result)
     if dataset:
         loaded = with_files_of(loaded, load_dataset(dataset, loaded.rig))
@@ -314,11 +317,15 @@ def perturb(
     ] = False,
 ) -> None:
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
-    from calibgraph.load import load_rig
+    from calibgraph.files import require_place_for_file
+    from calibgraph.load import REFERENCE_FILE, load_rig, rig_file
     from calibgraph.perturbation import perturb
 
+    require_place_for_file(out, ".yaml", ".yml")
     given = load_rig(rig)
     with checked_arguments():
+        if out.exists() and (out.name == REFERENCE_FILE or out.samefile(rig_file(rig))):
+            raise ValueError(f"--out {out}: that is a truth, or what is read; choose another name")
         moved = perturb(
             given,
             rotation_deg=rotation_deg,
@@ -417,17 +424,22 @@ def main() -> None:
 
     sys.argv[1:] = list(_each_with_its_option(sys.argv[1:]))
     try:
-        sys.exit(app(standalone_mode=False) or 0)
+        code = app(standalone_mode=False) or 0
+        if code == _INTERRUPTED:  # by Ctrl-C, as typer puts it
+            raise KeyboardInterrupt
+        sys.exit(code)
     except (CalibrationError, OSError, _UsageError) as error:
         if "--debug" in sys.argv:
             raise
         if str(error) or not isinstance(error, _UsageError):  # else the help has been printed
             print(f"calibgraph: {_one_line(error)}", file=sys.stderr)
         sys.exit(2)
-    except typer.Abort:
-        sys.exit("calibgraph: interrupted")
+    except (typer.Abort, KeyboardInterrupt):
+        print("calibgraph: interrupted", file=sys.stderr)
+        sys.exit(_INTERRUPTED)
 
 
+_INTERRUPTED = 130
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 
 
@@ -499,6 +511,8 @@ def _matcher(
     if name == "structure":
         from calibgraph.structure import StructureMatcher
 
+        if len(searched) == len(_SEARCH) and len({n is None for n in searched.values()}) > 1:
+            raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
         none = dict.fromkeys(_SEARCH) if None in searched.values() else {}
         frames = {"most_frames": None} if chosen_frames else {}
         settings: dict[str, Any] = {**searched, **none, **frames}

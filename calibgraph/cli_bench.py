@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from calibgraph.cli_options import JsonOption, SeedOption
 from calibgraph.cli_support import checked_arguments, progress_bar, terminal
+from calibgraph.errors import CalibrationError
 
 if TYPE_CHECKING:
     from calibgraph.config import Config
@@ -92,6 +94,10 @@ def paper(
             trf=trf,
             progress=progress,
         )
+        if report.is_empty:
+            raise CalibrationError(
+                f"{data}: no way found poses in any draw; calibgraph calibrate says why"
+            )
         written = write_report(report, out)
     from calibgraph.tables import print_bench
 
@@ -171,7 +177,7 @@ def tune(
     from calibgraph.bench.tune import Candidates, tune
     from calibgraph.files import require_place_for_file
 
-    require_place_for_file(out)
+    require_place_for_file(out, ".yaml", ".yml")
     with checked_arguments(), progress_bar() as progress:
         candidates = Candidates(
             _values("--lambda", prior_weight),
@@ -189,6 +195,11 @@ def tune(
             candidates=candidates,
             seed=seed,
             progress=progress,
+        )
+    if not math.isfinite(tuned.best.tuning):
+        raise CalibrationError(
+            f"{data}: no candidate has poses in every draw; calibgraph calibrate says why, and "
+            "more --frames may help"
         )
     tuned.save(out)
     if as_json:

@@ -16,6 +16,7 @@ CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
 MAX_CLOUD_BYTES = 2 * 2**30
 
 _XYZ, _XYZI = 3, 4
+_MOST_COLUMNS = 64
 
 
 def load_cloud(path: Path | str) -> NDArray[np.float32]:
@@ -36,16 +37,22 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
     if path.stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     readers = {".npy": _read_npy, ".bin": _read_bin, ".pcd": _read_open3d, ".ply": _read_open3d}
-    if path.suffix not in readers:
+    if path.suffix.lower() not in readers:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
-    cloud = readers[path.suffix](path)
+    cloud = readers[path.suffix.lower()](path)
     returned = cloud[~np.isnan(cloud[:, :3]).all(axis=1)]
     if not len(returned):
         raise FileError(path, "holds no point")
-    finite = np.isfinite(returned[:, :3]).all(axis=1)
-    if not finite.all():
-        row = int(np.flatnonzero(~finite)[0])
-        raise FileError(path, f"point {row} is not finite: {returned[row, :3].tolist()}")
+    if not returned[:, :3].any():
+        raise FileError(path, f"all of its {len(returned)} points lie at the origin")
+    if not np.isfinite(returned[:, :3]).all():
+        bad = ~np.isfinite(cloud[:, :3]).all(axis=1) & ~np.isnan(cloud[:, :3]).all(axis=1)
+        row = int(np.flatnonzero(bad)[0])
+        raise FileError(
+            path,
+            f"point {row} is not finite: {cloud[row, :3].tolist()}; record again, or mark points "
+            "without a return by NaN in x, y and z",
+        )
     return returned
 
 
@@ -56,10 +63,14 @@ def _read_npy(path: Path) -> NDArray[np.float32]:
         raise FileError(
             path, f"cannot be read as a .npy array ({error}); is it complete?"
         ) from None
+    if not isinstance(array, np.ndarray):
+        raise FileError(path, "is an archive of arrays, expected one array; write it with np.save")
     if array.ndim != 2 or array.shape[1] < _XYZ or array.dtype.kind not in "fiu":  # noqa: PLR2004
         raise FileError(
             path, f"has shape {array.shape} of {array.dtype}, expected (n, 3) or (n, 4) numbers"
         )
+    if array.shape[1] > _MOST_COLUMNS:
+        raise FileError(path, f"has {array.shape[1]} columns, expected 3 or 4; is it transposed?")
     return _with_intensity(array[:, :3], array[:, 3] if array.shape[1] >= _XYZI else None)
 
 
@@ -92,8 +103,13 @@ def _read_open3d(path: Path) -> NDArray[np.float32]:
             f"Debian or Ubuntu also apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 ({error})"
         ) from error
     expected = _require_complete(path)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.t.io.read_point_cloud(path)
+    if not expected:
+        raise FileError(path, "holds no point")
+    try:
+        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+            cloud = open3d.t.io.read_point_cloud(path)
+    except (RuntimeError, KeyError) as error:
+        raise FileError(path, f"cannot be read by Open3D: {str(error).splitlines()[0]}") from error
     found = len(cloud.point.positions) if "positions" in cloud.point else 0
     if found != expected:
         raise FileError(path, f"{found} of {expected} points could be read; is it complete?")
@@ -109,13 +125,15 @@ def _require_complete(path: Path) -> int:
     """
     data = path.read_bytes()
     header, body = _split_header(path, data)
-    count, row_bytes, row_words = (_pcd_rows if path.suffix == ".pcd" else _ply_rows)(path, header)
+    rows_of = _pcd_rows if path.suffix.lower() == ".pcd" else _ply_rows
+    count, row_bytes, row_words = rows_of(path, header)
     if "compressed" in header:
         sizes = struct.unpack("<II", body[:8]) if len(body) >= 8 else (1, 0)  # noqa: PLR2004
         complete = len(body) >= 8 + sizes[0] and sizes[1] >= count * row_bytes
     elif "ascii" in header:
         rows = [line for line in body.splitlines() if line.strip()][:count]
         complete = len(rows) == count and all(len(row.split()) == row_words for row in rows)
+        _require_numbers(path, rows)
     else:
         complete = len(body) >= count * row_bytes
     if not complete:
@@ -123,8 +141,16 @@ def _require_complete(path: Path) -> int:
     return count
 
 
+def _require_numbers(path: Path, rows: list[bytes]) -> None:
+    """Open3D takes words for zeros, or leaves whatever is in memory in their place."""
+    try:
+        np.array(b" ".join(rows).split(), dtype=np.bytes_).astype(np.float64)
+    except ValueError as error:
+        raise FileError(path, f"holds no numbers where its points should be: {error}") from error
+
+
 def _split_header(path: Path, data: bytes) -> tuple[str, bytes]:
-    pattern = rb"^DATA[^\n]*\n" if path.suffix == ".pcd" else rb"^end_header\r?\n"
+    pattern = rb"^DATA[^\n]*\n" if path.suffix.lower() == ".pcd" else rb"^end_header\r?\n"
     end = re.search(pattern, data[:65536], re.MULTILINE)
     if end is None:
         raise FileError(path, f"has no complete {path.suffix} header; is it complete?")

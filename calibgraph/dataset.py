@@ -166,7 +166,12 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
             f"is {found[0]}x{found[1]} px, the rig says {expected[0]}x{expected[1]} px; correct "
             "width_px and height_px, and the intrinsics if the image was scaled",
         )
+    if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
+        raise FileError(path, "has 16 bits, of which only the lower 8 are used; write it with 8")
     return np.asarray(image, dtype=np.uint8)
+
+
+_AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 
 
 def _ends_properly(data: bytes, suffix: str) -> bool:

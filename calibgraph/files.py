@@ -19,6 +19,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 MAX_YAML_BYTES = 8 * 2**20
 MAX_YAML_VALUES = 1_000_000
+MAX_YAML_DEPTH = 200  # of brackets: the parser in C ends the process at some ten thousand
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -44,30 +45,37 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def require_place_for_file(path: Path) -> None:
+def require_place_for_file(path: Path, *suffixes: str) -> None:
     """Check, before hours of work, that a file can be written.
+
+    Args:
+        path: the file.
+        suffixes: one of which its name must end in, if there are any: so that no other kind of
+            file is overwritten by mistake.
 
     Raises:
         FileError: if a folder has its name, a file that of a folder above it, or the folder is not
-            to be written to.
+            to be written to; or if it ends in none of the suffixes.
     """
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise FileError(path, "is a folder, expected the name of a file to write")
     require_place_for_folder(path.parent)
-    there = next(part for part in (path.parent, *path.parent.parents) if part.exists())
-    if not os.access(there, os.W_OK):
-        raise FileError(there, "may not be written to; choose another folder")
 
 
 def require_place_for_folder(folder: Path) -> None:
     """Check, before hours of work, that a folder is there or can be made.
 
     Raises:
-        FileError: if a file has its name, or a parent's.
+        FileError: if a file has its name, or a parent's, or it is not to be written to.
     """
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():
             raise FileError(part, "is a file, expected a folder to write into; choose another")
+    there = next(part for part in (folder, *folder.parents) if part.exists())
+    if not os.access(there, os.W_OK):
+        raise FileError(there, "may not be written to; choose another folder")
 
 
 def sync_folder(folder: Path) -> None:
@@ -125,18 +133,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
     require_file(path)
     if path.stat().st_size > MAX_YAML_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
+    text = read_text(path)
+    if _bracket_depth(text) > MAX_YAML_DEPTH:
+        raise FileError(path, _TOO_DEEP)
     try:
-        content = yaml.load(path.read_text("utf-8"), Loader=_Loader)
+        content = yaml.load(text, Loader=_Loader)
         expanded = _expanded_size(content, {})
-    except UnicodeDecodeError as error:
-        raise FileError(path, f"is not a text file ({error.reason}); expected YAML") from error
     except (yaml.YAMLError, ValueError) as error:
-        text = str(error).replace('in "<unicode string>", ', "")
-        raise FileError(path, f"is not valid YAML: {text}") from error
+        why = str(error).replace('in "<unicode string>", ', "")
+        raise FileError(path, f"is not valid YAML: {why}") from error
     except RecursionError:
-        raise FileError(
-            path, "is nested too deeply; expected a mapping of keys to values"
-        ) from None
+        raise FileError(path, _TOO_DEEP) from None
     if not isinstance(content, dict):
         raise FileError(path, f"holds {_kind(content)}, expected a mapping of keys to values")
     if expanded > MAX_YAML_VALUES:
@@ -144,6 +151,29 @@ def read_yaml(path: Path) -> dict[str, Any]:
             path, f"its aliases stand for over {MAX_YAML_VALUES} values; write them out"
         )
     return content
+
+
+_TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
+
+
+def _bracket_depth(text: str) -> int:
+    """How deep brackets are nested, if those in quotes count too."""
+    data = np.frombuffer(text.encode(), np.uint8)
+    opened = np.isin(data, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
+    closed = np.isin(data, np.frombuffer(b"]}", np.uint8)).astype(np.int64)
+    return int(np.cumsum(opened - closed).max(initial=0))
+
+
+def read_text(path: Path) -> str:
+    """Read a text file.
+
+    Raises:
+        FileError: if it is missing, or no text.
+    """
+    try:
+        return require_file(path).read_text("utf-8")
+    except UnicodeDecodeError as error:
+        raise FileError(path, f"is not a text file ({error.reason})") from error
 
 
 def _expanded_size(value: Any, known: dict[int, int]) -> int:

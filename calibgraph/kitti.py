@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_file
-from calibgraph.rig import Camera, Intrinsics, Rig
+from calibgraph.files import checked_model, read_text, require_file
+from calibgraph.rig import Camera, Rig
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"
@@ -59,21 +59,24 @@ def _camera(
         if needed not in matrices:
             raise FileError(path, f"line {needed!r} is missing")
     P, K = matrices[key], matrices[key][:, :3]
+    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] > 0):
+        raise FileError(path, f"{key} is no projection matrix of a camera: {P.tolist()}")
     shift = np.eye(4)
     shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
     lidar_to_rectified = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
     width, height = _image_size(folder)
-    return Camera(
-        width_px=width,
-        height_px=height,
-        intrinsics_px=Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]),
-        T_camera_lidar=shift @ lidar_to_rectified,
-    )
+    content = {
+        "width_px": width,
+        "height_px": height,
+        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "T_camera_lidar": shift @ lidar_to_rectified,
+    }
+    return checked_model(Camera, content, f"{path}: {key} and Tr")
 
 
 def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
     matrices = {}
-    for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         name, _, values = line.partition(":")
         if not values.strip():
             continue

@@ -10,7 +10,7 @@ from calibgraph.files import checked_model, read_yaml
 from calibgraph.kitti import CALIBRATION_NAME, load_kitti_rig
 from calibgraph.rig import Rig
 
-RIG_FILE = "rig.yaml"
+RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 
 
 def load_rig(path: Path | str) -> Rig:

@@ -165,9 +165,16 @@ def _require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> No
             raise CorrespondenceError(
                 f"camera {name!r} has {count['capped']} usable correspondences, at least "
                 f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
-                f"(left after each filter: {left}): {_why_few(count)}",
+                f"(left after each filter: {left}): {_why_few(count)}{_of_others(tied)}",
                 camera=name,
             )
+
+
+def _of_others(tied: set[str]) -> str:
+    """What to do for the cameras that have enough."""
+    if not tied:
+        return ""
+    return f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file"
 
 
 def _why_few(count: Mapping[str, int]) -> str:

@@ -133,7 +133,7 @@ def test_rows_that_find_nothing_say_so() -> None:
 
 
 def test_a_recording_that_is_not_matched_fails_in_every_row(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, call: Call
 ) -> None:
     def give_up(*arguments: object, **options: object) -> None:
         raise CorrespondenceError("nothing", camera="left")
@@ -143,6 +143,11 @@ def test_a_recording_that_is_not_matched_fails_in_every_row(
     assert report.published_as == ""
     assert all(row.failed == 1 for row in report.blocks[0].rows.values())
     assert len(write_report(report, tmp_path)) == 3
+    for command in (("bench", "paper"), ("tune",)):
+        options = "--frames", 2, "--draws", 1, "--out", tmp_path / "new.yaml"
+        code, _, text = call(*command, SAMPLE, *options)
+        assert code == 2 and "calibgraph calibrate says why" in text
+        assert not (tmp_path / "new.yaml").exists()
 
 
 def test_the_papers_numbers_stand_beside_its_rows() -> None:
@@ -216,6 +221,8 @@ def test_both_readings_of_kittis_ground_truth(tmp_path: Path) -> None:
         (("bench", "paper", "kitti", "--preset", "x"), "unknown preset 'x'"),
         (("tune", "kitti", "--lambda", "a"), "--lambda a: give numbers"),
         (("tune", "kitti", "--tau", "-1"), "gate_px"),
+        (("tune", "kitti", "--frames", "10001"), "10001 frames: at most 10000"),
+        (("bench", "paper", "kitti", "--frames", "10001"), "10001 frames: at most 10000"),
     ],
 )
 def test_wrong_arguments_are_one_line(

@@ -209,11 +209,25 @@ def test_an_unwritable_folder_is_one_line(problem: Path, call: Call) -> None:
         ("perturb", SAMPLE, "--out", "never.yaml", "--translation-m", "inf"),
         ("perturb", SAMPLE, "--out", "never.yaml", "--rotation-deg", "nan"),
         ("perturb", SAMPLE, "--out", SAMPLE),
+        ("perturb", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+        ("perturb", SAMPLE, "--out", SAMPLE / "reference.yaml"),
+        ("perturb", SAMPLE, "--out", SAMPLE / "lidar" / "000000.npy"),
+        ("report", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+        ("calibrate", SAMPLE, "--search-deg", "none", "--search-m", 1.5),
         ("calibrate", SAMPLE, "--out", SAMPLE / "rig.yaml"),
     ],
 )
 def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -> None:
     one_line(*call(*arguments))
+
+
+def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None:
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("calibgraph.load.load_rig", interrupted)
+    code, out, err = call("perturb", SAMPLE, "--out", "never.yaml")
+    assert (code, out, err) == (130, "", "calibgraph: interrupted\n")
 
 
 def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:

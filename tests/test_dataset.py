@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -170,6 +171,10 @@ def test_bad_clouds_are_named(tmp_path: Path) -> None:
     (tmp_path / "odd.bin").write_bytes(b"12345")
     (tmp_path / "empty.bin").write_bytes(b"")
     (tmp_path / "cloud.las").write_bytes(b"LASF")
+    np.savez(tmp_path / "archive.npz", CLOUD)
+    (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
+    np.save(tmp_path / "transposed.npy", np.tile(CLOUD, (20, 1)).T)
+    np.save(tmp_path / "origin.npy", np.zeros((100, 4)))
     for path in sorted(set(tmp_path.iterdir()) - {good}):
         with pytest.raises(FileError, match=path.name) as caught:
             load_cloud(path)
@@ -205,3 +210,33 @@ def test_a_rig_from_outside_replaces_the_datasets(pair: Rig) -> None:
     one = load_rig(SAMPLE)
     one = one.model_copy(update={"cameras": {"left": one.cameras["left"]}})
     assert list(load_dataset(SAMPLE, one).frames[0].image_paths) == ["left"]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2 is no projection matrix"),
+        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2 is no projection matrix"),
+        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2 is no projection matrix"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and Tr: T_camera_lidar"),
+        ("Tr: 1 0 0", "expected 12 numbers"),
+        ("\xff\xfe", "is not a text file"),
+    ],
+)
+def test_a_wrong_kitti_calibration_is_one_line(tmp_path: Path, line: str, said: str) -> None:
+    folder = written_kitti(tmp_path / "00")
+    path = folder / "calib.txt"
+    key = line.partition(":")[0]
+    kept = [other for other in path.read_text().splitlines() if not other.startswith(key)]
+    path.write_bytes("\n".join([*kept, line]).encode("latin-1"))
+    with pytest.raises(FileError, match=re.escape(said)) as caught:
+        load_dataset(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_image_that_16_bits_make_black_is_named(tmp_path: Path) -> None:
+    camera = make_camera()
+    path = tmp_path / "dark.png"
+    cv2.imwrite(str(path), np.full((camera.height_px, camera.width_px), 200, np.uint16))
+    with pytest.raises(FileError, match="16 bits, of which only the lower 8"):
+        load_image(path, camera)

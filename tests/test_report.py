@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 import calibgraph
 from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
@@ -264,6 +265,18 @@ def test_the_command_writes_the_page_and_prints_the_verdict(
     assert (tmp_path / "other.html").read_text() == page
 
 
+def edited(result: Calibration, folder: Path) -> Path:
+    """A result whose file somebody changed: what the folder is called."""
+    path = result.save(folder)
+    content = yaml.safe_load(path.read_text())
+    if folder.name == "verdict":
+        content["verdict"]["status"] = "FAIL" if result.verdict.status == "PASS" else "PASS"
+    else:
+        content["counts"] = None
+    path.write_text(yaml.safe_dump(content))
+    return folder
+
+
 def test_what_cannot_be_reported_is_one_line(
     pair: Rig, of_sample: Calibration, call: Call, tmp_path: Path
 ) -> None:
@@ -275,6 +288,8 @@ def test_what_cannot_be_reported_is_one_line(
         "calibration.yaml: no such file": (SAMPLE,),
         "no such folder": (tmp_path / "sample", "--dataset", tmp_path / "nothing"),
         "is not in the rig": (strange,),
+        "it was edited": (edited(of_sample, tmp_path / "verdict"),),
+        "its counts are not of the cameras": (edited(of_sample, tmp_path / "counts"),),
     }
     for message, arguments in cases.items():
         code, out, err = call("report", *arguments)

@@ -100,6 +100,7 @@ def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
         ("a: " + "9" * 5000, "not valid YAML"),
         ("[" * 20_000, "not valid YAML|too deeply"),
         ("{a: " * 1000, "not valid YAML|too deeply"),
+        ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process
         ("&a [*a]", "."),
     ],
 )

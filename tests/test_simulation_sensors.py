@@ -309,6 +309,25 @@ def test_command_writes_a_dataset_and_none_over_it(call: Call, rig: Rig, tmp_pat
     assert "is there already" in errors
 
 
+def test_nothing_is_left_of_a_recording_that_fails(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*arguments: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("calibgraph.simulation.recording.render", fails)
+    with pytest.raises(MemoryError):
+        simulate_street(tmp_path / "out", rig, frames=1, beams=16)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_images_too_large_to_write_are_refused(rig: Rig, tmp_path: Path) -> None:
+    name, camera = next(iter(rig.cameras.items()))
+    values = {**camera.model_dump(), "width_px": 70_000}
+    with pytest.raises(ValueError, match="70000x"):
+        simulate_street(tmp_path / "out", Rig(cameras={name: Camera(**values)}), frames=1)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

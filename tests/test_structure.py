@@ -211,6 +211,34 @@ def test_more_frames_do_not_give_fewer_matches(truth: Rig) -> None:
     assert matches[1] > matches[0]
 
 
+def test_small_lenses_give_matches_too(tmp_path: Path, truth: Rig) -> None:
+    """Images of 320 pixels: the last rounds reach some pixels only, by their angles."""
+    camera = truth.cameras["left"]
+    k = camera.intrinsics_px
+    half = {"fx": k.fx / 2, "fy": k.fy / 2, "cx": (k.cx + 0.5) / 2 - 0.5}
+    smaller = {
+        "width_px": camera.width_px // 2,
+        "height_px": camera.height_px // 2,
+        "intrinsics_px": Intrinsics(**half, cy=(k.cy + 0.5) / 2 - 0.5),
+    }
+    small = Camera(**{**camera.model_dump(), **smaller})
+    rig = Rig(cameras={"left": small})
+    frames = []
+    for frame in calibgraph.load_dataset(SAMPLE).frames:
+        image = cv2.imread(str(frame.image_paths["left"]))
+        path = tmp_path / f"{frame.name}.png"
+        size = (small.width_px, small.height_px)
+        cv2.imwrite(str(path), cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        frames.append(replace(frame, image_paths={"left": path}))
+    data = Dataset(rig, tuple(frames), (tmp_path,))
+    guess = calibgraph.perturb(rig, rotation_deg=0.5, translation_m=0.05, seed=0)
+    found = match_in_rounds(data, guess, local(LEVELS[3:]), progress=lambda *_: None)
+    error = calibgraph.evaluate(found.fit.solved_rig, rig).cameras["left"]
+    pixel_deg = np.degrees(1 / small.intrinsics_px.fx)
+    assert error.rotation_error_deg < pixel_deg
+    assert error.translation_error_cm < 10
+
+
 def test_a_long_drive_is_thinned_unless_it_is_asked_for(truth: Rig) -> None:
     drive = repeated(calibgraph.load_dataset(SAMPLE, truth), 100)
     seen = []

@@ -112,6 +112,11 @@ class Report:
     seed: int
     blocks: tuple[Block, ...]
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no way found poses in any draw."""
+        return all(row.failed == b.draws for b in self.blocks for row in b.rows.values())
+
 
 def bench_paper(
     source: Source,

@@ -14,18 +14,17 @@ from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.dataset import Dataset, load_dataset
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.kitti import CALIBRATION_NAME, load_kitti_rig
-from calibgraph.load import load_rig
+from calibgraph.load import REFERENCE_FILE, load_rig
 from calibgraph.perturbation import perturb
 from calibgraph.pipeline import match_in_rounds
 from calibgraph.preprocess import preprocess
 from calibgraph.progress import silent
 from calibgraph.rig import Rig
-from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
+from calibgraph.simulation.scenarios import MAX_FRAMES, SCENARIOS, scenario_of
 from calibgraph.stage1 import Stage1, estimate_stage1
 from calibgraph.structure import StructureMatcher
 
 KITTI_PREFIX = "kitti:"
-REFERENCE_FILE = "reference.yaml"
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,13 @@ class Simulated:
         return self.name
 
     def frames_at(self, wanted: int) -> int:
-        """As many as are wanted."""
+        """As many as are wanted.
+
+        Raises:
+            ValueError: if these are more than fit into memory.
+        """
+        if wanted > MAX_FRAMES:
+            raise ValueError(f"{wanted} frames: at most {MAX_FRAMES} can be simulated")
         return wanted
 
     def draw(self, frames: int, seed: int) -> Sample:
@@ -144,7 +149,8 @@ class Simulated:
         scenario = scenario_of(self.name)
         drive, guess = _seeds(seed, self.stream)
         rig = self.displacement.guess(scenario.rig, guess)
-        return Sample(rig, scenario.draw(frames, drive), {"truth": scenario.rig})
+        table = scenario.draw(self.frames_at(frames), drive)
+        return Sample(rig, table, {"truth": scenario.rig})
 
     def halves(self, seed: int) -> tuple[Source, Source]:
         """Different drives."""

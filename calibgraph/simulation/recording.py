@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
-from calibgraph.load import RIG_FILE
+from calibgraph.files import (
+    require_place_for_folder,
+    sync_folder,
+    write_atomically,
+    write_bytes,
+)
+from calibgraph.load import REFERENCE_FILE, RIG_FILE
 from calibgraph.perturbation import perturb
 from calibgraph.progress import Progress, silent
 from calibgraph.rig import Rig
@@ -23,9 +29,9 @@ from calibgraph.simulation.world import World, build_world
 
 Array = NDArray[np.float64]
 
-REFERENCE_FILE = "reference.yaml"
 MAX_STREET_M = 2000
 """Longer ones take gigabytes of memory."""
+MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
@@ -84,16 +90,24 @@ def simulate_street(
     """
     out, lidar = Path(out), lidar_of(beams)
     _require_range(frames, step_m)
+    _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     tell = progress or silent
     tell("building the street", 0, frames)
     drive = street_drive(frames=frames, step_m=step_m, seed=seed)
-    _take_scans(out / "lidar", lidar, drive, seed, tell)
-    _take_pictures(out / "cameras", rig, drive, seed, tell)
-    rig.save(out / REFERENCE_FILE)
-    guess.save(out / RIG_FILE)  # last: only a whole recording is a dataset
-    return [out / RIG_FILE, out / REFERENCE_FILE, out / "lidar", out / "cameras"]
+    out.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
+        made = Path(folder)
+        _take_scans(made / "lidar", lidar, drive, seed, tell)
+        _take_pictures(made / "cameras", rig, drive, seed, tell)
+        rig.save(made / REFERENCE_FILE)
+        guess.save(made / RIG_FILE)
+        names = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # last what makes it a dataset
+        for name in names:
+            (made / name).rename(out / name)
+    sync_folder(out)
+    return [out / name for name in reversed(names)]
 
 
 def street_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
@@ -159,6 +173,16 @@ def _require_range(frames: int, step_m: float) -> None:
             f"{frames} frames, {step_m} m apart: expected at least 1 frame, and 0 to "
             f"{MAX_STREET_M} m in all"
         )
+
+
+def _require_sizes(rig: Rig) -> None:
+    for name, camera in rig.cameras.items():
+        width, height = camera.width_px, camera.height_px
+        if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
+            raise ValueError(
+                f"camera {name!r} has {width}x{height} px: up to {MAX_SIDE_PX} a side and "
+                f"{MAX_PIXELS} in all can be simulated"
+            )
 
 
 def _require_empty(out: Path) -> None:

@@ -21,6 +21,7 @@ Grids = NDArray[np.float32]
 GRAY_NOISE = 0.05  # logarithm of gray: below, a window counts as flat in the image
 OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly one
 MIN_GROUP_WINDOWS = 4
+LEAST_REACH = 6  # steps: with wide or small lenses a pixel is much of a level's reach
 MISFIT = 0.1  # share of its variance that an image cannot share with a cloud, at its best
 
 
@@ -70,6 +71,7 @@ def score_frame(
     pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
     places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
+    reach = max(reach, LEAST_REACH)
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     used, basis, first = windows.counts[kept], windows.basis[kept], np.array([-reach, -reach])
     score_windows(image, places, used, basis, group, first, level.strict, grids)
