@@ -37,9 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
-    parser.add_argument("--rounds", type=words, default=["00", "05+06+07+08"], help="data")
-    parser.add_argument("--search", type=words, default=["05"], help="data")
+    words: Callable[[str], list[str]] = lambda text: [n for n in text.split(",") if n]  # noqa: E731
+    parser.add_argument("--rounds", type=words, default=["00", "05+06+07+08"], help="data, or ''")
+    parser.add_argument("--search", type=words, default=["05"], help="data, or ''")
     parser.add_argument("--starts", type=int, default=4)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     arguments = parser.parse_args()
