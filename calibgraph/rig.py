@@ -85,7 +85,7 @@ def _checked_name(name: str) -> str:
 
 
 CameraName = Annotated[str, AfterValidator(_checked_name)]
-Sigma = Annotated[float, Field(ge=1e-9, allow_inf_nan=False)]
+Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # stiffer ones hold solves still
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import yaml
 
-from calibgraph import CalibrationError, FileError, Rig, RigError, load_rig, perturb
+from calibgraph import (
+    CalibrationError,
+    FileError,
+    RelativePose,
+    Rig,
+    RigError,
+    load_rig,
+    perturb,
+)
 from calibgraph.rig import angle_deg, rigid_transform
 from tests.conftest import stereo_relative_pose
 
@@ -155,6 +163,12 @@ def test_a_relative_pose_must_name_two_cameras(pair: Rig) -> None:
     for change, message in [({"b": "rear"}, "names camera 'rear'"), ({"b": "left"}, "itself")]:
         with pytest.raises(ValueError, match=message):
             Rig(cameras=pair.cameras, relative_poses=(relative.model_copy(update=change),))
+
+
+def test_a_relative_pose_is_not_known_to_less_than_10_micrometres(pair: Rig) -> None:
+    known = stereo_relative_pose(pair).model_dump()
+    with pytest.raises(ValueError, match="translation_sigma_m"):
+        RelativePose(**{**known, "translation_sigma_m": 1e-6})
 
 
 def test_a_pose_for_an_unknown_camera_is_refused(pair: Rig) -> None:
