@@ -9,11 +9,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibgraph.cli_bench import bench, tune
+from calibgraph.cli_choices import dataset_of, matcher_of, settings_of, terms_of
 from calibgraph.cli_learned import train, weights
 from calibgraph.cli_options import (
     BatchOption,
@@ -44,9 +45,7 @@ from calibgraph.cli_support import checked_arguments, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.calibration import Calibration
-    from calibgraph.config import Config
     from calibgraph.dataset import Dataset
-    from calibgraph.pipeline import Matcher
 
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
@@ -112,8 +111,8 @@ def calibrate(
 
     require_place_for_folder(out)
     with checked_arguments():
-        settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
-        chosen = _matcher(
+        settings, checked_terms = settings_of(config, preset, seed, bootstrap), terms_of(terms)
+        chosen = matcher_of(
             matcher,
             weights,
             seed=seed,
@@ -127,7 +126,7 @@ def calibrate(
             occlusion_filter=occlusion_filter,
             batch=batch,
         )
-    data = _dataset(dataset, rig, frames)
+    data = dataset_of(dataset, rig, frames)
     with progress_bar() as progress:
         result = calibrate(
             data,
@@ -175,7 +174,7 @@ def match(
     with checked_arguments():
         if out.suffix not in (".parquet", ".csv"):
             raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
-        chosen = _matcher(
+        chosen = matcher_of(
             matcher,
             weights,
             seed=seed,
@@ -189,7 +188,7 @@ def match(
             occlusion_filter=occlusion_filter,
             batch=batch,
         )
-    data = _dataset(dataset, rig, frames)
+    data = dataset_of(dataset, rig, frames)
     with progress_bar() as progress:
         matched = match_in_rounds(
             data, matcher=chosen, time_limit_s=time_limit_s, progress=progress
@@ -239,7 +238,7 @@ def solve(
 
     require_place_for_folder(out)
     with checked_arguments():
-        settings, checked_terms = _settings(config, preset, seed, bootstrap), _terms(terms)
+        settings, checked_terms = settings_of(config, preset, seed, bootstrap), terms_of(terms)
     result = solve(load_rig(rig), correspondences, settings, checked_terms)
     result = result.with_inputs({str(correspondences): sha256(correspondences)})
     written = [result.save(out), write_report(result, out / "report.html")]
@@ -391,8 +390,8 @@ def track(
 
     require_place_for_folder(out)
     with checked_arguments():
-        settings = _settings(config, preset, seed)
-        chosen = _matcher(matcher, weights, seed=seed, device=device) if matcher else None
+        settings = settings_of(config, preset, seed)
+        chosen = matcher_of(matcher, weights, seed=seed, device=device) if matcher else None
         if chosen is None and weights:
             raise ValueError("--weights is for --matcher cmrnext only")
         if chosen is None and len(source) > 1:
@@ -466,97 +465,6 @@ def _one_line(error: Exception) -> str:
     text = error.format_message() if hasattr(error, "format_message") else str(error)
     more = "; see calibgraph --help" if isinstance(error, _UsageError) else ""
     return " ".join(text.split()).removesuffix(".") + more
-
-
-def _dataset(folders: list[Path], rig: Path | None, frames: str | None) -> Dataset:
-    from calibgraph.dataset import load_dataset
-    from calibgraph.load import load_rig
-
-    data = load_dataset(folders, load_rig(rig) if rig else None)
-    with checked_arguments():
-        return data.select(frames) if frames is not None else data
-
-
-def _matcher(
-    name: str,
-    weights: list[Path] | None,
-    *,
-    seed: int,
-    chosen_frames: bool = False,
-    **options: Any,
-) -> Matcher:
-    """The matcher of that name or file.
-
-    Args:
-        name: of the matcher, or a file.
-        weights: of cmrnext.
-        seed: of everything random.
-        chosen_frames: the user chose the frames; then all of them count.
-        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
-
-    Raises:
-        ValueError: if they do not go together.
-    """
-    given = {key: value for key, value in options.items() if value is not None}
-    searched = {key: _range_option(key, given.pop(key)) for key in _SEARCH if key in given}
-    if searched and name != "structure":
-        raise ValueError(f"{_flag(next(iter(searched)))} is for --matcher structure only")
-    if name == "cmrnext" and weights:
-        from calibgraph.cmrnext import CmrNextMatcher
-
-        return CmrNextMatcher(weights, seed=seed, **given)
-    for option in ("weights", *(given.keys() - {"device"})):
-        if option != "weights" or weights:
-            raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
-    if name == "structure":
-        from calibgraph.structure import StructureMatcher
-
-        if len(searched) == len(_SEARCH) and len({n is None for n in searched.values()}) > 1:
-            raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
-        none = dict.fromkeys(_SEARCH) if None in searched.values() else {}
-        frames = {"most_frames": None} if chosen_frames else {}
-        settings: dict[str, Any] = {**searched, **none, **frames}
-        return StructureMatcher(seed=seed, **settings)
-    from calibgraph.pipeline import matcher_named
-
-    return matcher_named(name, seed=seed)
-
-
-_SEARCH = ("search_deg", "search_m")
-
-
-def _range_option(name: str, text: str) -> float | None:
-    """The number that was given, None for ``none``."""
-    if text == "none":
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{_flag(name)} {text}: give a number, or none") from None
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def _settings(
-    config: Path | None, preset_name: str | None, seed: int, bootstrap: int | None = None
-) -> Config:
-    from calibgraph.config import load_config, preset
-
-    if config is not None and preset_name is not None:
-        raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
-    settings = load_config(config) if config is not None else preset(preset_name or "auto")
-    given = {"seed": seed or None, "bootstrap": bootstrap}
-    return settings.changed(**{k: v for k, v in given.items() if v is not None})
-
-
-def _terms(name: str) -> Any:
-    from calibgraph.config import TERMS
-
-    if name not in TERMS:
-        raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")
-    return name
 
 
 def _say_frames(used: int, data: Dataset) -> None:

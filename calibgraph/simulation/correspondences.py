@@ -103,16 +103,23 @@ def simulate_correspondences(
         seed: of every draw.
     """
     rng = np.random.default_rng(seed)
-    matchers = {
-        name: _Matcher(camera, _errors_of(errors, name), [seed, number])
-        for number, (name, camera) in enumerate(rig.cameras.items(), start=1)  # [s, 0] is as s
-    }
+    matchers = _matchers(rig, errors, seed)
     tables = [
         matcher.frame(rng, name, frame, count=matches, depth_m=depth_m)
         for frame in range(frames)
         for name, matcher in matchers.items()
     ]
     return concatenate(tables)
+
+
+def _matchers(
+    rig: Rig, errors: MatcherErrors | Mapping[str, MatcherErrors] | None, seed: int
+) -> dict[str, _Matcher]:
+    """A matcher per camera. From 1 on: NumPy's generators of [seed, 0] and of seed are the same."""
+    return {
+        name: _Matcher(camera, _errors_of(errors, name), [seed, number])
+        for number, (name, camera) in enumerate(rig.cameras.items(), start=1)
+    }
 
 
 def _errors_of(
@@ -150,10 +157,7 @@ def simulate_drive(
     errors = errors or MatcherErrors()
     rng = np.random.default_rng(seed)
     nonsense = replace(errors, outlier_share=1.0, informative_confidence=False)
-    matchers = {
-        name: _Matcher(camera, errors, [seed, number])
-        for number, (name, camera) in enumerate(rig_at(0).cameras.items(), start=1)
-    }
+    matchers = _matchers(rig_at(0), errors, seed)
     for frame in range(frames):
         tables = []
         for name, camera in rig_at(frame).cameras.items():
