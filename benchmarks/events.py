@@ -19,6 +19,7 @@ import gtsam
 import numpy as np
 
 from calibgraph import Camera, IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, perturb
+from calibgraph.graph import twist_between
 from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.history import History
 
@@ -104,7 +105,7 @@ def drive(
         events += [event for event in update.events if event.kind not in ("started", "back")]
     errors = {"error_deg": 0.0, "error_cm": 0.0, "error_sigmas": 0.0}
     for name, T in rig_at(frames - 1).T_camera_lidar.items():
-        xi = gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(update.T_camera_lidar[name])))
+        xi = twist_between(T, update.T_camera_lidar[name])
         covariance = update.covariance[name]
         sigmas = np.abs(xi) / np.sqrt(np.diag(np.eye(6) if covariance is None else covariance))
         for key, value in (

@@ -1,8 +1,12 @@
-"""Cases that run in processes, a line of JSON each in a file: a stopped run goes on from there."""
+"""Cases that run in processes, a line of JSON each in a file: a stopped run goes on from there.
+
+A line says by which code it was made (``code``). Lines of other code are kept, and counted aloud.
+"""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import time
@@ -10,13 +14,16 @@ import traceback
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+import calibgraph
 from calibgraph import Calibration, CalibrationError, Rig, evaluate
+from calibgraph.graph import twist_between
 
 ROOT = Path(__file__).parents[1]
 REALDATA = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))
@@ -34,6 +41,13 @@ class Key:
 
 
 Record = dict[str, Any]
+
+
+@cache
+def code() -> str:
+    """A hash of the package's sources."""
+    sources = sorted(Path(calibgraph.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
 
 
 def read(path: Path) -> list[Record]:
@@ -68,9 +82,12 @@ def run(
         out: the file, to which a line is added as soon as its case is done.
         jobs: processes.
     """
-    done = {key_of(record) for record in read(out) if "crash" not in record}
+    kept = [record for record in read(out) if "crash" not in record]
+    done = {key_of(record) for record in kept}
     left = [case for case in cases if case not in done]
-    print(f"{len(left)} cases to run, {len(done)} in {out}", flush=True)
+    others = sum(record.get("code") != code() for record in kept)
+    of_others = f", {others} of them by other code" if others else ""
+    print(f"{len(left)} cases to run, {len(done)} in {out}{of_others}", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     _end_line(out)
     start, pool = time.perf_counter(), ProcessPoolExecutor(jobs)
@@ -104,7 +121,8 @@ def guarded(work: Callable[[Key], Record], case: Key) -> Record:
         found = {"refusal": f"{type(error).__name__}: {error}"}
     except Exception:  # noqa: BLE001 - a fault of the program, to be seen in the summary
         found = {"crash": traceback.format_exc()}
-    return {**asdict(case), "seconds": round(time.perf_counter() - start, 3), **found}
+    seconds = round(time.perf_counter() - start, 3)
+    return {**asdict(case), "code": code(), "seconds": seconds, **found}
 
 
 def judged(result: Calibration, truth: Rig) -> Record:
@@ -119,7 +137,7 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
         result.sigmas(name),
         result.covariance[name],
     )
-    xi = components(result.T_camera_lidar[name], truth.T_camera_lidar[name])
+    xi = twist_between(result.T_camera_lidar[name], truth.T_camera_lidar[name])
     squared = None if covariance is None else float(xi @ np.linalg.solve(covariance, xi)) / 6
     return {
         "status": verdict.status,
@@ -133,13 +151,6 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
         "normalised_squared": squared,
         "checks": [[c.name, c.status, _number(c.value)] for c in verdict.checks],
     }
-
-
-def components(T_estimate: np.ndarray, T_reference: np.ndarray) -> np.ndarray:
-    """(6,) xi of T_estimate = exp(xi) T_reference: rotation [rad], translation [m]."""
-    import gtsam
-
-    return gtsam.Pose3.Logmap(gtsam.Pose3(T_estimate @ np.linalg.inv(T_reference)))
 
 
 def _number(value: Any) -> float | None:

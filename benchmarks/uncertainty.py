@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from calibgraph import Camera, Config, Intrinsics, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.covariance import relative_covariance
-from calibgraph.graph import to_T_lidar_camera
+from calibgraph.graph import to_T_lidar_camera, twist_between
 from calibgraph.problem import Fit
 from calibgraph.two_pass import fit, judged
 
@@ -68,7 +68,7 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
     ours = judged(solved).joint_covariance
     assert ours is not None
     errors = np.concatenate(
-        [twist(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]
+        [twist_between(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]
     )
     for which, joint in (("by frames (ours)", ours), ("(J^T J)^-1", independent(solved))):
         for what, error, covariance in parts(solved, errors, joint):
@@ -95,11 +95,6 @@ def independent(solved: Fit) -> Array:
         sums = block.sums(to_T_lidar_camera(solved.poses[name]))
         joint[rows, rows] = np.linalg.inv(sums.hessian)
     return joint
-
-
-def twist(T: Array, reference: Array) -> Array:
-    """(6,) xi in T = exp(xi) reference."""
-    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(reference))))
 
 
 if __name__ == "__main__":

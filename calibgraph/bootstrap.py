@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.check import Check, above
 from calibgraph.errors import CorrespondenceError
+from calibgraph.graph import twist_between
 from calibgraph.matches import Matches
 from calibgraph.problem import Fit, Poses
 
@@ -31,7 +31,7 @@ def bootstrap_covariance(fit: Fit) -> dict[str, Array]:
     numbers = np.unique(np.concatenate([m.frame for m in fit.problem.matches.values()]))
     draws = [_solved(fit, rng, numbers) for _ in range(resamples)]
     return {
-        name: np.atleast_2d(np.cov([_twist(draw[name], T) for draw in draws], rowvar=False))
+        name: np.atleast_2d(np.cov([twist_between(draw[name], T) for draw in draws], rowvar=False))
         for name, T in fit.poses.items()
     }
 
@@ -82,8 +82,3 @@ def _of_frames(matches: Matches, drawn: NDArray[np.int64]) -> Matches:
     ends = np.searchsorted(matches.frame, drawn, side="right")
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
     return matches.select(np.sort(rows))
-
-
-def _twist(T: Array, reference: Array) -> Array:
-    """(6,) xi in T = exp(xi) reference."""
-    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(reference))))

@@ -47,6 +47,11 @@ class Frame:
         """(height, width, 3) image, BGR; see :func:`load_image`."""
         return load_image(self.image_paths[name], camera)
 
+    def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
+        """(height, width) the same image, gray."""
+        gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
+        return np.asarray(gray, dtype=np.uint8)
+
     def entry(self) -> dict[str, Any]:
         """Which files the frame's number stands for, as a result keeps it."""
         return {

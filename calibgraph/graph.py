@@ -57,6 +57,12 @@ def to_T_lidar_camera(T_camera_lidar: Array) -> gtsam.Pose3:
     return gtsam.Pose3(T_camera_lidar).inverse()
 
 
+def twist_between(T_camera_lidar: Array, reference: Array) -> Array:
+    """(6,) xi, rotation [rad] and translation [m], in T_camera_lidar = exp(xi) reference."""
+    step = gtsam.Pose3(T_camera_lidar @ np.linalg.inv(reference))
+    return np.asarray(gtsam.Pose3.Logmap(step))
+
+
 def projection_graph(
     cameras: Sequence[str], blocks: Mapping[str, ProjectionBlock]
 ) -> gtsam.NonlinearFactorGraph:

@@ -112,7 +112,7 @@ def image_motion(dataset: Dataset, name: str, camera: Camera, table: Corresponde
         near = _neighbours(dataset, frame)
         wanted = {frame.index: frame, **{other.index: other for other, _ in near}}
         images = {
-            index: images[index] if index in images else _gray(other, name, camera)
+            index: images[index] if index in images else other.load_gray(name, camera)
             for index, other in wanted.items()
         }
         rows = np.flatnonzero(table.frame == frame.index)
@@ -128,11 +128,6 @@ def _neighbours(dataset: Dataset, frame: Frame) -> list[tuple[Frame, int]]:
     """The frames before (-1) and after (1) of the same folder, where there are any."""
     near = [(dataset.neighbour(frame, sign), sign) for sign in (-1, 1)]
     return [(other, sign) for other, sign in near if other is not None]
-
-
-def _gray(frame: Frame, name: str, camera: Camera) -> Gray:
-    image = cv2.cvtColor(frame.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-    return np.asarray(image, dtype=np.uint8)
 
 
 def _tracked(image: Gray, other: Gray, pixels_px: Array) -> Array:

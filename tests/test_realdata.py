@@ -43,13 +43,11 @@ def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) ->
 
 @pytest.mark.parametrize("names", ["01", "08"])
 def test_poor_scenes_are_not_passed(realdata: Path, names: str) -> None:
-    """A motorway with 3 frames, and one place with 4: results that are off do not say PASS."""
-    start, reference = start_and_reference(sequences(realdata, names), seed=0)
+    """A motorway with 3 frames, and one place with 5: too little to be sure of, right or wrong."""
+    start, _ = start_and_reference(sequences(realdata, names), seed=0)
     matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)  # quick
     result = calibgraph.calibrate(sequences(realdata, names), start, matcher)
-    for name, error in calibgraph.evaluate(result.rig, reference).cameras.items():
-        if error.rotation_error_deg > 0.3 or error.translation_error_cm > 8:
-            assert result.camera_verdicts[name].status != "PASS"
+    assert "PASS" not in [verdict.status for verdict in result.camera_verdicts.values()]
 
 
 @pytest.mark.parametrize("name", ["surround6", "vlp16_distorted"])

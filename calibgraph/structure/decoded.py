@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,8 +39,7 @@ class Decoded:
         """(height, width) the camera's image, gray; its size is checked against the camera's."""
         key = (_version(frame.image_paths[name]), camera.width_px, camera.height_px)
         if key not in self._images:
-            image = cv2.cvtColor(frame.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-            self._images[key] = np.asarray(image, dtype=np.uint8)
+            self._images[key] = frame.load_gray(name, camera)
         return self._images[key]
 
 

@@ -115,7 +115,7 @@ class _View:
 
     def images(self, name: str, camera: Camera) -> list[NDArray[np.uint8]]:
         """Gray images of a camera, one per frame."""
-        return list(self._pool.map(lambda frame: _gray(frame, name, camera), self.frames))
+        return list(self._pool.map(lambda frame: frame.load_gray(name, camera), self.frames))
 
     def scores(
         self, images: Sequence[NDArray[np.uint8]], camera: Camera, level: Level, offset: int = 0
@@ -141,11 +141,6 @@ class _View:
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
         cloud = self._clouds[other.index]
         return score_frame(gray, cloud, camera, level, frame=frame.index, most=most)
-
-
-def _gray(frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
-    image = cv2.cvtColor(frame.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-    return np.asarray(image, dtype=np.uint8)
 
 
 def _camera_evidence(view: _View, name: str, camera: Camera, seed: int) -> ImageEvidence:
