@@ -225,18 +225,52 @@ class TestSample:
 
         monkeypatch.setattr(locate, "settle", settle)
         monkeypatch.setattr(locate, "overlap_pose", lambda *_, **__: direction)
-        with ThreadPoolExecutor(1) as pool:
-            found = locate.locate(
-                rig,
-                {name: locate.View([], []) for name in names},
-                locate.Range(0.3, 1.5),
-                seed=0,
-                out_of_time=never,
-                pool=pool,
-                progress=silent,
-            )[names[1]]
+        found = located(rig)[names[1]]
         assert found.contrast == 80.0
         np.testing.assert_allclose(found.camera.T_camera_lidar, goal, atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("near", "elsewhere", "taken"),
+        [
+            (12.3, 19.0, "elsewhere"),
+            (14.9, 17.2, "near"),
+            (11.5, 9.0, "near"),
+            (11.5, 12.0, "none"),
+            (8.4, 6.3, "near"),
+            (7.0, 5.0, "none"),
+        ],
+    )
+    def test_what_the_guess_settles_to_is_judged_after_a_search(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch, near: float, elsewhere: float, taken: str
+    ) -> None:
+        rig = Rig(cameras={"left": truth.cameras["left"]})
+        guess = rig.T_camera_lidar["left"]
+        other = moved(guess)
+        contrast = {place(guess): near, place(other): elsewhere}
+        searches = fake_search(monkeypatch, contrast, {"left": other})
+        found = located(rig)["left"]
+        assert searches[0] == "left"
+        assert found.accepted == (taken != "none")
+        if found.accepted:
+            T = guess if taken == "near" else other
+            np.testing.assert_allclose(found.camera.T_camera_lidar, T, atol=1e-9)
+
+    def test_another_camera_is_asked_before_a_poor_guess_is_taken(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The guess of one settles poorly, and its search finds less; the other is found."""
+        names = ("front_left", "front_right")
+        rig = Rig(cameras={name: truth.cameras[name] for name in names})
+        first, second = (rig.T_camera_lidar[name] for name in names)
+        found_first, nowhere = moved(first), moved(moved(second))
+        proposed = second @ np.linalg.inv(first) @ found_first
+        contrast = {place(second): 8.4, place(found_first): 19.0, place(proposed): 22.0}
+        fake_search(monkeypatch, contrast, {names[0]: found_first, names[1]: nowhere})
+        monkeypatch.setattr(locate, "overlap_pose", lambda *_, **__: None)
+        found = located(rig)
+        assert found[names[0]].contrast == 19.0
+        assert found[names[1]].accepted
+        np.testing.assert_allclose(found[names[1]].camera.T_camera_lidar, proposed, atol=1e-9)
 
     def test_what_is_not_found_fails(
         self, truth: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -302,6 +336,49 @@ class TestSample:
         matcher = StructureMatcher(search_deg=None, search_m=None, levels=LEVELS[:1])
         matched = match_in_rounds(data, matcher=matcher, time_limit_s=600, progress=silent)
         assert not matched.out_of_time and matched.missed_rounds == 0
+
+
+def moved(T_camera_lidar: np.ndarray) -> np.ndarray:
+    """A pose a metre off."""
+    T = T_camera_lidar.copy()
+    T[0, 3] += 1.0
+    return T
+
+
+def place(T_camera_lidar: np.ndarray) -> tuple[float, ...]:
+    """Its translation [mm], to look it up."""
+    return tuple((1000 * T_camera_lidar[:3, 3]).round().tolist())
+
+
+def fake_search(
+    monkeypatch: pytest.MonkeyPatch,
+    contrast: dict[tuple[float, ...], float],
+    found: dict[str, np.ndarray],
+) -> list[str]:
+    """Poses settle where they are, with contrasts as said (else 1); what searches try, as said."""
+    searches: list[str] = []
+
+    def settle(view: locate.View, camera: Camera) -> locate.Found:
+        value = contrast.get(place(camera.T_camera_lidar), 1.0)
+        return locate.Found(camera, value, value >= locate.ACCEPTED)
+
+    def search(seeker: locate._Seeker, counts: dict[str, int], name: str) -> locate.Found:
+        searches.append(name)
+        return seeker._first(name, [[found[name]]])
+
+    monkeypatch.setattr(locate, "settle", settle)
+    monkeypatch.setattr(locate._Seeker, "search", search)
+    return searches
+
+
+def located(rig: Rig) -> dict[str, locate.Found]:
+    """Search without images."""
+    views = {name: locate.View([], []) for name in rig.cameras}
+    within = locate.Range(0.3, 1.5)
+    with ThreadPoolExecutor(1) as pool:
+        return locate.locate(
+            rig, views, within, seed=0, out_of_time=never, pool=pool, progress=silent
+        )
 
 
 def with_noise(data: Dataset, folder: Path) -> Dataset:

@@ -35,10 +35,10 @@ ACCEPTED = 16.0
 guess, wrong poses had up to 15, right ones mostly from 17 on."""
 
 ACCEPTED_NEAR = ((12.0, 1 / 1.3), (11.0, 1.0), (8.0, 1.3))
-"""Contrasts of what the guess settles to, and by how often they must be as high as all that is found
-elsewhere: that it is the guess, of all places tried, which wrongly agrees best is unlikely. Only
-after a search: guesses 1.5 to 3 deg off have settled 30 to 50 cm off with 12.3, where the right
-poses had 19."""
+"""Contrasts of what the guess settles to, and by how often they must be as high as all that is
+found elsewhere: that it is the guess, of all places tried, which wrongly agrees best is unlikely.
+Only after a search: guesses 1.5 to 3 deg off have settled 30 to 50 cm off with 12.3, where the
+right poses had 19."""
 
 SAME_DEG, SAME_M = 0.5, 0.15
 
@@ -268,7 +268,7 @@ def _at_lengths(T_b_a: Array, T_a_lidar: Array, box: Box) -> Iterator[Array]:
 
 
 def _judged(near: Found, far: Found | None, *, searched: bool) -> Found:
-    """The accepted one; after a search, what is near the guess if nothing else is clearly better."""
+    """The accepted one; after a search, what is near the guess if all else is no better."""
     if far is None or near.accepted:
         return near
     best = max(near, far, key=lambda found: found.contrast)
