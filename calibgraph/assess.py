@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibgraph.bootstrap import bootstrap_check, bootstrap_covariance
 from calibgraph.calibration import Residuals
 from calibgraph.check import Check, Verdict, above
-from calibgraph.conventions import guess_checks, points_check
+from calibgraph.conventions import guess_checks, points_check, swap_check
 from calibgraph.covariance import cluster_robust_covariance, data_sigmas, relative_covariance
 from calibgraph.graph import relative_pose_graph
 from calibgraph.problem import Fit, Poses, Problem, Scales
@@ -235,9 +235,10 @@ def relative_pose_conflict(
 
 
 def _causes(fit: Fit, guess: Rig, camera: str) -> list[Check]:
-    """What names a cause comes first: a guess that was meant otherwise, points in millimetres."""
+    """What names a cause comes first: a guess meant otherwise, swapped cameras, points in mm."""
     matches = fit.problem.matches.get(camera)
     checks = guess_checks(guess.T_camera_lidar[camera], fit.poses[camera], fit.metadata)
+    checks += swap_check(camera, guess.T_camera_lidar, fit.poses)
     return checks if matches is None else [*checks, points_check(matches)]
 
 

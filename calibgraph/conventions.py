@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.check import Check, above
+from calibgraph.check import Check, above, below
 from calibgraph.matches import Matches
-from calibgraph.rig import Rig, angle_deg
+from calibgraph.rig import Rig, angle_deg, distance
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,11 @@ RANGE_WARN_M, RANGE_FAIL_M = 200.0, 1000.0
 
 RANGE_USED_WARN, RANGE_USED_FAIL = 1.2, 4.0
 """How far from the guess a result may lie, in ranges of its matcher."""
+
+SWAPPED_WARN, SWAPPED_FAIL = 0.7, 0.5
+"""Way of two results to each other's guesses, over that to their own. Of 1000 guesses of KITTI's
+pair each, within 2 to 20 deg and 0.2 to 1.5 m, up to 0.3 % are under 0.7 and none under 0.5; with
+images swapped 100 and 89 % of those within 2 deg, 0.2 m."""
 
 _MEANT_DEG, _MEANT_M = 30.0, 2.5  # a reading this near to the result is what was meant
 _NEAR_DEG, _NEAR_M = 15.0, 1.0
@@ -75,6 +80,30 @@ def guess_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> li
         above(name, metres, far_m, np.inf, "m", advice),
         above("the guess's translation", shift_m, SHIFT_WARN_M, SHIFT_FAIL_M, "m", units),
     ]
+
+
+def swap_check(
+    camera: str, guesses: Mapping[str, Array], results: Mapping[str, Array]
+) -> list[Check]:
+    """Whether a camera and another ended where the other's guess is; nothing for one camera.
+
+    Args:
+        camera: its name.
+        guesses: (4, 4) T_camera_lidar, by camera.
+        results: what came out, by camera.
+    """
+    shares = {
+        other: (_way(guesses[other], results[camera]) + _way(guesses[camera], results[other]))
+        / (_way(guesses[camera], results[camera]) + _way(guesses[other], results[other]) + 1e-9)
+        for other in results
+        if other != camera
+    }
+    if not shares:
+        return []
+    other = min(shares, key=lambda name: shares[name])
+    name = f"way of it and {other} to each other's guess, over that to their own"
+    advice = "are their images swapped, or their poses in the rig?"
+    return [below(name, shares[other], SWAPPED_WARN, SWAPPED_FAIL, "times", advice)]
 
 
 def range_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> list[Check]:
@@ -138,3 +167,9 @@ def _differs(one: Rig, two: Rig) -> bool:
 def _apart(one: Array, two: Array) -> tuple[float, float]:
     """Between two T_camera_lidar: angle [deg], difference of the translations [m]."""
     return angle_deg(one[:3, :3] @ two[:3, :3].T), float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
+
+
+def _way(one: Array, two: Array) -> float:
+    """Between two T_camera_lidar: of the camera's centre [m], and the angle [rad], together."""
+    degrees, centimetres = distance(one, two)
+    return float(np.radians(degrees)) + centimetres / 100

@@ -214,3 +214,10 @@ def angle_deg(R: Array) -> float:
     """Angle of a (3, 3) rotation, degrees; accurate for small angles too."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return math.degrees(math.atan2(float(np.linalg.norm(axis)), float(np.trace(R)) - 1.0))
+
+
+def distance(one: Array, two: Array) -> tuple[float, float]:
+    """Between two T_camera_lidar: the angle [deg], and that of the camera's centres [cm]."""
+    centres = [-T[:3, :3].T @ T[:3, 3] for T in (one, two)]
+    metres = float(np.linalg.norm(centres[0] - centres[1]))
+    return angle_deg(one[:3, :3] @ two[:3, :3].T), 100 * metres

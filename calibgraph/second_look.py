@@ -17,8 +17,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.perturbation import perturb
 from calibgraph.problem import Clock, Fit
 from calibgraph.progress import Progress, silent
-from calibgraph.rig import Rig, angle_deg
-from calibgraph.trials import distance
+from calibgraph.rig import Rig, angle_deg, distance
 from calibgraph.two_pass import fit
 from calibgraph.verdict import (
     CONTRAST_FAIL,

@@ -15,8 +15,7 @@ from calibgraph.augmented import AugmentedFit, camera_flow, fit_augmented, imita
 from calibgraph.check import Check, above, grade
 from calibgraph.correspondences import Correspondences
 from calibgraph.matches import Matches, Scale
-from calibgraph.rig import Camera
-from calibgraph.trials import distance
+from calibgraph.rig import Camera, distance
 
 Array = NDArray[np.float64]
 

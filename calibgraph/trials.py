@@ -10,7 +10,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.matches import MIN_MATCHES, Matches
 from calibgraph.perturbation import perturb
 from calibgraph.problem import Fit, Poses, Problem
-from calibgraph.rig import angle_deg
+from calibgraph.rig import distance
 from calibgraph.stage1 import frame_pose
 
 Array = NDArray[np.float64]
@@ -125,10 +125,3 @@ def rival_check(fit: Fit, camera: str) -> Check:
 def _inside(errors_and_valid: tuple[Array, NDArray[np.bool_]], gate_px: float) -> NDArray[np.bool_]:
     errors, valid = errors_and_valid
     return np.asarray(valid & (errors <= gate_px))
-
-
-def distance(one: Array, two: Array) -> tuple[float, float]:
-    """Between two T_camera_lidar: the angle [deg], and that of the camera's centres [cm]."""
-    centres = [-T[:3, :3].T @ T[:3, 3] for T in (one, two)]
-    metres = float(np.linalg.norm(centres[0] - centres[1]))
-    return angle_deg(one[:3, :3] @ two[:3, :3].T), 100 * metres

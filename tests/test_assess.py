@@ -21,7 +21,13 @@ from calibgraph import (
     solve,
 )
 from calibgraph.check import above, below, rig_verdict
-from calibgraph.conventions import OPTICAL_FROM_BODY, guess_checks, nearest_reading, readings
+from calibgraph.conventions import (
+    OPTICAL_FROM_BODY,
+    guess_checks,
+    nearest_reading,
+    readings,
+    swap_check,
+)
 from calibgraph.covariance import relative_covariance, with_pseudo_frames
 from calibgraph.trials import rival_check
 from calibgraph.two_pass import fit
@@ -295,6 +301,17 @@ class TestGuess:
         for name, T in pair.T_camera_lidar.items():
             checks = guess_checks(guess.T_camera_lidar[name], T, {})
             assert all(check.status == "PASS" for check in checks)
+
+    def test_swapped_cameras_are_named(self, pair: Rig) -> None:
+        """Half a metre apart, from 2 deg and 20 cm; and the same the right way round."""
+        right = pair.T_camera_lidar
+        swapped = dict(zip(right, reversed(right.values()), strict=True))
+        guess = calibgraph.perturb(pair, rotation_deg=2, translation_m=0.2, seed=3).T_camera_lidar
+        for name in right:
+            assert [check.status for check in swap_check(name, guess, right)] == ["PASS"]
+            (check,) = swap_check(name, guess, swapped)
+            assert check.status != "PASS" and "are their images swapped" in check.text
+        assert swap_check("left", {"left": guess["left"]}, {"left": right["left"]}) == []
 
     def test_points_in_millimetres_fail(self, pair: Rig) -> None:
         table = simulated(pair, errors=MatcherErrors())
