@@ -16,10 +16,9 @@ from calibgraph.conventions import guess_checks, points_check, swap_check
 from calibgraph.covariance import cluster_robust_covariance, data_sigmas, relative_covariance
 from calibgraph.graph import relative_pose_graph
 from calibgraph.problem import Fit, Poses, Problem, Scales
-from calibgraph.rig import RelativePose, Rig
+from calibgraph.rig import RelativePose, Rig, distance
 from calibgraph.smell import smell_checks
 from calibgraph.trials import (
-    distance,
     even_frames,
     halves_of,
     held_out_check,
