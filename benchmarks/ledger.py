@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 import calibgraph
+import factors
 from calibgraph import Calibration, CalibrationError, Rig, evaluate
 from calibgraph.graph import twist_between
 
@@ -45,8 +46,9 @@ Record = dict[str, Any]
 
 @cache
 def code() -> str:
-    """A hash of the package's sources."""
-    sources = sorted(Path(calibgraph.__file__).parent.rglob("*.py"))
+    """A hash of the packages' sources."""
+    packages = [Path(package.__file__ or "").parent for package in (calibgraph, factors)]
+    sources = [path for package in packages for path in sorted(package.rglob("*.py"))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
 
 

@@ -311,6 +311,11 @@ class TestGuess:
             assert [check.status for check in swap_check(name, guess, right)] == ["PASS"]
             (check,) = swap_check(name, guess, swapped)
             assert check.status != "PASS" and "are their images swapped" in check.text
+        # Lenses of one housing, and results that are off by more than these are apart.
+        near = {"left": np.eye(4), "right": np.eye(4)}
+        near["right"][0, 3] = 0.02
+        for results in (near, dict(zip(near, reversed(near.values()), strict=True))):
+            assert [check.status for check in swap_check("left", near, results)] == ["PASS"]
         assert swap_check("left", {"left": guess["left"]}, {"left": right["left"]}) == []
 
     def test_points_in_millimetres_fail(self, pair: Rig) -> None:

@@ -129,8 +129,10 @@ def locate(
     asked: set[str] = set()  # the accepted cameras that the others were proposed from
     searches = dict.fromkeys(names, 0)
     while True:
-        for searched in (dict.fromkeys(names, 0), searches):  # what is sure, before what is not
-            best = {n: _judged(near[n], far.get(n), searched=searched[n] > 0) for n in names}
+        for late in (False, True):  # what needs no search, before what is taken after one
+            best = {
+                n: _judged(near[n], far.get(n), searched=late and searches[n] > 0) for n in names
+            }
             news = {n: f for n, f in best.items() if f.accepted and n not in asked}
             if news:
                 break
