@@ -123,16 +123,15 @@ def locate(
     names = list(rig.cameras)
     seeker = _Seeker(rig, views, within, seed, out_of_time)
     progress("trying the guess", 0, SEARCHES * len(names))
-    tried = pool.map(lambda name: settle(views[name], rig.cameras[name]), names)
-    near = dict(zip(names, tried, strict=True))
+    settled = pool.map(lambda name: settle(views[name], rig.cameras[name]), names)
+    near = dict(zip(names, settled, strict=True))
     far: dict[str, Found] = {}
     asked: set[str] = set()  # the accepted cameras that the others were proposed from
     searches = dict.fromkeys(names, 0)
     while True:
         for late in (False, True):  # what needs no search, before what is taken after one
-            best = {
-                n: _judged(near[n], far.get(n), searched=late and searches[n] > 0) for n in names
-            }
+            tried = {n: late and searches[n] > 0 for n in names}
+            best = {n: _judged(near[n], far.get(n), searched=tried[n]) for n in names}
             news = {n: f for n, f in best.items() if f.accepted and n not in asked}
             if news:
                 break
