@@ -107,7 +107,7 @@ def swap_check(
     other = min(shares, key=lambda name: shares[name])
     name = f"distance of it and {other} from each other's guess, over that from their own"
     advice = "are their images swapped, or their poses in the rig?"
-    return [below(name, shares[other], SWAPPED_WARN, SWAPPED_FAIL, "times", advice)]
+    return [below(name, shares[other], SWAPPED_WARN, SWAPPED_FAIL, "", advice)]
 
 
 def range_checks(guess: Array, result: Array, metadata: Mapping[str, Any]) -> list[Check]:
