@@ -22,11 +22,11 @@ from data_cases import Folders
 from scipy.stats import qmc
 
 from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
-from calibgraph.pipeline import match_in_rounds
-from calibgraph.progress import silent
-from calibgraph.structure import locate, matcher, scores, search, windows
-from calibgraph.structure.level import LEVELS
-from calibgraph.structure.responses import Responses
+from calibgraph.matching.structure import locate, matcher, scores, search, windows
+from calibgraph.matching.structure.correlation_maps import Responses
+from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.progress import no_progress
+from calibgraph.rounds import match_in_rounds
 
 REACHED_DEG, REACHED_CM = 1.5, 25.0
 Part = Callable[[], AbstractContextManager[Any]]
@@ -61,9 +61,9 @@ def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
     for seed in range(starts):
         guess = perturb(truth, rotation_deg=0.3, translation_m=0.06, seed=seed, uniform=True)
         rounds = StructureMatcher(search_deg=None, search_m=None, levels=matcher.LEVELS[3:])
-        matched = match_in_rounds(frames, guess, rounds, progress=silent)
-        contrasts += matched.table.metadata["contrast"].values()
-        found.append(evaluate(matched.fit.solved_rig, truth))
+        matched = match_in_rounds(frames, guess, rounds, progress=no_progress)
+        contrasts += matched.correspondences.metadata["contrast"].values()
+        found.append(evaluate(matched.solution.solved_rig, truth))
     cameras = [_error(camera) for one in found for camera in one.cameras.values()]
     pairs = [_error(pair) for one in found for pair in one.pairs.values()]
     seconds = (time.perf_counter() - begun) / starts
@@ -81,7 +81,7 @@ def _search(data: tuple[Dataset, Rig], starts: int) -> str:
     for seed in range(starts):
         guess = perturb(truth, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
         structure = StructureMatcher(seed=seed)
-        start = structure.locate(frames, guess, out_of_time=lambda: False, progress=silent)
+        start = structure.locate(frames, guess, out_of_time=lambda: False, progress=no_progress)
         errors = evaluate(start.rig, truth).cameras
         for name in start.metadata["found"]:
             degrees, centimetres = _error(errors[name])

@@ -23,10 +23,10 @@ ITERATIONS = 12
 def one_pass(way: str, height: int, width: int) -> tuple[float, float]:
     """Seconds, and peak memory of the process in GB."""
     import torch
-
-    from calibgraph.cmrnext import network
-    from calibgraph.cmrnext.variant import Variant
     from tests.cmrnext_reference import flow_and_sigma
+
+    from calibgraph.matching.cmrnext import network
+    from calibgraph.matching.cmrnext.architecture import Variant
 
     torch.manual_seed(0)
     model = network.CmrNext(Variant()).eval()

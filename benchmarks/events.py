@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from calibgraph import Camera, IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, perturb
-from calibgraph.graph import twist_between
+from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.history import History
 

@@ -20,11 +20,12 @@ import numpy as np
 from events import camera
 
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
-from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences, concatenate
-from calibgraph.graph import pose_key, prior_graph, values_of
-from calibgraph.matches import CAUCHY_SCALE_SIGMAS, matches_by_camera
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.simulation.correspondences import simulate_drive
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.factor_graph import pose_key, prior_graph, values_of
+from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from factors import block_factor
 
 RIG = Rig(
@@ -83,7 +84,7 @@ def plain_isam2(count: int) -> dict[int, float]:
     )
     seconds = []
     for table in frames(count):
-        matches = matches_by_camera(RIG, table, Config())
+        matches = camera_blocks(RIG, table, Config())
         start = time.perf_counter()
         graph = gtsam.NonlinearFactorGraph()
         for name, m in matches.items():

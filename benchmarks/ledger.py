@@ -24,7 +24,7 @@ import numpy as np
 import calibgraph
 import factors
 from calibgraph import Calibration, CalibrationError, Rig, evaluate
-from calibgraph.graph import twist_between
+from calibgraph.model.geometry import twist_between
 
 ROOT = Path(__file__).parents[1]
 REALDATA = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from calibgraph import MatcherErrors, Rig, load_correspondences, perturb, simulate_correspondences
-from calibgraph.graph import to_T_lidar_camera
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.pipeline import solve
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.two_pass import solve
 from factors import ProjectionBlock
 
 Array = NDArray[Any]

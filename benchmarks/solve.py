@@ -30,15 +30,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph import Camera, MatcherErrors, Rig, perturb, preset, simulate_correspondences
-from calibgraph.bench.baselines import minimize_trf, prior_rows
-from calibgraph.graph import joined, pose_graph, pose_key, values_of
-from calibgraph.matches import matches_by_camera
-from calibgraph.problem import Problem
+from calibgraph.evaluation.baselines import minimize_trf, prior_rows
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.factor_graph import joined, objective_graph, pose_key, values_of
+from calibgraph.solver.objective import Objective
 from factors import projection_factor
 
 Array = NDArray[np.float64]
-Poses = dict[str, Array]
+Transforms = dict[str, Array]
 
 CONFIG = preset("kitti").changed(stage1="rig")
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.15)
@@ -60,7 +60,7 @@ class World:
         self.hat = self.rig.T_camera_lidar
         self.rows = {name: self.table.of_camera(name) for name in self.cameras}
 
-    def gated(self, T: Poses) -> World:
+    def gated(self, T: Transforms) -> World:
         """The problem without what lies beyond the gate at some poses."""
         inside = World.__new__(World)
         inside.__dict__.update(self.__dict__)
@@ -77,7 +77,7 @@ class World:
         u, v = lens.fx * p[:, 0] / p[:, 2] + lens.cx, lens.fy * p[:, 1] / p[:, 2] + lens.cy
         return np.stack([u, v], 1) - rows.pixels_px
 
-    def cost(self, T: Poses) -> float:
+    def cost(self, T: Transforms) -> float:
         """The paper's objective, evaluated directly."""
         total = float(np.sum(self.prior_rows(T) ** 2))
         for name in self.rows:
@@ -85,7 +85,7 @@ class World:
             total += float(SCALE_PX**2 * np.log1p(s / SCALE_PX**2).sum())
         return total
 
-    def prior_rows(self, T: Poses) -> Array:
+    def prior_rows(self, T: Transforms) -> Array:
         """Both priors as residuals: their squares are the two terms."""
         return prior_rows(T, self.hat, CONFIG)
 
@@ -112,15 +112,15 @@ class Passes:
         second: after the second; None if the way was not asked for it.
     """
 
-    first: Poses
-    second: Poses | None = None
+    first: Transforms
+    second: Transforms | None = None
 
 
 def ours(world: World) -> Passes:
     """Both passes of calibgraph; the time includes building the graph."""
     problem = _problem(world)
     poses, scales = problem.settled(world.hat, CONFIG)
-    inliers = problem.gated(poses, scales)
+    inliers = problem.without_outliers(poses, scales)
     return Passes(poses, inliers.minimize(poses, scales).T_camera_lidar)
 
 
@@ -129,10 +129,10 @@ def ours_once(world: World) -> Passes:
     return Passes(_problem(world).settled(world.hat, CONFIG)[0])
 
 
-def _problem(world: World) -> Problem:
-    matches = matches_by_camera(world.rig, world.table, CONFIG)
-    known = pose_graph(world.rig, world.hat, CONFIG, "full")
-    return Problem(tuple(world.cameras), matches, known, "full")
+def _problem(world: World) -> Objective:
+    matches = camera_blocks(world.rig, world.table, CONFIG)
+    known = objective_graph(world.rig, world.hat, CONFIG, "full")
+    return Objective(tuple(world.cameras), matches, known, "full")
 
 
 def scipy_trf(world: World, inliers: World) -> Passes:
@@ -141,10 +141,10 @@ def scipy_trf(world: World, inliers: World) -> Passes:
     return Passes(first, one_trf(inliers, first))
 
 
-def one_trf(world: World, start: Poses) -> Poses:
+def one_trf(world: World, start: Transforms) -> Transforms:
     """One pass of TRF as the library's comparison with the paper runs it."""
 
-    def residuals(T: Poses) -> Array:
+    def residuals(T: Transforms) -> Array:
         return np.concatenate([world.residuals(name, T[name]) for name in world.cameras])
 
     return minimize_trf(residuals, world.prior_rows, start, scale_px=SCALE_PX)
@@ -180,7 +180,7 @@ def gtsam_python(world: World) -> Passes:
 
 
 def _start(world: World) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    known = pose_graph(world.rig, world.hat, CONFIG, "full")
+    known = objective_graph(world.rig, world.hat, CONFIG, "full")
     return joined(known), values_of(world.cameras, world.hat)
 
 
@@ -225,7 +225,7 @@ class Bench:
     def compare(self, frames: int, cameras: int) -> None:
         """Time every way on one problem and print a line each."""
         world = World(frames, cameras)
-        inliers = world.gated(ours(world).first)
+        inliers = world.without_outliers(ours(world).first)
         size = frames, cameras, len(world.table)
         print(f"\nN = {frames} frames, {cameras} cameras, {size[2]} correspondences")
         print(

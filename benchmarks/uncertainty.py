@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calibgraph import Camera, Config, Intrinsics, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.covariance import relative_covariance
-from calibgraph.graph import to_T_lidar_camera, twist_between
-from calibgraph.problem import Fit
-from calibgraph.two_pass import fit, judged
+from calibgraph.model.geometry import relative_covariance, to_T_lidar_camera, twist_between
+from calibgraph.pipeline import to_calibration
+from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
 
@@ -64,8 +64,8 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
     """One draw: of what, by which covariance, the normalised error squared."""
     rig = stereo()
     table = simulate_correspondences(rig, frames=frames, matches=matches, errors=ERRORS, seed=seed)
-    solved = fit(rig, table, Config())
-    ours = judged(solved).joint_covariance
+    solved = solve_joint(rig, table, Config())
+    ours = to_calibration(solved).joint_covariance
     assert ours is not None
     errors = np.concatenate(
         [twist_between(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]
@@ -75,7 +75,7 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
             yield what, which, float(error @ np.linalg.solve(covariance, error))
 
 
-def parts(solved: Fit, errors: Array, joint: Array) -> Iterator[tuple[str, Array, Array]]:
+def parts(solved: Solution, errors: Array, joint: Array) -> Iterator[tuple[str, Array, Array]]:
     """Each camera and the pair: its error and covariance."""
     for place, name in enumerate(solved.poses):
         rows = slice(6 * place, 6 * place + 6)
@@ -86,10 +86,10 @@ def parts(solved: Fit, errors: Array, joint: Array) -> Iterator[tuple[str, Array
     yield "left->right", of_pair, relative_covariance(joint, 0, 1, T_right_left)
 
 
-def independent(solved: Fit) -> Array:
+def independent(solved: Solution) -> Array:
     """(12, 12) inverse of the information of all inliers, as if they were independent."""
     joint = np.zeros((12, 12))
-    for place, (name, matches) in enumerate(solved.inliers.matches.items()):
+    for place, (name, matches) in enumerate(solved.inliers.blocks.items()):
         rows = slice(6 * place, 6 * place + 6)
         block = matches.scaled(solved.scales[name])
         sums = block.sums(to_T_lidar_camera(solved.poses[name]))

@@ -1,12 +1,34 @@
-"""How long work tells how far it is."""
+"""Progress callbacks, and the wall time of named stages."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
-"""Told of progress: what is being done, how much of it is done, out of how much."""
+"""Called with what is being done, how many steps of it are done, and out of how many."""
 
 
-def silent(what: str, done: int, total: int) -> None:
-    """Progress that nobody wants to know."""
+def no_progress(what: str, done: int, total: int) -> None:
+    """No-op progress callback."""
+
+
+class Stopwatch:
+    """Wall time of named stages: ``with watch("stage"): ...``.
+
+    Attributes:
+        seconds: by stage.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the time that the body takes to a stage's."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Intrinsics, RelativePose, Rig, cli
+from calibgraph import Camera, Intrinsics, RelativePose, Rig
+from calibgraph.cli import app as cli
 
 Call = Callable[..., tuple[int, str, str]]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph.structure.level import LEVELS
+from calibgraph.matching.structure.schedule import LEVELS
 from tests.conftest import ROOT, SAMPLE
 
 README = (ROOT / "README.md").read_text()
@@ -119,7 +119,7 @@ def test_the_names_that_types_see_are_the_names_that_run() -> None:
 def test_every_command_of_the_readme_exists() -> None:
     from typer.main import get_command
 
-    from calibgraph.cli import app
+    from calibgraph.cli.app import app
 
     named = set(re.findall(r"^    calibgraph (\w+)", README, flags=re.MULTILINE))
     assert named == set(get_command(app).commands)

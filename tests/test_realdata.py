@@ -11,10 +11,10 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.cmrnext.variant import Variant
-from calibgraph.pipeline import match_in_rounds
+from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
-from tests.test_cmrnext_checkpoint import good_content, saved
+from tests.matching.cmrnext.test_checkpoint import good_content, saved
 
 pytestmark = pytest.mark.realdata
 
@@ -36,7 +36,7 @@ def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) ->
     folders = sequences(realdata, names)
     start, reference = start_and_reference(folders, seed=0)
     matched = match_in_rounds(folders, start, progress=lambda *_: None)
-    for error in calibgraph.evaluate(matched.fit.solved_rig, reference).cameras.values():
+    for error in calibgraph.evaluate(matched.solution.solved_rig, reference).cameras.values():
         assert error.rotation_error_deg < 0.3
         assert error.translation_error_cm < 8
 

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.calibration import Calibration
-from calibgraph.clouds import load_cloud
-from calibgraph.dataset import load_image
 from calibgraph.errors import CalibrationError
-from calibgraph.overlay import DEPTH_RANGE_M, depth_colours, overlay
-from calibgraph.report.shown import BeforeAfter, Errors, shown_frame
-from calibgraph.rig import Camera
+from calibgraph.io.clouds import load_cloud
+from calibgraph.io.dataset import load_image
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.rig import Camera
+from calibgraph.report.frame_errors import BeforeAfter, Errors, shown_frame
+from calibgraph.report.overlay import DEPTH_RANGE_M, depth_colours, overlay
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

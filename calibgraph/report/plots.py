@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.report.shown import Errors
-from calibgraph.rig import Camera
+from calibgraph.model.rig import Camera
+from calibgraph.report.frame_errors import Errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.rig import Camera
+from calibgraph.model.rig import Camera
 from calibgraph.simulation.world import World, cast, colours
 
 Array = NDArray[np.float64]

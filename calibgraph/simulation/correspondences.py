@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.correspondences import Correspondences, concatenate
-from calibgraph.rig import Camera, Rig
-from calibgraph.stage1 import normalized
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.solver.pnp import normalized
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -302,7 +303,7 @@ def _on_street(rng: Rng, camera: Camera, count: int) -> Array:
     """(at most count, 3) points in the camera frame that a LiDAR sees of a street."""
     size = np.array([camera.width_px, camera.height_px])
     plane = normalized(camera, rng.random((count, 2)) * size - 0.5)
-    T_lidar_camera = np.linalg.inv(camera.T_camera_lidar)
+    T_lidar_camera = invert(camera.T_camera_lidar)
     rays = np.column_stack([plane, np.ones(count)]) @ T_lidar_camera[:3, :3].T
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     origin, wall = T_lidar_camera[:3, 3], np.sign(rays[:, 1]) * rng.uniform(*_WALLS_M)

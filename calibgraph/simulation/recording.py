@@ -17,10 +17,11 @@ from calibgraph.files import (
     write_atomically,
     write_bytes,
 )
-from calibgraph.load import REFERENCE_FILE, RIG_FILE
-from calibgraph.perturbation import perturb
-from calibgraph.progress import Progress, silent
-from calibgraph.rig import Rig
+from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
+from calibgraph.model.geometry import relative_transform
+from calibgraph.model.perturbation import perturb
+from calibgraph.model.rig import Rig
+from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, pose
@@ -93,7 +94,7 @@ def simulate_street(
     _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
-    tell = progress or silent
+    tell = progress or no_progress
     tell("building the street", 0, frames)
     drive = street_drive(frames=frames, step_m=step_m, seed=seed)
     out.mkdir(parents=True, exist_ok=True)
@@ -129,7 +130,7 @@ def _sun(rng: np.random.Generator) -> Array:
 def _stops(
     line: Centreline, frames: int, step_m: float, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Poses of the LiDAR, swaying in its lane."""
+    """Transforms of the LiDAR, swaying in its lane."""
     stops, s = [], 0.0
     for _ in range(frames):
         (x, y), heading_deg = line.at(s, LANE_Y_M + rng.normal(0, _SWAY_Y_M))
@@ -157,7 +158,7 @@ def _take_pictures(folder: Path, rig: Rig, drive: Drive, seed: int, tell: Progre
         for frame, T_world_lidar in enumerate(drive.T_world_lidar):
             tell(f"taking pictures, {name}", index * frames + frame, frames * len(rig.cameras))
             rng = np.random.default_rng([seed, _IMAGE, index, frame])
-            T_world_camera = T_world_lidar @ np.linalg.inv(camera.T_camera_lidar)
+            T_world_camera = relative_transform(T_world_lidar, camera.T_camera_lidar)
             image = render(drive.world, rays, T_world_camera, rng)
             _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
             write_bytes(folder / name / f"{frame:06d}.jpg", data.tobytes())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.rig import Camera, Intrinsics, Rig
+from calibgraph.model.rig import Camera, Intrinsics, Rig
 
 Array = NDArray[np.float64]
 

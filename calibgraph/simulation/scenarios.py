@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibgraph.correspondences import Correspondences
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder
-from calibgraph.perturbation import perturb
-from calibgraph.rig import Rig
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.perturbation import perturb
+from calibgraph.model.rig import Rig
 from calibgraph.simulation.correspondences import (
     MatcherErrors,
     PoseSpread,

@@ -1,7 +1,7 @@
 """Recalibration while the robot drives: frames in, estimates with error bars and events out."""
 
-from calibgraph.tracking.change import Event
 from calibgraph.tracking.durable import DurableCalibrator
+from calibgraph.tracking.events import Event
 from calibgraph.tracking.tracker import IncrementalCalibrator, Update
 
 __all__ = ["DurableCalibrator", "Event", "IncrementalCalibrator", "Update"]

@@ -12,15 +12,15 @@ from itertools import chain
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.calibration import Calibration
-from calibgraph.config import Config
-from calibgraph.dataset import load_dataset
 from calibgraph.errors import FileError
-from calibgraph.pipeline import Matcher
-from calibgraph.rig import Rig
+from calibgraph.io.dataset import load_dataset
+from calibgraph.matching.protocol import Matcher, completed
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.config import Config
+from calibgraph.model.rig import Rig
+from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
-from calibgraph.tracking.matched import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.run import Say, follow
 from calibgraph.tracking.stream import Item, frames_of
 
@@ -97,9 +97,10 @@ def _opened(
     if wanted.matcher is None:
         items = frames_of(str(source[0]), follow=wanted.follow, stop=stop)
         return items, _told(DurableCalibrator(folder, wanted.rig, wanted.config), tell)
+    matcher = completed(wanted.matcher)
     data = load_dataset(source, wanted.rig)
     data = replace(data, frames=data.frames[:: wanted.every])
-    config = wanted.config.changed(stage1=wanted.matcher.stage1)
+    config = wanted.config.changed(stage1=matcher.stage1)
     first: list[Calibration] = []
 
     def begin() -> Rig:
@@ -109,7 +110,6 @@ def _opened(
             tell(f"warning: the first frames give no start that can be trusted: {reasons}")
         return first[0].rig
 
-    matcher = wanted.matcher
     calibrator = _told(DurableCalibrator(folder, wanted.rig, config, begin=begin), tell)
     taken, count = calibrator.tracker.frame, config.tracking.start_frames
     head: Iterator[Item] = iter(())

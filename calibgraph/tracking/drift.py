@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.tracking.change import (
+from calibgraph.tracking.epoch_summary import Memory
+from calibgraph.tracking.events import (
     CLEARLY,
     Event,
     Size,
@@ -20,9 +21,8 @@ from calibgraph.tracking.change import (
     cause_of,
     unexplained,
 )
-from calibgraph.tracking.memory import Memory
+from calibgraph.tracking.posterior import inverse, is_determined, posterior
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal
-from calibgraph.tracking.sums import inverse, is_determined, posterior
 
 _QUIET = 1000  # frames in which a drift of the same camera is not told again
 _PATIENCE = 300  # frames until it is told in any case

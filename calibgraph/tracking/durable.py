@@ -8,10 +8,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.rig import Rig
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Rig
 from calibgraph.tracking.packing import UnreadableError, packed, unpacked
 from calibgraph.tracking.store import Store
 from calibgraph.tracking.tracker import IncrementalCalibrator, Update

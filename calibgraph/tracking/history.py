@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.files import write_atomically
-from calibgraph.tracking.change import Event, Kind
+from calibgraph.tracking.events import Event, Kind
 from calibgraph.tracking.tracker import Update
 
 if TYPE_CHECKING:

@@ -18,12 +18,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CalibrationError
-from calibgraph.matches import Matches, Scale
-from calibgraph.rig import Rig
-from calibgraph.tracking.memory import Memory
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.epoch_summary import Memory
 from calibgraph.tracking.repetition import Groups
 from calibgraph.tracking.spread import Spread
 from calibgraph.tracking.state import (
@@ -39,7 +40,7 @@ from factors import Lens, ProjectionBlock
 _KINDS: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, Suspect, Groups, Memory, Spread,
-                 Scale, Correspondences, Matches, ProjectionBlock)
+                 ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 _LENGTH = struct.Struct("<Q")

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph.json_output import finite
-from calibgraph.tracking.change import Event
+from calibgraph.report.as_json import finite
+from calibgraph.tracking.events import Event
 from calibgraph.tracking.tracker import Update
 
 

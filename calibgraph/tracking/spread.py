@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.config import Config
-from calibgraph.matches import Matches, Scale, scale_from, settled_spread
+from calibgraph.model.config import Config
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.residual_scale import ResidualScale, scale_from, settled_spread
 
 Array = NDArray[np.float64]
 
@@ -29,12 +30,12 @@ class Spread:
     counts: Array = field(default_factory=lambda: np.zeros((2, len(_EDGES) - 1)))
     least: float = 0.0
 
-    def plus(self, matches: Matches, T_camera_lidar: Array) -> Spread:
+    def plus(self, matches: CameraBlock, T_camera_lidar: Array) -> Spread:
         """With a frame's residuals counted."""
         new = [_counted(sizes) for sizes in matches.sizes(T_camera_lidar)]
         return Spread(_KEPT * self.counts + new, matches.least_spread)
 
-    def scale(self, config: Config) -> Scale:
+    def scale(self, config: Config) -> ResidualScale:
         """The scale of all the residuals, as ``Matches.scale`` would find it."""
         sigma_px, spread = (settled_spread(_Quantiles(counts)) for counts in self.counts)
         return scale_from(sigma_px, max(spread, self.least), config)

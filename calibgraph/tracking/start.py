@@ -7,16 +7,16 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from calibgraph.correspondences import Correspondences, concatenate
 from calibgraph.errors import CorrespondenceError
-from calibgraph.graph import to_T_lidar_camera
-from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
-from calibgraph.preprocess import preprocess
-from calibgraph.rig import Rig
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.rig import Rig
+from calibgraph.pipeline import solve
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
+from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.spread import Spread
 from calibgraph.tracking.state import HISTORY, CameraState, State, put
-from calibgraph.tracking.sums import quadratic
-from calibgraph.two_pass import solve
 
 _TRY_AGAIN = 1.5  # so many times more frames than at the last attempt
 
@@ -66,7 +66,7 @@ def _begun(state: State, camera: int, pose: gtsam.Pose3) -> State:
     usable = [part for part in parts if part is not None]
     spread = Spread()
     for part in usable:
-        spread = spread.plus(part, pose.inverse().matrix())
+        spread = spread.plus(part, to_T_camera_lidar(pose))
     scale = spread.scale(state.config)  # what `noted` counts inliers by
     known = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for part in usable:
@@ -76,20 +76,22 @@ def _begun(state: State, camera: int, pose: gtsam.Pose3) -> State:
     return absorbed_late(state, camera, usable, pose)
 
 
-def absorbed_late(state: State, camera: int, matches: list[Matches], pose: gtsam.Pose3) -> State:
+def absorbed_late(
+    state: State, camera: int, matches: list[CameraBlock], pose: gtsam.Pose3
+) -> State:
     """The state with a camera at a pose, and frames of it that had been set aside.
 
     Those of live frames take their places in them; older ones are left out.
     """
     scale = state.cameras[camera].scale
-    T = pose.inverse().matrix()
+    T = to_T_camera_lidar(pose)
     by_number = {int(part.frame[0]): part for part in matches}
     epochs, counts = [], {"absorbed": 0, "given": 0, "used": 0}
     for epoch in state.epochs:
         frames = []
         for frame in epoch.frames:
             raw = by_number.get(frame.number)
-            used = None if raw is None else raw.gated(T, scale)
+            used = None if raw is None else raw.without_outliers(T, scale)
             if raw is None or used is None or len(used.frame) < MIN_MATCHES:
                 frames.append(frame)
                 continue
@@ -106,17 +108,17 @@ def absorbed_late(state: State, camera: int, matches: list[Matches], pose: gtsam
     return state.with_camera(camera, state.cameras[camera].counted(**counts))
 
 
-def noted(known: CameraState, matches: Matches, pose: gtsam.Pose3) -> CameraState:
+def noted(known: CameraState, matches: CameraBlock, pose: gtsam.Pose3) -> CameraState:
     """The camera with a frame's residuals counted in what is usual."""
-    T = pose.inverse().matrix()
+    T = to_T_camera_lidar(pose)
     errors, valid = matches.errors_px(T)
     share = float(np.mean(valid & (errors <= known.scale.gate_px)))
     recent = np.vstack([known.recent, [share, float(np.median(errors))]])[-HISTORY:]
     return replace(known, recent=recent, spread=known.spread.plus(matches, T))
 
 
-def _matches(state: State, camera: int, table: Correspondences) -> Matches | None:
+def _matches(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
     """The preprocessed matches of one camera's frame, None if there are too few."""
     name = state.names[camera]
     kept = preprocess(state.rig, table, state.config)
-    return matches_by_camera(state.rig, kept.table, state.config).get(name)
+    return camera_blocks(state.rig, kept.table, state.config).get(name)

@@ -9,11 +9,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences
-from calibgraph.matches import Matches, Scale
-from calibgraph.rig import Rig
-from calibgraph.tracking.memory import Memory
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.epoch_summary import Memory
 from calibgraph.tracking.repetition import Groups, inflation, none_seen, widening
 from calibgraph.tracking.spread import Spread
 
@@ -37,8 +39,8 @@ class LiveFrame:
     """
 
     number: int
-    raw: dict[int, Matches]
-    used: dict[int, Matches]
+    raw: dict[int, CameraBlock]
+    used: dict[int, CameraBlock]
     hessian: Array
     gradient: Array
 
@@ -51,7 +53,7 @@ class LiveFrame:
         return LiveFrame(self.number, raw, used, hessian, gradient)
 
     def plus(
-        self, camera: int, raw: Matches, used: Matches, sums: tuple[Array, Array]
+        self, camera: int, raw: CameraBlock, used: CameraBlock, sums: tuple[Array, Array]
     ) -> LiveFrame:
         """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
@@ -90,7 +92,7 @@ class Suspect:
     """
 
     number: int
-    raw: Matches
+    raw: CameraBlock
     pose: gtsam.Pose3
 
 
@@ -120,7 +122,7 @@ class CameraState:
     waiting: tuple[Correspondences, ...] = ()
     refused: tuple[str, ...] = ()
     spread: Spread = field(default_factory=Spread)
-    scale: Scale = Scale(1.0, 1.0, 1.0, 1.0)
+    scale: ResidualScale = ResidualScale(1.0, 1.0, 1.0, 1.0)
     recent: Array = field(default_factory=lambda: np.empty((0, 2)))
     memory: Memory = field(default_factory=Memory.empty)
     suspects: tuple[Suspect, ...] = ()
@@ -203,7 +205,7 @@ class State:
     def initial(rig: Rig, config: Config) -> State:
         """Before the first frame."""
         n = len(rig.cameras)
-        poses = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
+        poses = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
         return State(
             rig=rig,
             config=config,

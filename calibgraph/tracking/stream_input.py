@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.correspondence_file import COORDINATES, INFORMATION
-from calibgraph.correspondences import Correspondences, as_confidence, concatenate
 from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.model.correspondences import Correspondences, as_confidence, concatenate
+from calibgraph.model.table_columns import COORDINATES, INFORMATION
 from calibgraph.tracking.stream_tables import (
     Item,
     StreamFrame,

@@ -9,16 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.correspondence_file import (
-    arrow_reads,
-    check_schema,
-    from_arrow,
-    read_arrow,
-    require_rows,
-)
-from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
+from calibgraph.io.correspondence_tables import arrow_reads, from_arrow, read_arrow, require_rows
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.table_columns import check_schema
 
 if TYPE_CHECKING:
     import pyarrow as pa

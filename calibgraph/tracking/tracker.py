@@ -9,25 +9,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.calibration import Calibration
-from calibgraph.check import Verdict
-from calibgraph.config import Config
-from calibgraph.correspondences import Correspondences
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_bytes
-from calibgraph.matches import MIN_MATCHES, Matches, matches_by_camera
-from calibgraph.preprocess import preprocess
-from calibgraph.rig import Rig
-from calibgraph.tracking.change import Event, squared_sigmas
-from calibgraph.tracking.health import calibration_of, covariance_of, health_of, known_hessian
-from calibgraph.tracking.memory import step_between
-from calibgraph.tracking.moves import found_shift, found_step, moved, shifted
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Verdict
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
+from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.assessment import calibration_of, covariance_of, health_of, known_hessian
+from calibgraph.tracking.epoch_summary import step_between
+from calibgraph.tracking.epochs import closed
+from calibgraph.tracking.events import Event, squared_sigmas
+from calibgraph.tracking.outlier_frames import agrees, suspect
 from calibgraph.tracking.packing import packed, unpacked
-from calibgraph.tracking.past import closed
+from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.start import noted, started
 from calibgraph.tracking.state import LiveFrame, State
-from calibgraph.tracking.sums import closed_posterior, quadratic, with_open_epoch
-from calibgraph.tracking.suspect import agrees, suspect
+from calibgraph.tracking.step_detection import found_shift, found_step, moved, shifted
 from calibgraph.tracking.window import Window
 
 Array = NDArray[np.float64]
@@ -91,7 +92,7 @@ class IncrementalCalibrator:
     def rig(self) -> Rig:
         """The rig with the present estimates."""
         poses = zip(self._state.names, self._state.poses, strict=True)
-        return self._state.rig.moved_to({name: pose.inverse().matrix() for name, pose in poses})
+        return self._state.rig.moved_to({name: to_T_camera_lidar(pose) for name, pose in poses})
 
     @property
     def initial_rig(self) -> Rig:
@@ -150,11 +151,13 @@ class IncrementalCalibrator:
             frame=number,
             stamp_ns=state.stamp_ns if stamp is None else stamp,
             updates=state.updates + 1,
-            systematic_sigmas=table.systematic_sigmas if len(table) else state.systematic_sigmas,
+            systematic_sigmas=table.findings.systematic_sigmas
+            if len(table)
+            else state.systematic_sigmas,
         )
         self._state = _with_open_frame(state, LiveFrame.empty(number, len(state.names)))
 
-    def _take(self, table: Correspondences, matches: dict[int, Matches]) -> Update:
+    def _take(self, table: Correspondences, matches: dict[int, CameraBlock]) -> Update:
         """Absorb what agrees, set aside what does not, and see what has happened."""
         used = self._absorb(self._sorted(matches))
         events = self._started(table, matches) + self._seen(used) + self._stepped()
@@ -249,15 +252,15 @@ class IncrementalCalibrator:
                 frame=number,
             )
 
-    def _by_camera(self, table: Correspondences) -> dict[int, Matches]:
+    def _by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
         """The preprocessed matches of each camera that has enough."""
         if not len(table):
             return {}
         kept = preprocess(self.rig, table, self._state.config)
-        matches = matches_by_camera(self._state.rig, kept.table, self._state.config)
+        matches = camera_blocks(self._state.rig, kept.table, self._state.config)
         return {self._state.names.index(name): found for name, found in matches.items()}
 
-    def _sorted(self, matches: dict[int, Matches]) -> dict[int, Matches]:
+    def _sorted(self, matches: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The matches that agree with the estimate; others are suspects, or have failed."""
         agreeing = {}
         for camera, found in matches.items():
@@ -271,7 +274,7 @@ class IncrementalCalibrator:
                 self._suspect(camera, found)
         return agreeing
 
-    def _suspect(self, camera: int, found: Matches) -> None:
+    def _suspect(self, camera: int, found: CameraBlock) -> None:
         state = self._state
         known = state.cameras[camera]
         number = state.frame or 0
@@ -290,14 +293,14 @@ class IncrementalCalibrator:
             camera, known.counted(left_out=1, failed=1 if own is None else 0)
         )
 
-    def _absorb(self, agreeing: dict[int, Matches]) -> dict[int, Matches]:
+    def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add, gate with the new estimate, put the gated in place, go on."""
         if not agreeing:
             return {}
         scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
         places = self._window.add({c: m.scaled(scales[c]) for c, m in agreeing.items()})
         gated = {
-            c: m.gated(self._window.pose(c).inverse().matrix(), scales[c])
+            c: m.without_outliers(to_T_camera_lidar(self._window.pose(c)), scales[c])
             for c, m in agreeing.items()
         }
         used = {c: m for c, m in gated.items() if len(m.frame) >= MIN_MATCHES}
@@ -319,7 +322,7 @@ class IncrementalCalibrator:
         last = replace(epochs[-1], poses=poses)
         self._state = replace(self._state, epochs=(*epochs[:-1], last))
 
-    def _note(self, camera: int, found: Matches, used: int) -> None:
+    def _note(self, camera: int, found: CameraBlock, used: int) -> None:
         """Remember how well a frame agreed."""
         state = self._state
         known = noted(state.cameras[camera], found, state.poses[camera])
@@ -329,7 +332,7 @@ class IncrementalCalibrator:
             camera, known.counted(absorbed=1, given=len(found.frame), used=used)
         )
 
-    def _started(self, table: Correspondences, matches: dict[int, Matches]) -> list[Event]:
+    def _started(self, table: Correspondences, matches: dict[int, CameraBlock]) -> list[Event]:
         """First estimates of cameras that have none."""
         events = []
         for camera in matches:
@@ -343,7 +346,7 @@ class IncrementalCalibrator:
                 events.append(Event("started", name, number, number, self._state.stamp_ns))
         return events
 
-    def _seen(self, used: dict[int, Matches]) -> list[Event]:
+    def _seen(self, used: dict[int, CameraBlock]) -> list[Event]:
         """Cameras that have gone blind, or see again."""
         events = []
         state, limit = self._state, self._state.config.tracking.blind_frames
@@ -385,7 +388,7 @@ class IncrementalCalibrator:
         self._resume(self._state)
         return events
 
-    def _report(self, events: tuple[Event, ...], used: dict[int, Matches]) -> Update:
+    def _report(self, events: tuple[Event, ...], used: dict[int, CameraBlock]) -> Update:
         state = self._state
         health = health_of(state, with_open_epoch(self._closed, state), self._known)
         names = state.names

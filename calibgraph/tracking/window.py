@@ -20,9 +20,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph import joined, pose_graph, pose_key
-from calibgraph.matches import Matches, merged
-from calibgraph.tracking.memory import STRENGTHS
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.camera_block import CameraBlock, merged
+from calibgraph.solver.factor_graph import joined, objective_graph, pose_key
+from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
 
@@ -94,9 +95,9 @@ class Window:
     def _key_of_last(self, camera: int) -> int:
         return self._key(self._epochs - 1, camera)
 
-    def _by_key(self, state: State, camera: int) -> dict[int, list[Matches]]:
+    def _by_key(self, state: State, camera: int) -> dict[int, list[CameraBlock]]:
         """A camera's matches of all frames, by the variable that they are on."""
-        by_key: dict[int, list[Matches]] = {}
+        by_key: dict[int, list[CameraBlock]] = {}
         for place, epoch in enumerate(state.epochs):
             seen = [frame.used[camera] for frame in epoch.frames if camera in frame.used]
             if seen:
@@ -144,7 +145,7 @@ def known_of_poses(state: State) -> gtsam.NonlinearFactorGraph:
     kept = tuple(pair for place, pair in pairs if place not in state.dropped_pairs)
     rig = state.rig.model_copy(update={"relative_poses": kept})
     T_hat = {
-        name: reference.inverse().matrix()
+        name: to_T_camera_lidar(reference)
         for name, reference in zip(state.names, state.references, strict=True)
     }
-    return pose_graph(rig, T_hat, state.config, "full")
+    return objective_graph(rig, {}, T_hat, state.config, "full")

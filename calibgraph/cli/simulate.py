@@ -1,0 +1,117 @@
+"""The command that makes data with a known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibgraph.cli.options import SeedOption
+from calibgraph.cli.support import checked_arguments, progress_bar, terminal
+
+if TYPE_CHECKING:
+    from calibgraph.model.rig import Rig
+
+STREET = "street"
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # of the street, unless the user says otherwise
+_STREET = "Scenario street"
+
+
+def simulate(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="street: a rig drives along a procedural street; a dataset of scans and images. "
+            "kitti, walkley, surround, fisheye: a table of correspondences, of a matcher that errs "
+            "as the paper's does (kitti, walkley) or in between.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|RIG",
+            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
+            f"file of your own; its poses are the truth. (default: {RIG})",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option(help="How many, at different places.")] = 10,
+    rotation_deg: Annotated[
+        float, typer.Option(min=0, help="Angle by which the guess, rig.yaml, is off.")
+    ] = 5.0,
+    translation_m: Annotated[
+        float, typer.Option(min=0, help="Length by which the guess is off.")
+    ] = 0.3,
+    seed: SeedOption = 0,
+    beams: Annotated[
+        int | None,
+        typer.Option(
+            metavar="16|64|128",
+            help=f"Of the LiDAR. (default: {BEAMS})",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
+    step_m: Annotated[
+        float | None,
+        typer.Option(
+            help=f"Between two frames, on average. (default: {STEP_M:g})",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
+) -> None:
+    """Make data with a known truth, reference.yaml, and a guess that is off, rig.yaml."""
+    from calibgraph.simulation.recording import simulate_street
+    from calibgraph.simulation.scenarios import simulate_table
+
+    with progress_bar() as progress, checked_arguments():
+        if scenario == STREET:
+            written = simulate_street(
+                out,
+                _rig(RIG if rig is None else rig),
+                beams=BEAMS if beams is None else beams,
+                frames=frames,
+                step_m=STEP_M if step_m is None else step_m,
+                seed=seed,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+                progress=progress,
+            )
+        else:
+            _refuse_options_of_street(
+                scenario, {"--rig": rig, "--beams": beams, "--step-m": step_m}
+            )
+            written = simulate_table(
+                out,
+                scenario,
+                frames=frames,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+                seed=seed,
+            )
+    for path in written:
+        terminal().print(f"{path}: written", soft_wrap=True, markup=False, highlight=False)
+
+
+def _refuse_options_of_street(scenario: str, given: Mapping[str, object]) -> None:
+    from calibgraph.simulation.scenarios import scenario_of
+
+    named = [option for option, value in given.items() if value is not None]
+    if named and scenario_of(scenario):
+        raise ValueError(
+            f"scenario {scenario!r} has a rig and a matcher of its own, {' and '.join(named)} "
+            f"would change nothing; leave it out, or simulate {STREET!r}"
+        )
+
+
+def _rig(name: str) -> Rig:
+    """A rig by its name, or from a file."""
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+
+    if name not in RIG_NAMES and Path(name).exists():
+        return load_rig(name)
+    return rig_of(name)

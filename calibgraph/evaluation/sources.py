@@ -1,0 +1,279 @@
+"""What a benchmark draws from: a simulated scenario, or recordings that are matched anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.rigs import REFERENCE_FILE, load_rig
+from calibgraph.matching.structure import StructureMatcher
+from calibgraph.model.config import Config, PresetName
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.perturbation import perturb
+from calibgraph.model.rig import Rig
+from calibgraph.progress import no_progress
+from calibgraph.rounds import match_in_rounds
+from calibgraph.simulation.scenarios import MAX_FRAMES, SCENARIOS, scenario_of
+from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.stage1 import Stage1, estimate_stage1
+
+KITTI_PREFIX = "kitti:"
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """How far every camera's guess is from the truth: the paper's T_delta."""
+
+    rotation_deg: float = 20.0
+    translation_m: float = 1.5
+
+    def guess(self, truth: Rig, seed: int) -> Rig:
+        """T_init = T_delta T_GT, exactly so far, in a random direction per camera."""
+        return perturb(
+            truth, rotation_deg=self.rotation_deg, translation_m=self.translation_m, seed=seed
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One draw: what the ways are given, and what they are judged by.
+
+    Attributes:
+        rig: lenses, and the guess; for what was matched, the estimate that its last round began
+            from.
+        table: correspondences.
+        references: rigs to be judged by, by their names; never given to a way.
+        simulated: whether the first reference is the truth of a simulation.
+        matched: whether the matcher has a pose estimate of its own, which then stands for Stage 1
+            in ours.
+    """
+
+    rig: Rig
+    table: Correspondences
+    references: Mapping[str, Rig]
+    simulated: bool = True
+    matched: bool = False
+    _stage1: dict[float, Stage1] = field(default_factory=dict)
+
+    def stage1(self, config: Config) -> Stage1:
+        """Stage 1 of what these settings let through, computed once.
+
+        Of the settings that are compared here it depends on ``confidence_min`` alone.
+        """
+        least = config.confidence_min
+        if least not in self._stage1:
+            kept = preprocess(self.rig, self.table, config).table
+            self._stage1[least] = estimate_stage1(self.rig, kept, config)
+        return self._stage1[least]
+
+
+class Source(Protocol):
+    """Where draws come from. It travels to other processes.
+
+    Attributes:
+        name: for headings.
+        preset: the paper's settings that go with it.
+        usual_draws: how many there are time for.
+        published_as: which of the paper's data it is like: kitti, walkley or none.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def preset(self) -> PresetName: ...  # noqa: D102
+
+    @property
+    def usual_draws(self) -> int: ...  # noqa: D102
+
+    @property
+    def published_as(self) -> str: ...  # noqa: D102
+
+    def frames_at(self, wanted: int) -> int:
+        """How many frames a draw of so many has: no more than there are."""
+        ...
+
+    def draw(self, frames: int, seed: int) -> Sample:
+        """So many frames and a new guess."""
+        ...
+
+    def halves(self, seed: int) -> tuple[Source, Source]:
+        """Two sources that share no frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A scenario by name: every draw is a new drive.
+
+    Attributes:
+        name: of the scenario.
+        displacement: of the guesses.
+        stream: part of all its seeds; drives of other streams are others.
+    """
+
+    name: str
+    displacement: Displacement = Displacement()
+    stream: int = 0
+    usual_draws: int = field(default=50, init=False)
+
+    @property
+    def preset(self) -> PresetName:
+        """Walkley's own, KITTI's for all others."""
+        return "walkley" if self.name == "walkley" else "kitti"
+
+    @property
+    def published_as(self) -> str:
+        """As its name says."""
+        return self.name
+
+    def frames_at(self, wanted: int) -> int:
+        """As many as are wanted.
+
+        Raises:
+            ValueError: if these are more than fit into memory.
+        """
+        if wanted > MAX_FRAMES:
+            raise ValueError(f"{wanted} frames: at most {MAX_FRAMES} can be simulated")
+        return wanted
+
+    def draw(self, frames: int, seed: int) -> Sample:
+        """A new drive and a new guess."""
+        scenario = scenario_of(self.name)
+        drive, guess = _seeds(seed, self.stream)
+        rig = self.displacement.guess(scenario.rig, guess)
+        table = scenario.draw(self.frames_at(frames), drive)
+        return Sample(rig, table, {"truth": scenario.rig})
+
+    def halves(self, seed: int) -> tuple[Source, Source]:
+        """Different drives."""
+        return replace(self, stream=2 * self.stream + 1), replace(self, stream=2 * self.stream + 2)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recordings with a reference: matched anew in every draw, from a new guess.
+
+    Attributes:
+        folders: dataset folder, or KITTI odometry sequences of one rig.
+        displacement: of the guesses.
+        positions: of the frames to draw from; None for all.
+    """
+
+    folders: tuple[Path, ...]
+    displacement: Displacement = Displacement()
+    positions: tuple[int, ...] | None = None
+    preset: PresetName = field(default="kitti", init=False)
+    usual_draws: int = field(default=3, init=False)
+
+    @property
+    def name(self) -> str:
+        """The folders' names."""
+        return "+".join(folder.name for folder in self.folders)
+
+    @property
+    def published_as(self) -> str:
+        """KITTI's, if it is of KITTI."""
+        return "kitti" if (self.folders[0] / CALIBRATION_NAME).is_file() else ""
+
+    @property
+    def references(self) -> dict[str, Rig]:
+        """What to judge by: for KITTI both readings of its ``calib.txt``, the right one first."""
+        folder = self.folders[0]
+        if (folder / CALIBRATION_NAME).is_file():
+            return {
+                "K^-1 P[:,3] (right)": load_kitti_rig(folder),
+                "P[0,3]/fx only": load_kitti_rig(folder, shift_along_x_only=True),
+            }
+        if not (folder / REFERENCE_FILE).is_file():
+            raise FileError(folder / REFERENCE_FILE, "no such file; a benchmark needs a reference")
+        return {"reference": load_rig(folder / REFERENCE_FILE)}
+
+    def frames_at(self, wanted: int) -> int:
+        """At most all there are."""
+        return min(wanted, len(self._positions()))
+
+    def draw(self, frames: int, seed: int) -> Sample:
+        """A random subset of the frames, matched with ``structure`` from a new guess.
+
+        The table is empty where the matcher gave up.
+        """
+        draw, guess = _seeds(seed, 0)
+        positions = self._positions()
+        chosen = np.random.default_rng(draw).permutation(positions)[: self.frames_at(frames)]
+        references = self.references
+        rig = self.displacement.guess(next(iter(references.values())), guess)
+        data = load_dataset(self.folders, rig).select(",".join(map(str, np.sort(chosen))))
+        try:
+            found = match_in_rounds(
+                data,
+                rig,
+                StructureMatcher(seed=draw, most_frames=None),
+                Config(seed=draw),
+                progress=no_progress,
+            )
+        except CorrespondenceError:
+            nothing = concatenate([_no_matches(name) for name in rig.cameras])
+            return Sample(rig, nothing, references, simulated=False, matched=True)
+        return Sample(
+            found.solution.rig, found.correspondences, references, simulated=False, matched=True
+        )
+
+    def halves(self, seed: int) -> tuple[Source, Source]:
+        """Every frame is in one of two random halves."""
+        order = np.random.default_rng(seed).permutation(self._positions()).tolist()
+        if len(order) < 2:  # noqa: PLR2004 - halves
+            raise ValueError(f"{self.name}: to keep frames apart at least 2 are needed")
+        middle = (len(order) + 1) // 2
+        first, second = tuple(sorted(order[:middle])), tuple(sorted(order[middle:]))
+        return replace(self, positions=first), replace(self, positions=second)
+
+    def _positions(self) -> Sequence[int]:
+        return self.positions or range(len(self._dataset().frames))
+
+    def _dataset(self) -> Dataset:
+        return load_dataset(self.folders, next(iter(self.references.values())))
+
+
+def _no_matches(camera: str) -> Correspondences:
+    return Correspondences.from_arrays(
+        camera=camera, frame=0, pixels_px=np.empty((0, 2)), points_lidar_m=np.empty((0, 3))
+    )
+
+
+def _seeds(seed: int, stream: int) -> tuple[int, int]:
+    """Independent seeds of a draw's correspondences and of its guess."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(2)
+    return int(state[0] >> 1), int(state[1] >> 1)
+
+
+def source_of(data: str, displacement: Displacement | None = None) -> Source:
+    """A source by what the user said.
+
+    Args:
+        data: a scenario's name; a dataset folder with a ``reference.yaml``, or a KITTI odometry
+            sequence; ``kitti:DIR,DIR``: KITTI sequences of one rig, as one recording.
+        displacement: of the guesses; the paper's 20 deg and 1.5 m if None.
+
+    Raises:
+        ValueError: if it is none of these.
+        FileError, DatasetError: if the data cannot be read.
+    """
+    displacement = displacement or Displacement()
+    if data in SCENARIOS:
+        return Simulated(data, displacement)
+    folders = tuple(Path(part) for part in data.removeprefix(KITTI_PREFIX).split(",") if part)
+    if not folders or not folders[0].is_dir():
+        raise ValueError(
+            f"{data!r} is no scenario ({', '.join(SCENARIOS)}), no folder, and no kitti:DIR,DIR"
+        )
+    source = Recorded(folders, displacement)
+    _ = source.frames_at(1)  # whether it can be read, before anything is drawn
+    return source

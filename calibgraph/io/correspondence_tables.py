@@ -1,0 +1,174 @@
+"""Correspondence tables from disk: Parquet, or CSV with the same columns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import require_file
+from calibgraph.model.correspondences import Correspondences, as_confidence
+from calibgraph.model.table_columns import (
+    COORDINATES,
+    INFORMATION,
+    OPTIONAL_WHOLE,
+    check_schema,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Array = NDArray[np.float64]
+
+_PART_ROWS = 2**18
+
+
+def load_correspondences(path: Path | str) -> Correspondences:
+    """Read a table from Parquet, or from CSV with the same columns.
+
+    Raises:
+        FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
+    """
+    path = require_file(Path(path))
+    table = read_arrow(path)
+    require_rows(path, len(table))
+    try:
+        return from_arrow(table)
+    except CorrespondenceError as error:
+        raise FileError(path, str(error)) from error
+
+
+def parts_of_file(path: Path) -> Iterator[Correspondences]:
+    """The table of a file in parts, in order: of Parquet some rows at a time; a CSV file whole.
+
+    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
+
+    Raises:
+        FileError: as of :func:`load_correspondences`, once the wrong part is reached; the rows that
+            it names are counted from the beginning of the file.
+    """
+    rows = 0
+    for part in _arrow_parts(require_file(path)):
+        try:
+            yield from_arrow(part)
+        except CorrespondenceError as error:
+            raise FileError(path, str(error.after(rows))) from error
+        rows += len(part)
+    require_rows(path, rows)
+
+
+def _arrow_parts(path: Path) -> Iterator[pa.Table]:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    if path.suffix == ".csv":
+        yield read_arrow(path)
+        return
+    # One row group after the other: until it is done, a reader holds on to all that it has read.
+    with arrow_reads(path), parquet.ParquetFile(path) as file:
+        metadata = file.schema_arrow.metadata
+        for group in range(file.num_row_groups):
+            for batch in file.iter_batches(_PART_ROWS, row_groups=[group]):
+                yield pa.Table.from_batches([batch]).replace_schema_metadata(metadata)
+
+
+def read_arrow(path: Path) -> pa.Table:
+    """A whole Parquet or CSV file, whatever its columns.
+
+    Raises:
+        FileError: if it cannot be read.
+    """
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    with arrow_reads(path):
+        if path.suffix == ".csv":
+            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
+            return csv.read_csv(path, convert_options=strings)
+        with parquet.ParquetFile(path) as file:
+            return file.read()
+
+
+@contextmanager
+def arrow_reads(path: Path) -> Iterator[None]:
+    """Whatever Arrow finds wrong with a file in here is a ``FileError``."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (pa.ArrowException, OSError, ValueError) as error:
+        kind = "CSV" if path.suffix == ".csv" else "Parquet"
+        message = f"cannot be read as {kind} ({error}); is it complete? write it again"
+        raise FileError(path, message) from error
+
+
+def require_rows(path: Path, rows: int) -> None:
+    """Whether a file has any.
+
+    Raises:
+        FileError: if not.
+    """
+    if not rows:
+        raise FileError(path, "holds no rows; write the correspondences into it")
+
+
+def from_arrow(table: pa.Table) -> Correspondences:
+    """Build correspondences from an Arrow table that has the file format's columns.
+
+    Raises:
+        CorrespondenceError: if a column, a value or the metadata is wrong.
+    """
+    import pyarrow as pa
+
+    check_schema(table.schema)
+    try:
+        # As plain strings: a name that is null may hide in a dictionary.
+        names = table["camera"].cast(pa.string())
+        camera = table.column_names.index("camera")
+        return _from_plain_columns(table.set_column(camera, "camera", names))
+    except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
+        message = f"a column or the metadata has the wrong type: {error}"
+        raise CorrespondenceError(message) from error
+
+
+def _from_plain_columns(table: pa.Table) -> Correspondences:
+    import pyarrow as pa
+
+    for name in table.column_names:
+        if table[name].null_count:
+            row = table[name].is_null().to_pylist().index(True)
+            raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+
+    def stack(names: Sequence[str]) -> Array:
+        return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)
+
+    given = table.column_names
+    encoded = table["camera"].combine_chunks().dictionary_encode()
+    if isinstance(encoded, pa.ChunkedArray):
+        encoded = encoded.combine_chunks()
+    return Correspondences(
+        cameras=tuple(encoded.dictionary.to_pylist()),
+        camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
+        frame=_whole(table, "frame"),
+        pixels_px=stack(COORDINATES[:2]),
+        points_lidar_m=stack(COORDINATES[2:]),
+        confidence=as_confidence(table["confidence"].to_numpy())
+        if "confidence" in given
+        else np.ones(len(table), np.float32),
+        information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
+        **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
+        metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
+    )
+
+
+def _whole(table: pa.Table, name: str) -> NDArray[np.int64]:
+    values = table[name].to_numpy()
+    if values.dtype == np.uint64 and (values >= 2**63).any():
+        raise CorrespondenceError(f"column {name!r} holds a number beyond 64 bits")
+    return np.asarray(values, dtype=np.int64)

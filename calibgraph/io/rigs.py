@@ -1,0 +1,51 @@
+"""Wherever a rig is asked for, several things serve: the one place that tells them apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibgraph.errors import FileError
+from calibgraph.files import checked_model, read_yaml
+from calibgraph.io.calibrations import is_calibration, rig_of_calibration
+from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.model.calibration import CALIBRATION_FILE
+from calibgraph.model.rig import Rig
+
+RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
+
+
+def load_rig(path: Path | str) -> Rig:
+    """Read a rig from a rig file, a result (file or folder), a dataset or a KITTI sequence folder.
+
+    A result gives the calibrated poses, a KITTI sequence those of its own ``calib.txt``.
+
+    Raises:
+        FileError: if there is none, or it is malformed.
+    """
+    path = rig_file(path)
+    if path.name == CALIBRATION_NAME:
+        return load_kitti_rig(path.parent)
+    content = read_yaml(path)
+    if is_calibration(content):
+        return rig_of_calibration(content, path)
+    return checked_model(Rig, content, path)
+
+
+def rig_file(path: Path | str) -> Path:
+    """The file that :func:`load_rig` reads: the path itself, or the one that a folder stands for.
+
+    Raises:
+        FileError: if a folder holds none.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        return folder
+    names = (CALIBRATION_FILE, RIG_FILE)
+    if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it
+        names = (RIG_FILE, CALIBRATION_FILE)
+    for name in (*names, CALIBRATION_NAME):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileError(
+        folder, f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
+    )

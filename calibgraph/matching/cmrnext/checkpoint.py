@@ -1,0 +1,241 @@
+"""Weights from files: strictly, safely, and with a hash of what was read."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from calibgraph.errors import FileError
+from calibgraph.files import sha256, write_atomically
+from calibgraph.matching.cmrnext.architecture import Variant, recognised, require_config_agrees
+from calibgraph.matching.cmrnext.network import CmrNext
+from calibgraph.matching.cmrnext.pickle_reader import read_checkpoint
+
+SAFETENSORS = ".safetensors"
+TORCH_SUFFIXES = (".tar", ".pt", ".pth")
+
+DOWNLOAD = (
+    "the published weights are at "
+    "https://cmrnext.cs.uni-freiburg.de/downloads/cmrnext_calibration_weights.zip; they are not "
+    "part of calibgraph: GPL-3.0 for academic use, for other use ask their authors; or train your "
+    "own with calibgraph train"
+)
+
+_NUMBERS = {
+    "max_depth": (1.0, 10_000.0, True),
+    "max_r": (0.0, 180.0, False),
+    "max_t": (0.0, 1000.0, False),
+    "systematic_rotation_rad": (0.0, 10.0, False),
+    "systematic_translation_m": (0.0, 1000.0, False),
+}  # least, most, and whether they must be there
+_SWITCHES = {"use_reflectance": True, "normalize_images": True, "half_resolution": False}
+_MAX_TEXT, _MAX_INTEGER = 200, 2**53
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A network's weights and what they were made for.
+
+    Attributes:
+        path: of the file.
+        sha256: of the file.
+        variant: of the network, recognised from the shapes.
+        config: what the file says of its training; plain values only.
+        state: the state dict.
+    """
+
+    path: Path
+    sha256: str
+    variant: Variant
+    config: dict[str, Any]
+    state: dict[str, Tensor]
+
+    @property
+    def max_depth_m(self) -> float:
+        """What depths are divided by."""
+        return float(self.config["max_depth"])
+
+    @property
+    def range_deg_m(self) -> tuple[float, float] | None:
+        """Largest perturbation per axis in training, degrees and metres, if the file says."""
+        rotation, translation = (self.config.get(key) for key in ("max_r", "max_t"))
+        return (float(rotation), float(translation)) if rotation and translation else None
+
+    def summary(self) -> dict[str, Any]:
+        """What the file holds, as plain values."""
+        return {
+            "file": str(self.path),
+            "sha256": self.sha256,
+            "parameters": sum(t.numel() for name, t in self.state.items() if not _copied(name)),
+            "network": asdict(self.variant),
+            "config": self.config,
+        }
+
+    def network(self, device: str | torch.device = "cpu") -> CmrNext:
+        """The network with these weights, for evaluation."""
+        model = CmrNext(self.variant)
+        model.load_state_dict(self.state)
+        return model.to(device).eval()
+
+    def save_safetensors(self, path: Path) -> None:
+        """Write the weights and their config as a .safetensors file."""
+        from safetensors.torch import save_file
+
+        metadata = {"format": "calibgraph-cmrnext/1", "config": json.dumps(self.config)}
+        # Some tensors are stored under two names; safetensors wants them apart.
+        state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
+        write_atomically(path, lambda temporary: save_file(state, temporary, metadata))
+
+
+def _copied(name: str) -> bool:
+    """Whether a state dict's entry is no parameter: a second name, or a running statistic."""
+    return ".downsample.1." in name or name.endswith(
+        ("running_mean", "running_var", "num_batches_tracked")
+    )
+
+
+def load_checkpoint(path: Path | str) -> Checkpoint:
+    """Read weights, from a published ``.tar`` (``torch.save``) or a ``.safetensors``.
+
+    Nothing in the file is executed.
+
+    Raises:
+        FileError: if the file is missing, damaged, hostile, not of a CMRNext network, or differs
+            from what it says of itself.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise FileError(path, "is not a file; expected weights, .tar or .safetensors")
+    if not path.exists():
+        raise FileError(path, f"no such file of weights; {DOWNLOAD}")
+    given, tensors = _read_safetensors(path) if path.suffix == SAFETENSORS else _read_torch(path)
+    try:
+        config = _plain(given)
+        _require_sound(config)
+        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        variant = recognised(shapes, reflectance=config["use_reflectance"])
+        require_config_agrees(variant, config)
+        state = _checked_state(variant, tensors)
+    except ValueError as error:
+        raise FileError(path, f"{error}") from None
+    return Checkpoint(path, sha256(path), variant, config, state)
+
+
+def _read_torch(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    content = read_checkpoint(path)
+    for key in ("config", "state_dict"):
+        if not isinstance(content.get(key), dict):
+            raise FileError(path, f"lacks {key!r}: expected the checkpoint of a CMRNext training")
+    tensors = {}
+    for name, array in content["state_dict"].items():
+        if not isinstance(name, str) or not isinstance(array, np.ndarray):
+            raise FileError(path, f"its state_dict holds {str(name)[:100]!r}, which is no tensor")
+        # A number that is repeated by a stride of zero is copied only when its shape is right.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # torch: the array is read-only; so be it
+            tensors[name.removeprefix("module.")] = torch.from_numpy(array)
+    return content["config"], tensors
+
+
+def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        data = path.read_bytes()
+        tensors = load(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        text = header.get("__metadata__", {}).get("config")
+        config = None if text is None else json.loads(text)
+    except (SafetensorError, ValueError, OSError, RecursionError, KeyError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FileError(path, f"cannot be read as safetensors: {reason}") from None
+    if not isinstance(config, dict):
+        raise FileError(
+            path, "has no config in its metadata; convert the original with calibgraph weights"
+        )
+    return config, tensors
+
+
+def _plain(config: Mapping[Any, Any]) -> dict[str, Any]:
+    """The part of a config that is plain, printable values of ordinary size."""
+    return {key: value for key, value in config.items() if _is_plain(key) and _is_plain(value)}
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, str):
+        return len(value) <= _MAX_TEXT and value.isprintable()
+    if isinstance(value, (list, tuple)):
+        return len(value) <= 2 and all(type(item) is int and _is_plain(item) for item in value)  # noqa: PLR2004
+    if isinstance(value, (int, float)):
+        return math.isfinite(value) if isinstance(value, float) else abs(value) <= _MAX_INTEGER
+    return value is None
+
+
+def _require_sound(config: Mapping[str, Any]) -> None:
+    """Check the keys of the config that anything depends on.
+
+    Raises:
+        ValueError: on the first that is missing or out of its range.
+    """
+    for key, (least, most, needed) in _NUMBERS.items():
+        value = config.get(key)
+        if value is None and not needed:
+            continue
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not (least <= value <= most)
+        ):
+            raise ValueError(
+                f"its config has {key!r} = {value!r}, expected a number from {least} to {most}"
+            )
+    for key, needed in _SWITCHES.items():
+        value = config.get(key)
+        if not isinstance(value, bool) and (needed or value is not None):
+            raise ValueError(f"its config has {key!r} = {value!r}, expected true or false")
+
+
+def _checked_state(variant: Variant, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state dict, after comparing every name and shape with the network's.
+
+    Raises:
+        ValueError: on the first difference, and on numbers that are not finite.
+    """
+    with torch.device("meta"):
+        expected = CmrNext(variant).state_dict()
+    for kind, names in (
+        ("lacks", expected.keys() - tensors.keys()),
+        ("has the unknown", tensors.keys() - expected.keys()),
+    ):
+        if names:
+            raise ValueError(f"{kind} weights {min(names)!r} ({len(names)} such names)")
+    state = {}
+    for name, like in expected.items():
+        tensor = tensors[name]
+        if tensor.shape != like.shape:
+            raise ValueError(
+                f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}"
+            )
+        if tensor.is_floating_point() != like.is_floating_point():
+            raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
+        state[name] = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
+        if not torch.isfinite(state[name]).all():
+            raise ValueError(f"{name!r} holds values that are not finite")
+        if name.endswith("running_var") and (state[name] < 0).any():
+            raise ValueError(f"{name!r} holds variances below zero")
+    for name, tensor in state.items():
+        if ".norm3." in name and not torch.equal(
+            tensor, state[name.replace(".norm3.", ".downsample.1.")]
+        ):
+            raise ValueError(f"{name!r} and its copy under 'downsample.1' differ")
+    return state

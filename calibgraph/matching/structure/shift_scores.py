@@ -1,0 +1,189 @@
+"""How well the image agrees with a group of LiDAR windows, at every shift of a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from calibgraph.matching.structure.schedule import Level
+from calibgraph.matching.structure.windows import WINDOW_POINTS, Cloud, build_windows, view_angles
+from calibgraph.model.rig import Camera
+from calibgraph.solver.augmented_fit import camera_flow
+
+Array = NDArray[np.float64]
+Grids = NDArray[np.float32]
+
+GRAY_NOISE = 0.05  # logarithm of gray: below, a window counts as flat in the image
+OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly one
+MIN_GROUP_WINDOWS = 4
+LEAST_REACH = 6  # steps: with wide or small lenses a pixel is much of a level's reach
+MISFIT = 0.1  # share of its variance that an image cannot share with a cloud, at its best
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Score grids of the groups of one camera.
+
+    Attributes:
+        grids: (g, s, s) score by shift [v, u], from -reach to reach steps; the mean is zero.
+        flow: (g, 2, 6) shift in steps (u, v) per unit of the twist xi = (rotation [rad],
+            translation [m]) of T_camera_lidar = exp(xi) estimate.
+        points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame.
+        pixels_px: (g, 2) where it projects at the estimate.
+        frame: (g,) the number of its frame.
+        counts: (g,) windows in the group.
+        steps_per_px: (2,) of u and v.
+    """
+
+    grids: Grids
+    flow: Array
+    points_lidar_m: Array
+    pixels_px: Array
+    frame: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    steps_per_px: Array
+
+
+def score_frame(
+    gray: NDArray[np.uint8], cloud: Cloud, camera: Camera, level: Level, *, frame: int, most: int
+) -> Scores:
+    """Score one image against one cloud, from the camera's present pose.
+
+    Args:
+        gray: (height, width) image.
+        cloud: the frame's cloud.
+        camera: lens, and the estimate of the pose.
+        level: reach and resolution.
+        frame: number of the frame.
+        most: most windows to use.
+    """
+    T = camera.T_camera_lidar
+    image, scale = small_logarithm(gray, camera, level.step_rad, level.blur_steps)
+    windows = build_windows(cloud, camera, level, most)
+    points_lidar_m = windows.rays_m.reshape(-1, 3) + cloud.viewpoint_m(camera)
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    kept, group, groups = _groups(points[::WINDOW_POINTS], level.group_rad)
+    pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
+    places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
+    reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
+    reach = max(reach, LEAST_REACH)
+    grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
+    used, basis, first = windows.counts[kept], windows.basis[kept], np.array([-reach, -reach])
+    score_windows(image, places, used, basis, group, first, level.strict, grids)
+    grids -= grids.mean(axis=(1, 2), keepdims=True)
+    counts = np.bincount(group, minlength=groups)
+    centres = _group_means(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
+    pixels_px, flow_px = camera_flow(camera, centres)
+    return Scores(
+        grids=grids,
+        flow=flow_px * scale[:, None],
+        points_lidar_m=centres,
+        pixels_px=pixels_px,
+        frame=np.full(groups, frame, np.int64),
+        counts=counts,
+        steps_per_px=scale,
+    )
+
+
+def joined(scores: Sequence[Scores]) -> Scores:
+    """The groups of several frames of one camera, together."""
+    columns = ("grids", "flow", "points_lidar_m", "pixels_px", "frame", "counts")
+    stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
+    return Scores(**stacked, steps_per_px=scores[0].steps_per_px)
+
+
+def small_logarithm(
+    gray: NDArray[np.uint8], camera: Camera, step_rad: float, blur_steps: float
+) -> tuple[NDArray[np.float32], Array]:
+    """Logarithm of gray, down-scaled so that a pixel is a step; its (2,) scales of u and v.
+
+    A pixel p of the image lies at (p + 0.5) scale - 0.5.
+    """
+    factor = min(1.0, 1.0 / (camera.intrinsics_px.fx * step_rad))
+    height, width = gray.shape
+    size = (max(8, round(width * factor)), max(8, round(height * factor)))
+    logarithm = np.log1p(gray.astype(np.float32))
+    small = cv2.resize(logarithm, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), blur_steps)
+    scale = np.array([size[0] / width, size[1] / height])
+    return np.ascontiguousarray(small, dtype=np.float32), scale
+
+
+def _groups(
+    seeds_camera_m: Array, cell_rad: float
+) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
+    """Group windows by direction and depth.
+
+    Returns:
+        The kept windows (k,), the group of each (k,), and the number of groups.
+    """
+    distance = np.linalg.norm(seeds_camera_m, axis=1)
+    cells = np.column_stack(
+        [
+            np.floor(view_angles(seeds_camera_m) / cell_rad),
+            np.floor(np.log2(distance) / OCTAVES_PER_BIN),
+        ]
+    )
+    _, cell, sizes = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    kept = np.flatnonzero(sizes[cell] >= MIN_GROUP_WINDOWS)
+    names, group = np.unique(cell[kept], return_inverse=True)
+    return kept, group.reshape(-1).astype(np.int32), len(names)
+
+
+def _group_means(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
+    sums = [np.bincount(group, column, minlength=len(counts)) for column in points.T]
+    return np.stack(sums, axis=1) / counts[:, None]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
+    """Add every window's score at all shifts to its group's grid.
+
+    image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
+    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s). The
+    score is d_D^2 + d_I |d_I|: squared for depth, which has no sign in an image, and signed for
+    intensity; over the image's own variation. It is a share r of explained variance, or
+    (likelihood) the -log(1 - r) of a Gaussian window. Shifts at which a window leaves the image
+    count 0.
+    """
+    height, width = image.shape
+    rows, columns = grids.shape[1], grids.shape[2]
+    sums = np.empty((6, columns), np.float32)  # depth, intensity, two of trend, total, power
+    for w in range(places.shape[0]):
+        n = counts[w]
+        left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
+        top, bottom = places[w, :n, 1].min(), places[w, :n, 1].max()
+        first = max(origin[0], -left)
+        size = min(origin[0] + columns, width - right) - first
+        if size <= 0:
+            continue
+        for shift in range(max(origin[1], -top), min(origin[1] + rows, height - bottom)):
+            sums[:, :size] = 0
+            for p in range(n):
+                row = image[places[w, p, 1] + shift]
+                start = places[w, p, 0] + first
+                a, b, c, d = basis[w, p, 0], basis[w, p, 1], basis[w, p, 2], basis[w, p, 3]
+                for k in range(size):
+                    value = row[start + k]
+                    sums[0, k] += a * value
+                    sums[1, k] += b * value
+                    sums[2, k] += c * value
+                    sums[3, k] += d * value
+                    sums[4, k] += value
+                    sums[5, k] += value * value
+            grid = grids[group[w], shift - origin[1]]
+            for k in range(size):
+                power = sums[5, k] - sums[4, k] * sums[4, k] / n + n * np.float32(GRAY_NOISE**2)
+                power -= sums[2, k] * sums[2, k] + sums[3, k] * sums[3, k]
+                score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
+                share = score / power
+                if likelihood:
+                    left_over = np.float32(1 + MISFIT) - abs(share)
+                    share = np.copysign(np.log(np.float32(1 + MISFIT) / left_over), share)
+                grid[first - origin[0] + k] += share

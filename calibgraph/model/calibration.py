@@ -1,0 +1,234 @@
+"""The result: one type for every solver, complete enough to judge it, use it and repeat it."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.files import write_yaml
+from calibgraph.model.config import Config, Terms
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import relative_covariance, relative_transform
+from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Check, Verdict, rig_verdict
+
+Array = NDArray[np.float64]
+
+CALIBRATION_FORMAT = "calibgraph-calibration/1"
+CALIBRATION_FILE = "calibration.yaml"
+CORRESPONDENCES_FILE = "correspondences.parquet"
+
+FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
+TANGENT_SENTENCE = (
+    "T_camera_lidar = exp(xi) * estimate, "
+    "xi = (rotation [rad], translation [m]) in the camera's axes"
+)
+PAIR_TANGENT_SENTENCE = (
+    "A->B: T_B_A = exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the axes of B"
+)
+
+
+def _versions() -> dict[str, str]:
+    """What made the result: this package and the libraries that matter."""
+    versions = {"python": platform.python_version()}
+    for package in ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed as a package"
+    return versions
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How well the result explains one camera's correspondences.
+
+    Attributes:
+        median_px: median unweighted error over the preprocessed correspondences; for a match that
+            constrains one direction only, the error along it.
+        inlier_share: share of them that the gate kept.
+        sigma_px: the residuals' robust spread (per axis).
+        loss_scale_px: delta that was used.
+        gate_px: tau that was used.
+    """
+
+    median_px: float
+    inlier_share: float
+    sigma_px: float
+    loss_scale_px: float
+    gate_px: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration:
+    """A calibrated rig.
+
+    Attributes:
+        rig: the rig with the estimated poses.
+        initial_rig: the rig that the solve started from.
+        covariance: clustered by frames, plus the error that the matcher says its frames share:
+            per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+            [rad], translation [m]) in the camera's axes; None with too few frames to tell.
+        joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
+        camera_verdicts: per camera.
+        residuals: per camera that had correspondences.
+        counts: per camera, what was left after each filter and gate, and the frames.
+        timings_s: seconds per stage.
+        terms: which terms of the objective were used.
+        config: the resolved settings.
+        stage1_T_camera_lidar: the pairwise estimates.
+        weaknesses: per camera, what the data leave loose, in words, the worst first.
+        prior_share: per camera, which share of its result comes from priors, not from data (0-1).
+        bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
+            frames drawn with replacement, like ``covariance``; the check of it.
+        frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
+            ``images``, a file per camera.
+        rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
+        correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
+            its last round.
+        inputs: SHA-256 of the input files, by path.
+        versions: of this package and the libraries that matter.
+    """
+
+    rig: Rig
+    initial_rig: Rig
+    covariance: dict[str, Array | None]
+    joint_covariance: Array | None
+    camera_verdicts: dict[str, Verdict]
+    residuals: dict[str, Residuals]
+    counts: dict[str, dict[str, int]]
+    timings_s: dict[str, float]
+    terms: Terms
+    config: Config
+    stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
+    weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    prior_share: dict[str, float] = field(default_factory=dict)
+    bootstrap: dict[str, Array] = field(default_factory=dict)
+    frames: tuple[dict[str, Any], ...] = ()
+    rounds: tuple[Mapping[str, Any], ...] = ()
+    correspondences: Correspondences | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=_versions)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the rig: all that was asked of its cameras."""
+        return rig_verdict(self.camera_verdicts)
+
+    @property
+    def T_camera_lidar(self) -> dict[str, Array]:
+        """Each camera's (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
+        return self.rig.T_camera_lidar
+
+    def sigmas(self, name: str) -> tuple[Array, Array] | None:
+        """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
+
+        Returns:
+            (3,) rotation [deg], (3,) translation [cm]; None with too few frames to tell.
+        """
+        covariance = self.covariance.get(name, self.pair_covariance.get(name))
+        return None if covariance is None else degrees_and_centimetres(covariance)
+
+    def with_checks(self, checks: Mapping[str, Sequence[Check]]) -> Calibration:
+        """The same result with more checks per camera."""
+        verdicts = {
+            name: verdict.and_also(checks.get(name, ()))
+            for name, verdict in self.camera_verdicts.items()
+        }
+        return replace(self, camera_verdicts=verdicts)
+
+    @property
+    def pair_covariance(self) -> dict[str, Array]:
+        """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
+
+        Empty with too few frames to tell.
+        """
+        if self.joint_covariance is None:
+            return {}
+        T = self.T_camera_lidar
+        return {
+            f"{a}->{b}": relative_covariance(
+                self.joint_covariance, i, j, relative_transform(T[b], T[a])
+            )
+            for (i, a), (j, b) in combinations(enumerate(T), 2)
+        }
+
+    def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
+        """The same result, knowing the hashes of the files it came from."""
+        return replace(self, inputs=dict(inputs))
+
+    def save(self, folder: Path | str) -> Path:
+        """Write ``calibration.yaml``, and the correspondences if there are any, into a folder.
+
+        Each file appears whole or not at all. Returns the path of the YAML file.
+        """
+        path = Path(folder) / CALIBRATION_FILE
+        table = path.with_name(CORRESPONDENCES_FILE)
+        if self.correspondences is not None:
+            marked = {**self.correspondences.metadata, "verdict": self.verdict.status}
+            replace(self.correspondences, metadata=marked).save(table)
+        else:
+            table.unlink(missing_ok=True)  # an older result's
+        write_yaml(path, self._to_mapping())
+        return path
+
+    def __repr__(self) -> str:
+        return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"
+
+    def _sigma_mapping(self, name: str) -> dict[str, list[float]] | None:
+        covariance = self.covariance[name]
+        if covariance is None:
+            return None
+        sigmas = np.sqrt(np.diag(covariance)).tolist()
+        return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}
+
+    def _to_mapping(self) -> dict[str, Any]:
+        return {
+            "format": CALIBRATION_FORMAT,
+            "verdict": _verdict_mapping(self.verdict),
+            "camera_verdicts": {
+                name: {**_verdict_mapping(verdict), "checks": [vars(c) for c in verdict.checks]}
+                for name, verdict in self.camera_verdicts.items()
+            },
+            "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
+            "prior_share": self.prior_share,
+            "frames": FRAMES_SENTENCE,
+            "T_camera_lidar": self.T_camera_lidar,
+            "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
+            "rig": self.rig.model_dump(),
+            "covariance_of": TANGENT_SENTENCE,
+            "covariance": dict(self.covariance),
+            "joint_covariance": self.joint_covariance,
+            "pair_covariance_of": PAIR_TANGENT_SENTENCE,
+            "pair_covariance": self.pair_covariance,
+            "bootstrap_covariance": self.bootstrap,
+            "residuals": {name: vars(value) for name, value in self.residuals.items()},
+            "counts": self.counts,
+            "frames_used": list(self.frames),
+            "rounds": list(self.rounds),
+            "initial_rig": self.initial_rig.model_dump(),
+            "stage1_T_camera_lidar": self.stage1_T_camera_lidar,
+            "terms": self.terms,
+            "config": self.config.model_dump(),
+            "timings_s": self.timings_s,
+            "inputs": self.inputs,
+            "versions": self.versions,
+        }
+
+
+def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
+    """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
+    sigmas = np.sqrt(np.diag(covariance))
+    return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
+
+
+def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
+    return {"status": verdict.status, "reasons": list(verdict.reasons)}

@@ -1,0 +1,239 @@
+"""The correspondence table: the waist of the program. Matchers write it, the graph reads it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.table_columns import save_correspondences
+
+Array = NDArray[np.float64]
+
+MAX_COORDINATE = 1e6  # px or m: nothing that is matched lies farther
+_MAX_WHOLE = 2**63 - 1
+MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Correspondences:
+    """2D-3D correspondences of several cameras and frames, as columns of equal length.
+
+    Attributes:
+        cameras: the names that ``camera_index`` counts.
+        camera_index: (n,) which of ``cameras`` saw the pixel.
+        frame: (n,) frame number; the same number in two cameras is the same instant.
+        pixels_px: (n, 2) pixel (column, row) in the image as recorded (distorted).
+        points_lidar_m: (n, 3) point in the LiDAR frame.
+        confidence: (n,) in (0, 1].
+        information_px: (n, 3) or None: i_uu, i_uv, i_vv of the 2x2 information of the pixel
+            [1/px^2], positive semidefinite; it may have rank one (an edge constrains only its
+            normal). None stands for the identity.
+        stamp_ns: (n,) or None: time of the frame.
+        point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
+        metadata: where the table comes from: the matcher and its settings.
+
+    Raises:
+        CorrespondenceError: on wrong shapes or values, naming the first bad row, and if the
+            metadata has wrong ``findings``.
+    """
+
+    cameras: tuple[str, ...]
+    camera_index: NDArray[np.int32]
+    frame: NDArray[np.int64]
+    pixels_px: Array
+    points_lidar_m: Array
+    confidence: NDArray[np.float32]
+    information_px: Array | None = None
+    stamp_ns: NDArray[np.int64] | None = None
+    point_index: NDArray[np.int64] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        for column, width in _WIDTHS.items():
+            array = getattr(self, column)
+            shape = (n,) if width == 1 else (n, width)
+            if array is not None and array.shape != shape:
+                raise CorrespondenceError(
+                    f"{column} has shape {array.shape}, expected {shape} like the column frame"
+                )
+        if len(self.camera_index) and not (
+            0 <= self.camera_index.min() <= self.camera_index.max() < len(self.cameras)
+        ):
+            raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
+        if not isinstance(self.metadata, dict):
+            raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
+        _ = self.findings
+        self._check_values()
+
+    @staticmethod
+    def from_arrays(
+        *,
+        camera: Sequence[str] | NDArray[np.str_] | str,
+        frame: ArrayLike,
+        pixels_px: ArrayLike,
+        points_lidar_m: ArrayLike,
+        confidence: ArrayLike | None = None,
+        information_px: ArrayLike | None = None,
+        stamp_ns: ArrayLike | None = None,
+        point_index: ArrayLike | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> Correspondences:
+        """Build a table from arrays; ``camera`` and ``frame`` may be one value for all rows.
+
+        Raises:
+            CorrespondenceError: on wrong shapes or values.
+        """
+        pixels = np.atleast_2d(np.asarray(pixels_px, dtype=np.float64))
+        n = len(pixels)
+        whole = {"frame": frame, "stamp_ns": stamp_ns, "point_index": point_index}
+        for name, numbers in whole.items():
+            if numbers is not None and n and np.asarray(numbers).dtype.kind not in "iu":
+                raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
+            if numbers is not None and n and np.asarray(numbers).max() > _MAX_WHOLE:
+                raise CorrespondenceError(f"{name} holds a number beyond 64 bits")
+        names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
+        given = np.ones(n) if confidence is None else confidence
+        return Correspondences(
+            cameras=tuple(str(name) for name in names),
+            camera_index=index.astype(np.int32),
+            frame=np.array(np.broadcast_to(np.asarray(frame, dtype=np.int64), n)),
+            pixels_px=pixels,
+            points_lidar_m=np.asarray(points_lidar_m, dtype=np.float64),
+            confidence=as_confidence(given),
+            information_px=_optional(information_px, np.float64),
+            stamp_ns=_optional(stamp_ns, np.int64),
+            point_index=_optional(point_index, np.int64),
+            metadata=metadata or {},
+        )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{name}: {count}" for name, count in self.counts().items())
+        return f"Correspondences({counts}; {len(np.unique(self.frame))} frames)"
+
+    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
+        """The table with only some rows: a mask, an index array or a slice."""
+        kept = copy.copy(self)  # not checked again: rows of a good table are good
+        for name in _WIDTHS:
+            column = getattr(self, name)
+            object.__setattr__(kept, name, None if column is None else column[rows])
+        return kept
+
+    def of_camera(self, name: str) -> Correspondences:
+        """The rows of one camera (none, if the camera is not in the table)."""
+        if name not in self.cameras:
+            return self.select(slice(0, 0))
+        rows = np.flatnonzero(self.camera_index == self.cameras.index(name))
+        adjacent = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+        return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view, if it can
+
+    @cached_property
+    def findings(self) -> MatcherFindings:
+        """What the matcher reported, from the metadata.
+
+        Raises:
+            CorrespondenceError: if a value is not a number in its range.
+        """
+        return MatcherFindings.from_metadata(self.metadata)
+
+    def counts(self) -> dict[str, int]:
+        """Rows per camera."""
+        counts = np.bincount(self.camera_index, minlength=len(self.cameras))
+        return dict(zip(self.cameras, counts.tolist(), strict=True))
+
+    def save(self, path: Path | str) -> None:
+        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
+        save_correspondences(self, Path(path))
+
+    def _check_values(self) -> None:
+        u, v = self.pixels_px, self.points_lidar_m
+        for what, values in (("pixel", u), ("point", v)):
+            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        c = self.confidence
+        self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
+        if self.point_index is not None:
+            self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
+        if self.information_px is not None:
+            i = self.information_px
+            good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
+            self._require(good, "information", i, f"be finite and below {MAX_INFORMATION:g}")
+            determinant = i[:, 0] * i[:, 2] - i[:, 1] ** 2
+            tolerance = 1e-6 * np.maximum(i[:, 0], i[:, 2]) ** 2
+            positive = (i[:, [0, 2]] >= 0).all(axis=1) & (determinant >= -tolerance)
+            good = positive & (i[:, 0] + i[:, 2] > MIN_INFORMATION)
+            self._require(good, "information", i, "be positive semidefinite and not zero")
+
+    def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
+        if good.all():
+            return
+        row = int(np.flatnonzero(~good)[0])
+        camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
+        raise CorrespondenceError(
+            f"{what} must {rule}, found {found[row].tolist()}; drop or mend the row",
+            camera=camera,
+            frame=frame,
+            row=row,
+        )
+
+
+_WIDTHS = {
+    "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
+    "information_px": 3, "stamp_ns": 1, "point_index": 1,
+}  # fmt: skip
+assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
+
+
+def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
+    """Confidences in single precision; one beyond it becomes infinite, which a table refuses."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype=np.float32)
+
+
+def _optional(values: ArrayLike | None, dtype: type) -> Any:
+    return None if values is None else np.asarray(values, dtype=dtype)
+
+
+def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
+    """Put tables under each other; the metadata is that of the first.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if not tables:
+        raise ValueError("no tables to concatenate")
+    names = tuple(sorted({name for table in tables for name in table.cameras}))
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("frame", "pixels_px", "points_lidar_m", "confidence")
+    }
+    numbers = [np.array([names.index(n) for n in t.cameras], np.int32) for t in tables]
+    columns["camera_index"] = np.concatenate(
+        [number[t.camera_index] if len(t) else t.camera_index
+         for number, t in zip(numbers, tables, strict=True)]
+    )  # fmt: skip
+    if any(table.information_px is not None for table in tables):
+        columns["information_px"] = np.concatenate([_information(t) for t in tables])
+    for name in ("stamp_ns", "point_index"):
+        given = [getattr(table, name) for table in tables if len(table)]
+        if given and all(column is not None for column in given):
+            columns[name] = np.concatenate(given)
+    return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
+
+
+def _information(table: Correspondences) -> Array:
+    if table.information_px is not None:
+        return table.information_px
+    return np.tile([1.0, 0.0, 1.0], (len(table), 1))

@@ -1,0 +1,117 @@
+"""What a matcher reports beside its correspondences, as a type; on disk, keys of the metadata."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from calibgraph.errors import CorrespondenceError
+
+_PER_CAMERA = {
+    "z_score": "contrast",  # the key on disk is older than the name
+    "start_dependence": "start_dependence",
+    "recall": "recall",
+    "failed_share": "failed_share",
+    "found": "found",
+    "missed": "missed",
+}
+_NUMBERS = {
+    "range_rotation_deg": 180.0,
+    "range_translation_m": 100.0,
+    "systematic_rotation_rad": math.pi,
+    "systematic_translation_m": 100.0,
+}
+
+
+@dataclass(frozen=True)
+class MatcherFindings:
+    """What a matcher reports of its work. Mappings are by camera; all of it is optional.
+
+    Attributes:
+        z_score: agreement of image and cloud, in standard deviations of chance agreement.
+        start_dependence: share of a displaced start that remains in the matches (0 to 1).
+        recall: share of the way back that is found without the image (0 to 1).
+        failed_share: share of the frames without matches (0 to 1).
+        found: z-score at the pose where the search found the camera.
+        missed: best z-score of the search where it did not find the camera: the camera fails.
+        range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
+            if unknown.
+        systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
+            error that all its frames share.
+    """
+
+    z_score: Mapping[str, float] = field(default_factory=dict)
+    start_dependence: Mapping[str, float] = field(default_factory=dict)
+    recall: Mapping[str, float] = field(default_factory=dict)
+    failed_share: Mapping[str, float] = field(default_factory=dict)
+    found: Mapping[str, float] = field(default_factory=dict)
+    missed: Mapping[str, float] = field(default_factory=dict)
+    range_rotation_deg: float | None = None
+    range_translation_m: float | None = None
+    systematic_rotation_rad: float = 0.0
+    systematic_translation_m: float = 0.0
+
+    @staticmethod
+    def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:
+        """Read the keys of a table's metadata that are findings; others are left alone.
+
+        Raises:
+            CorrespondenceError: if a value is not a number in its range.
+        """
+        values: dict[str, Any] = {
+            name: _by_camera(metadata, key) for name, key in _PER_CAMERA.items()
+        }
+        for key, largest in _NUMBERS.items():
+            if key in metadata:
+                values[key] = _number(key, metadata[key], largest)
+        return MatcherFindings(**values)
+
+    def to_metadata(self) -> dict[str, Any]:
+        """The keys of the metadata; findings that are not known have none."""
+        content: dict[str, Any] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name in _PER_CAMERA:
+                content |= {_PER_CAMERA[item.name]: dict(value)} if value else {}
+            elif value is not None and value != item.default:
+                content[item.name] = value
+        return content
+
+    @property
+    def systematic_sigmas(self) -> tuple[float, float]:
+        """Rotation [rad] and translation [m] that all frames share, per axis."""
+        return self.systematic_rotation_rad, self.systematic_translation_m
+
+
+def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:
+    values = metadata.get(key) or {}
+    if not isinstance(values, dict):
+        raise CorrespondenceError(
+            f"metadata {key!r} must map camera names to numbers, found {values!r}"
+        )
+    for camera, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise CorrespondenceError(
+                f"metadata {key!r} must map camera names to numbers, found {values!r}",
+                camera=camera,
+            )
+    return {camera: _to_float(value) for camera, value in values.items()}
+
+
+def _number(key: str, value: Any, largest: float) -> float:
+    number = _to_float(value)
+    if isinstance(value, bool) or not (isinstance(number, float) and 0 <= number <= largest):
+        raise CorrespondenceError(
+            f"metadata {key!r} must be a number from 0 to {largest:.3g}, found {value!r}"
+        )
+    return number
+
+
+def _to_float(value: Any) -> Any:
+    """A whole number as a float, infinite if it is too large; anything else as it is."""
+    try:
+        return float(value) if isinstance(value, int) else value
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf

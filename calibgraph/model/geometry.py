@@ -1,0 +1,90 @@
+"""All of SE(3): the only module that inverts a transform.
+
+``T_a_b`` maps coordinates in b to coordinates in a. Files, results and public functions hold
+``T_camera_lidar``, a (4, 4) array; GTSAM's variables are ``T_lidar_camera``, a ``Pose3``.
+Tangent vectors are (rotation [rad], translation [m]).
+"""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def invert(T_a_b: Array) -> Array:
+    """(4, 4) T_b_a."""
+    return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
+
+
+def relative_transform(T_a_c: Array, T_b_c: Array) -> Array:
+    """(4, 4) T_a_b = T_a_c T_b_c^-1: of two cameras, from both extrinsics (paper, Eq. 3)."""
+    T_a_b: Array = T_a_c @ np.linalg.inv(T_b_c)
+    return T_a_b
+
+
+def to_T_lidar_camera(T_camera_lidar: Array) -> gtsam.Pose3:
+    """The graph's variable for an extrinsic."""
+    return gtsam.Pose3(T_camera_lidar).inverse()
+
+
+def to_T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
+    """(4, 4) the extrinsic for a variable of the graph."""
+    T_camera_lidar: Array = T_lidar_camera.inverse().matrix()
+    return T_camera_lidar
+
+
+def camera_center(T_camera_lidar: Array) -> Array:
+    """(3,) the camera's centre in the LiDAR frame [m]."""
+    center: Array = -T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3]
+    return center
+
+
+def point_in_lidar(T_camera_lidar: Array, point_camera_m: Array) -> Array:
+    """(3,) a point of the camera frame in the LiDAR frame [m]."""
+    point_lidar_m: Array = T_camera_lidar[:3, :3].T @ (point_camera_m - T_camera_lidar[:3, 3])
+    return point_lidar_m
+
+
+def angle_deg(R: Array) -> float:
+    """Angle of a (3, 3) rotation, degrees; accurate for small angles too."""
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return math.degrees(math.atan2(float(np.linalg.norm(axis)), float(np.trace(R)) - 1.0))
+
+
+def pose_difference(one: Array, two: Array) -> tuple[float, float]:
+    """Between two T_camera_lidar: the angle [deg] and the distance of the camera centres [cm]."""
+    meters = float(np.linalg.norm(camera_center(one) - camera_center(two)))
+    return angle_deg(one[:3, :3] @ two[:3, :3].T), 100 * meters
+
+
+def twist_between(T_camera_lidar: Array, reference: Array) -> Array:
+    """(6,) xi, rotation [rad] and translation [m], in T_camera_lidar = exp(xi) reference."""
+    step = gtsam.Pose3(relative_transform(T_camera_lidar, reference))
+    return np.asarray(gtsam.Pose3.Logmap(step))
+
+
+def pose_rows(camera: int) -> slice:
+    """The six rows of camera number ``camera`` in a joint vector or matrix of all cameras."""
+    return slice(6 * camera, 6 * camera + 6)
+
+
+def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
+    """(6, 6) covariance of xi in T_b_a = exp(xi) estimate, xi in b's axes.
+
+    Args:
+        joint: (6 N, 6 N) of all cameras.
+        a: index of the one camera.
+        b: index of the other camera.
+        T_b_a: the estimate, T_b_lidar T_a_lidar^-1.
+    """
+    # T_b_a = exp(xi_b) T_b (exp(xi_a) T_a)^-1 = exp(xi_b) exp(-Ad(T_b_a) xi_a) T_b_a.
+    jacobian = np.zeros((6, len(joint)))
+    jacobian[:, pose_rows(a)] = -gtsam.Pose3(T_b_a).AdjointMap()
+    jacobian[:, pose_rows(b)] = np.eye(6)
+    covariance: Array = jacobian @ joint @ jacobian.T
+    return covariance

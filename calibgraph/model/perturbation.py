@@ -1,0 +1,60 @@
+"""Perturbed initial guesses: the paper's protocol, T_init = T_delta T_GT."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+def perturb(
+    rig: Rig, *, rotation_deg: float, translation_m: float, seed: int = 0, uniform: bool = False
+) -> Rig:
+    """Displace every camera independently: T_camera_lidar becomes T_delta T_camera_lidar.
+
+    Args:
+        rig: its poses are displaced.
+        rotation_deg: the angle, about a random axis.
+        translation_m: the length, in a random direction.
+        seed: of the draws; cameras are drawn in the rig's order.
+        uniform: draw each of the six components uniformly within +- the value instead, the
+            rotation as Euler angles about the camera's x, y, z axes.
+
+    Raises:
+        ValueError: if an angle or length is out of range.
+    """
+    if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
+        raise ValueError(
+            f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "
+            f"and {translation_m} m"
+        )
+    rng = np.random.default_rng(seed)
+    draw = _uniform if uniform else _exact
+    poses = {
+        name: draw(rng, rotation_deg, translation_m) @ camera.T_camera_lidar
+        for name, camera in rig.cameras.items()
+    }
+    return rig.moved_to(poses)
+
+
+def _exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    axis, direction = rng.standard_normal((2, 3))
+    T = np.eye(4)
+    angle = np.radians(rotation_deg)
+    T[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    T[:3, 3] = translation_m * direction / np.linalg.norm(direction)
+    return T
+
+
+def _uniform(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    angles, shift = rng.uniform(-1.0, 1.0, (2, 3))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", rotation_deg * angles, degrees=True).as_matrix()
+    T[:3, 3] = translation_m * shift
+    return T

@@ -1,0 +1,209 @@
+"""The rig: one LiDAR, its cameras, their lenses, and what is known of where they are.
+
+``T_a_b`` maps coordinates in b to coordinates in a: ``p_camera = T_camera_lidar * p_lidar``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    model_validator,
+)
+
+from calibgraph.errors import RigError
+from calibgraph.files import write_yaml
+from factors import Lens
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-3
+"""Largest deviation of R^T R from the identity that is taken for rounded digits, not an error."""
+
+
+def rigid_transform(value: Any) -> Array:
+    """Check a 4x4 rigid transform and return it with its rounding errors removed.
+
+    Raises:
+        ValueError: if it is not 4x4, finite, with last row 0 0 0 1 and a rotation.
+    """
+    try:
+        T = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError("expected a 4x4 matrix of numbers") from error
+    if T.shape != (4, 4):
+        raise ValueError(f"expected a 4x4 matrix, found shape {T.shape}")
+    if not np.isfinite(T).all():
+        raise ValueError("the matrix holds values that are not finite")
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
+        raise ValueError(f"the last row must be 0 0 0 1, found {T[3].tolist()}")
+    deviation = np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max()
+    if deviation > ROUNDING:
+        raise ValueError(
+            f"the upper left 3x3 is not a rotation: R^T R differs from the identity by "
+            f"{deviation:.3g}; if its digits are rounded, write at least 4"
+        )
+    if np.linalg.det(T[:3, :3]) < 0:
+        raise ValueError("the upper left 3x3 has determinant -1: it mirrors; check the axes' signs")
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = u @ vt
+    T.setflags(write=False)
+    return T
+
+
+Transform = Annotated[
+    Array,
+    BeforeValidator(rigid_transform),
+    PlainSerializer(lambda T: T.tolist(), return_type=list),
+]
+
+
+def _checked_name(name: str) -> str:
+    """A camera's name is part of file names and messages.
+
+    Raises:
+        ValueError: if it cannot be.
+    """
+    if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,100}", name) or name in (".", ".."):
+        raise ValueError(
+            f"camera name {name!r}: expected 1 to 100 characters without slashes, and not a dot"
+        )
+    return name
+
+
+CameraName = Annotated[str, AfterValidator(_checked_name)]
+Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # stiffer ones hold solves still
+Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+class Intrinsics(_Model):
+    """Focal lengths and principal point [px]; pixel (0, 0) is the centre of the top-left pixel."""
+
+    fx: Positive
+    fy: Positive
+    cx: Finite
+    cy: Finite
+
+
+class Camera(_Model):
+    """One camera: its lens, its image size, and its pose guess (or truth, in a reference)."""
+
+    model: Literal["pinhole", "fisheye"] = "pinhole"
+    width_px: Size
+    height_px: Size
+    intrinsics_px: Intrinsics
+    distortion: tuple[Finite, ...] = ()
+    T_camera_lidar: Transform
+
+    @model_validator(mode="after")
+    def _lens_can_be_built(self) -> Self:
+        _ = self.lens
+        return self
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The lens model for projection."""
+        make = Lens.pinhole if self.model == "pinhole" else Lens.fisheye
+        return make(**self.intrinsics_px.model_dump(), distortion=self.distortion)
+
+    @property
+    def matrix_px(self) -> Array:
+        """(3, 3) the camera matrix K."""
+        k = self.intrinsics_px
+        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
+
+    def moved_to(self, T_camera_lidar: Array) -> Camera:
+        """The same camera with another pose."""
+        T = rigid_transform(T_camera_lidar)
+        return self.model_copy(update={"T_camera_lidar": T})
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with some fields changed, not checked; its lens is that of its own intrinsics."""
+        copy = super().model_copy(update=update, deep=deep)
+        if update and update.keys() - {"T_camera_lidar"}:
+            copy.__dict__.pop("lens", None)
+        return copy
+
+    def in_image(self, pixels_px: Array) -> NDArray[np.bool_]:
+        """Which of (n, 2) pixels lie on the image."""
+        size = np.array([self.width_px, self.height_px])
+        cells = np.floor(pixels_px + 0.5)  # pixel (0, 0) is the centre of the top-left cell
+        return np.asarray(((cells >= 0) & (cells < size)).all(axis=1))
+
+
+class RelativePose(_Model):
+    """Independent knowledge of camera b in camera a: stereo calibration, CAD, Kalibr."""
+
+    a: str
+    b: str
+    T_a_b: Transform
+    rotation_sigma_rad: Sigma
+    translation_sigma_m: Sigma
+
+
+class Rig(_Model):
+    """A LiDAR and its cameras, in a fixed order."""
+
+    format: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
+    lidar: str = "lidar"
+    cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
+    relative_poses: tuple[RelativePose, ...] = ()
+
+    @model_validator(mode="after")
+    def _relative_poses_name_cameras(self) -> Self:
+        for index, pair in enumerate(self.relative_poses):
+            for name in (pair.a, pair.b):
+                if name not in self.cameras:
+                    raise ValueError(
+                        f"relative_poses[{index}] names camera {name!r}; the rig has "
+                        f"{', '.join(self.cameras)}"
+                    )
+            if pair.a == pair.b:
+                raise ValueError(f"relative_poses[{index}] relates camera {pair.a!r} to itself")
+        return self
+
+    @property
+    def T_camera_lidar(self) -> dict[str, Array]:
+        """Each camera's (4, 4) transform: p_camera = T_camera_lidar * p_lidar."""
+        return {name: camera.T_camera_lidar for name, camera in self.cameras.items()}
+
+    def moved_to(self, T_camera_lidar: Mapping[str, Array]) -> Rig:
+        """The same rig with other camera poses.
+
+        Raises:
+            RigError: if a camera is not of this rig.
+        """
+        for name in T_camera_lidar:
+            if name not in self.cameras:
+                raise RigError(
+                    f"camera {name!r} is not in the rig, which has "
+                    f"{', '.join(map(repr, self.cameras))}",
+                    camera=name,
+                )
+        cameras = {
+            name: camera.moved_to(T_camera_lidar[name]) if name in T_camera_lidar else camera
+            for name, camera in self.cameras.items()
+        }
+        return self.model_copy(update={"cameras": cameras})
+
+    def save(self, path: Path | str) -> None:
+        """Write the rig file."""
+        write_yaml(Path(path), self.model_dump())

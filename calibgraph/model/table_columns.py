@@ -1,0 +1,108 @@
+"""The columns of a correspondence table on disk: their names and types, and the writer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.files import write_atomically
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from calibgraph.model.correspondences import Correspondences
+
+TABLE_FORMAT = "calibgraph-correspondences/1"
+
+COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
+INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+
+OPTIONAL_WHOLE = ("stamp_ns", "point_index")
+_WHOLE = ("frame", *OPTIONAL_WHOLE)
+_REQUIRED = ("camera", "frame", *COORDINATES)
+_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION)
+_TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
+
+
+def save_correspondences(table: Correspondences, path: Path) -> None:
+    """Write a table as Parquet, or as CSV if the name ends in .csv, atomically."""
+    from pyarrow import csv, parquet
+
+    arrow = to_arrow(table)
+    if path.suffix == ".csv":
+        strings = arrow.set_column(0, "camera", arrow["camera"].cast("string"))
+        write_atomically(path, lambda part: csv.write_csv(strings, part))
+    else:
+        write_atomically(path, lambda part: parquet.write_table(arrow, part))
+
+
+def to_arrow(table: Correspondences) -> pa.Table:
+    """The table in the file format's columns, its metadata in the schema."""
+    import pyarrow as pa
+
+    columns: dict[str, Any] = {
+        "camera": pa.DictionaryArray.from_arrays(
+            table.camera_index, pa.array(table.cameras, pa.string())
+        ),
+        "frame": table.frame,
+        **dict(zip(COORDINATES[:2], table.pixels_px.T, strict=True)),
+        **dict(zip(COORDINATES[2:], table.points_lidar_m.T, strict=True)),
+        "confidence": table.confidence,
+    }
+    optional = {name: getattr(table, name) for name in OPTIONAL_WHOLE}
+    columns |= {name: column for name, column in optional.items() if column is not None}
+    if table.information_px is not None:
+        columns |= dict(zip(INFORMATION, table.information_px.T, strict=True))
+    metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(table.metadata)}
+    return pa.table(columns).replace_schema_metadata(metadata)
+
+
+def check_schema(schema: pa.Schema) -> None:
+    """Whether a table has the columns and the format of the file, each column of a right type.
+
+    Raises:
+        CorrespondenceError: with the first thing that is wrong.
+    """
+    try:
+        types = [(field.name, str(field.type)) for field in schema]
+    except UnicodeDecodeError as error:
+        raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
+    names = [name for name, _ in types]
+    missing = [name for name in _REQUIRED if name not in names]
+    unknown = [name for name in names if name not in _COLUMNS]
+    partial = [name for name in INFORMATION if name in names]
+    if missing:
+        raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
+    if unknown:
+        raise CorrespondenceError(f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
+    if len(set(names)) < len(names):
+        raise CorrespondenceError(f"has a column twice: {names}; keep one")
+    if partial and len(partial) < len(INFORMATION):
+        raise CorrespondenceError(f"has only {partial} of the columns {list(INFORMATION)}")
+    form = (schema.metadata or {}).get(b"format", TABLE_FORMAT.encode()).decode("utf-8", "replace")
+    if form != TABLE_FORMAT:
+        raise CorrespondenceError(f"has the format {form!r}, expected {TABLE_FORMAT!r}")
+    for field in schema:
+        _check_type(field)
+
+
+def _check_type(field: pa.Field) -> None:
+    """Whether a column's type is a plain one, whose size in memory is that of the data.
+
+    Of run-end encoded values, say, a few bytes could stand for any number of rows.
+    """
+    from pyarrow import types
+
+    if types.is_null(field.type):
+        raise CorrespondenceError(f"column {field.name!r} is empty; fill in or drop it")
+    if field.name == "camera":
+        named = field.type.value_type if types.is_dictionary(field.type) else field.type
+        kind, right = "text", str(named) in _TEXT or types.is_integer(named)
+    elif field.name in _WHOLE:
+        kind, right = "whole numbers", types.is_integer(field.type)
+    else:
+        kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
+    if not right:
+        raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")

@@ -1,0 +1,58 @@
+"""What ``--json`` prints: results as plain values on stdout, for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from calibgraph.model.calibration import Calibration
+
+
+def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
+    """A result as plain values: degrees, centimetres and pixels, named in every key."""
+    cameras = {}
+    for name, T in result.T_camera_lidar.items():
+        residuals = result.residuals.get(name)
+        cameras[name] = {
+            "T_camera_lidar": T.tolist(),
+            "verdict": result.camera_verdicts[name].status,
+            "reasons": list(result.camera_verdicts[name].reasons),
+            **_sigmas(result, name),
+            "residuals": None if residuals is None else vars(residuals),
+            "weaknesses": list(result.weaknesses.get(name, ())),
+            "prior_share": result.prior_share.get(name),
+            "counts": result.counts[name],
+        }
+    return {
+        "verdict": result.verdict.status,
+        "reasons": list(result.verdict.reasons),
+        "cameras": cameras,
+        "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
+        "timings_s": result.timings_s,
+        "files": [str(path) for path in written],
+    }
+
+
+def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | None]:
+    """Of a camera or a pair: about and along x, y, z."""
+    sigmas = result.sigmas(name)
+    return {
+        "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
+        "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
+    }
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    print(json.dumps(finite(content), indent=2, allow_nan=False))
+
+
+def finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by null."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,102 @@
+"""One point, worked through by the conventions, step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.model.geometry import invert, point_in_lidar
+from calibgraph.model.rig import Camera
+from calibgraph.report.frame_errors import Errors
+
+Array = NDArray[np.float64]
+
+_DISTANCE_M = 10.0
+
+
+@dataclass(frozen=True)
+class Worked:
+    """One point from the LiDAR to the pixel, in lines of text.
+
+    Attributes:
+        matrix: the rows of T_camera_lidar.
+        steps: the calculation.
+        inverse: the static transform of ROS TF, from lidar to camera_optical.
+        origin: which point it is.
+    """
+
+    matrix: str
+    steps: str
+    inverse: str
+    origin: str
+
+
+def worked_point(camera: Camera, errors: Errors | None) -> Worked:
+    """Work through the used correspondence nearest to 10 m, or a point on the optical axis.
+
+    Args:
+        camera: lens and pose.
+        errors: of its correspondences at that pose.
+    """
+    T = camera.T_camera_lidar
+    used = None if errors is None else errors.select(errors.inside)
+    if used is None or not len(used.frame):
+        point = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M]))
+        origin, matched = "a point 10 m ahead on the optical axis", ""
+    else:
+        row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
+        point, pixel = used.points_lidar_m[row], used.pixels_px[row]
+        origin = f"a correspondence of frame {used.frame[row]}"
+        matched = (
+            f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
+            f"residual {used.sizes_px[row]:.2f} px"
+        )
+    return Worked(_matrix(T), _steps(camera, point) + matched, _inverse(T), origin)
+
+
+def _steps(camera: Camera, point: Array) -> str:
+    T = camera.T_camera_lidar
+    turned = T[:3, :3] @ point
+    seen = turned + T[:3, 3]
+    pixel = camera.lens.project(seen[None])[0][0]
+    return (
+        f"p_lidar                  = {_vector(point)} m\n"
+        f"R p_lidar                = {_vector(turned)} m\n"
+        f"p_camera = R p_lidar + t  = {_vector(seen)} m\n"
+        f"{_through_the_lens(camera, seen)}\n"
+        f"projected pixel (u, v)   = ({pixel[0]:.2f}, {pixel[1]:.2f}) px"
+    )
+
+
+def _through_the_lens(camera: Camera, seen: Array) -> str:
+    """How p_camera becomes a pixel: the formula, for the lens that has a short one."""
+    k = camera.intrinsics_px
+    if camera.model == "pinhole" and not any(camera.distortion):
+        x, y, z = seen
+        return (
+            f"u = fx x/z + cx          = {k.fx:.3f} * {x:.3f} / {z:.3f} + {k.cx:.3f}\n"
+            f"v = fy y/z + cy          = {k.fy:.3f} * {y:.3f} / {z:.3f} + {k.cy:.3f}"
+        )
+    coefficients = ", ".join(f"{c:g}" for c in camera.distortion)
+    return f"lens: {camera.model}, distortion {coefficients}"
+
+
+def _vector(values: Array) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"
+
+
+def _matrix(T: Array) -> str:
+    return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
+
+
+def _inverse(T: Array) -> str:
+    """Translation and quaternion of T_lidar_camera."""
+    inverse = invert(T)
+    x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+    return (
+        f"translation x y z   = {' '.join(f'{v:.6f}' for v in inverse[:3, 3])} m\n"
+        f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
+    )

@@ -1,0 +1,166 @@
+"""Cluster-robust covariance: matches of one frame share their errors, frames do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.factor_graph import values_of
+from factors import ProjectionBlock
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 5
+"""With fewer frames their scatter says too little to print a number."""
+
+PSEUDO_FRAMES = 8.0
+"""Frames that the scatter along each principal direction counts for again. A covariance of six
+numbers from few frames is too small for their joint error (its inverse, by (F - 1) / (F - 8) for F
+frames); with these it is right from 5 frames on."""
+
+_FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
+_STEP = 1e-5  # rad and m: of the central differences of the gradient
+
+
+def cluster_robust_covariance(
+    blocks: Mapping[str, ProjectionBlock],
+    frames: Mapping[str, NDArray[np.int64]],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    T_camera_lidar: Mapping[str, Array],
+    *,
+    gate_hessian: Mapping[str, Array] | None = None,
+) -> Array | None:
+    """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few) H^-1``.
+
+    g_f is the gradient of everything that frame f says, over all cameras jointly; ``few`` is the
+    allowance for few frames, see :func:`with_pseudo_frames`. H is the true
+    Hessian of the robust cost (by differences of its exact gradient), the priors' included: the
+    iteratively reweighted one would be too large, and the errors too small.
+
+    Args:
+        blocks: per camera with correspondences, the inliers of the solution.
+        frames: per camera, the sorted frame number of each of them.
+        pose_graph: the priors and relative poses.
+        T_camera_lidar: the solution, all cameras.
+        gate_hessian: per camera, what the gate's moving with the solution adds to H.
+
+    Returns:
+        (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
+        xi = (rotation [rad], translation [m]) in each camera's axes. None with fewer than
+        MIN_FRAMES frames, or where H is singular.
+    """
+    cameras = list(T_camera_lidar)
+    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values()]))
+    if len(numbers) < MIN_FRAMES:
+        return None
+    size = 6 * len(cameras)
+    hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
+    gradients = np.zeros((len(numbers), size))
+    for name, block in blocks.items():
+        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
+        hessian[rows, rows] += (gate_hessian or {}).get(name, 0.0)
+        own, starts = np.unique(frames[name], return_index=True)
+        edges = np.append(starts, len(frames[name]))
+        sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
+        gradients[np.searchsorted(numbers, own), rows] = sums.gradient
+    values, vectors = np.linalg.eigh(hessian)
+    if values[0] <= _FREE * values[-1]:
+        return None
+    inverse = (vectors / values) @ vectors.T
+    frames_of = np.full(size, float(len(numbers)))
+    scatter = with_pseudo_frames(gradients.T @ gradients, hessian, frames_of)
+    covariance: Array = inverse @ scatter @ inverse
+    return covariance
+
+
+def with_pseudo_frames(scatter: Array, hessian: Array, frames: Array) -> Array:
+    """Add what few frames leave unsaid to the scatter of their gradients.
+
+    Along each eigenvector of the Hessian the scatter is known from all frames; its correlations
+    between eigenvectors, much less well. So the scatter without correlations counts as
+    PSEUDO_FRAMES frames more. In 200 draws the normalised squared error over 6 is 0.8 to 1.0 with
+    5 to 30 frames, with errors shared by a frame or not.
+
+    Args:
+        scatter: (n, n) sum over frames of the outer products of their gradients.
+        hessian: (n, n).
+        frames: (n,) how many frames each row comes from.
+    """
+    vectors = np.linalg.eigh(hessian)[1]
+    each = np.sqrt(PSEUDO_FRAMES / np.maximum(frames, 1.0))
+    along = np.einsum("ik,ij,jk->k", vectors, scatter * np.outer(each, each), vectors)
+    allowed: Array = scatter + (vectors * along) @ vectors.T
+    return allowed
+
+
+def data_sigmas(
+    blocks: Mapping[str, ProjectionBlock],
+    pose_graph: gtsam.NonlinearFactorGraph,
+    T_camera_lidar: Mapping[str, Array],
+) -> Array:
+    """What the data could tell at best, if every correspondence were independent.
+
+    A lower bound of the true uncertainty: it shows the directions that the data do not determine.
+
+    Args:
+        blocks: per camera with correspondences.
+        pose_graph: measured relative poses; no priors.
+        T_camera_lidar: the solution, all cameras.
+
+    Returns:
+        (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
+        infinite where nothing is known.
+    """
+    cameras = list(T_camera_lidar)
+    hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
+    for name, block in blocks.items():
+        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
+        hessian[rows, rows] += sums.hessian
+    units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
+    free = values < _FREE
+    variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
+    loose = (vectors[:, free] ** 2).sum(axis=1) > _FREE
+    return np.sqrt(np.where(loose, np.inf, variances)).reshape(-1, 6)
+
+
+def pose_hessian(
+    graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
+) -> Array:
+    """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
+    values = values_of(cameras, T_camera_lidar)
+    hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    keys = list(values.keys())
+    for index in range(graph.size()):
+        factor = graph.at(index).linearize(values)
+        A = factor.jacobian()[0]
+        rows = np.concatenate([6 * keys.index(key) + np.arange(6) for key in list(factor.keys())])
+        hessian[np.ix_(rows, rows)] += A.T @ A
+    return hessian
+
+
+def robust_hessian(block: ProjectionBlock, pose: gtsam.Pose3) -> Array:
+    """(6, 6) derivative of the gradient of half the robust cost, by central differences.
+
+    Where the robust cost is not convex the reweighted Hessian, which always is, stands in.
+
+    Args:
+        block: correspondences of one camera.
+        pose: ``T_lidar_camera``, in whose tangent the Hessian is.
+    """
+    steps = np.eye(6) * _STEP
+    rows = [
+        block.sums(pose.retract(step)).gradient - block.sums(pose.retract(-step)).gradient
+        for step in steps
+    ]
+    hessian = np.array(rows) / (2 * _STEP)
+    hessian = (hessian + hessian.T) / 2
+    if np.linalg.eigvalsh(hessian)[0] > 0:
+        return hessian
+    return block.sums(pose).hessian

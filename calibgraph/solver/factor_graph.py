@@ -1,0 +1,195 @@
+"""The factor graph: one small graph per kind of factor; ``objective_graph`` is all of Eq. 5.
+
+Its variables are ``T_lidar_camera``, one ``Pose3`` per camera: with this direction GTSAM's stock
+prior and between factors are the paper's terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.config import Config, Terms
+from calibgraph.model.geometry import relative_transform, to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.rig import RelativePose, Rig
+from factors import ProjectionBlock
+from factors import block_factor as block_factor
+from factors import camera_prior_factor as camera_prior_factor
+from factors import projection_factor as projection_factor
+from factors import relative_pose_factor as relative_pose_factor
+from factors import relative_prior_factor as relative_prior_factor
+
+Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 200
+RELATIVE_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where Levenberg-Marquardt stopped.
+
+    Attributes:
+        T_camera_lidar: per camera, (4, 4).
+        cost: the paper's objective there (twice GTSAM's error).
+        iterations: of LM.
+        converged: whether it stopped by its tolerance.
+    """
+
+    T_camera_lidar: dict[str, Array]
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def pose_key(cameras: Sequence[str], name: str) -> int:
+    """GTSAM key of a camera's variable ``T_lidar_camera``."""
+    return int(gtsam.symbol("x", cameras.index(name)))
+
+
+def projection_graph(
+    cameras: Sequence[str], blocks: Mapping[str, ProjectionBlock]
+) -> gtsam.NonlinearFactorGraph:
+    """The reprojection term: one lossless block factor per camera that has correspondences."""
+    return _graph(block_factor(pose_key(cameras, name), block) for name, block in blocks.items())
+
+
+def prior_graph(
+    cameras: Sequence[str], T_hat_camera_lidar: Mapping[str, Array], *, weight: float
+) -> gtsam.NonlinearFactorGraph:
+    """The per-camera priors, lambda |log(T_hat^-1 T)|^2; empty if the weight is zero."""
+    return _graph(
+        camera_prior_factor(pose_key(cameras, name), T, weight=weight)
+        for name, T in T_hat_camera_lidar.items()
+        if weight > 0
+    )
+
+
+def relative_prior_graph(
+    cameras: Sequence[str],
+    T_hat_camera_lidar: Mapping[str, Array],
+    *,
+    weight: float,
+    pairs: Literal["spanning", "all"],
+) -> gtsam.NonlinearFactorGraph:
+    """The relative-pose priors, mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, of Stage-1 estimates.
+
+    Over each camera with the next one (a spanning set), or over all pairs.
+    """
+    choose = pairwise if pairs == "spanning" else _all_pairs
+    return _graph(
+        relative_prior_factor(
+            pose_key(cameras, one),
+            pose_key(cameras, two),
+            relative_transform(T_hat_camera_lidar[two], T_hat_camera_lidar[one]),
+            weight=weight,
+        )
+        for one, two in choose(T_hat_camera_lidar)
+        if weight > 0
+    )
+
+
+def _all_pairs(names: Iterable[str]) -> Iterable[tuple[str, str]]:
+    return combinations(names, 2)
+
+
+def relative_pose_graph(
+    cameras: Sequence[str], relative_poses: Iterable[RelativePose]
+) -> gtsam.NonlinearFactorGraph:
+    """Independently known relative poses of the rig, with their own sigmas."""
+    return _graph(
+        relative_pose_factor(
+            pose_key(cameras, pair.a),
+            pose_key(cameras, pair.b),
+            pair.T_a_b,
+            rotation_sigma_rad=pair.rotation_sigma_rad,
+            translation_sigma_m=pair.translation_sigma_m,
+        )
+        for pair in relative_poses
+    )
+
+
+def objective_graph(
+    rig: Rig,
+    blocks: Mapping[str, ProjectionBlock],
+    T_hat: Mapping[str, Array],
+    config: Config,
+    terms: Terms,
+) -> gtsam.NonlinearFactorGraph:
+    """The whole objective (paper, Eq. 5), and the measured relative poses of the rig.
+
+    Its error is half of the paper's cost. ``print(graph)`` lists every factor.
+
+    Args:
+        rig: its cameras are the variables; its ``relative_poses`` are measurements, not a term of
+            the paper.
+        blocks: per camera with correspondences; its scale and sigma are those of the loss.
+        T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar.
+        config: lambda, mu and the pairs of the relative prior.
+        terms: which terms of Eq. 5 take part; ``stage1`` has none but the priors.
+    """
+    cameras = list(rig.cameras)
+    lambda_, mu = config.prior_weight, config.relative_prior_weight
+    if terms == "reprojection":
+        lambda_ = mu = 0.0
+    if terms in ("priors", "stage1"):
+        blocks = {}
+    return joined(
+        # sum_i sum_k rho(|w_ik (u_ik - pi_i(T_i, p_k))|^2)
+        projection_graph(cameras, blocks),
+        # measured relative poses, each with its own sigmas
+        relative_pose_graph(cameras, rig.relative_poses),
+        # lambda sum_i |log(T_hat_i^-1 T_i)|^2
+        prior_graph(cameras, T_hat, weight=lambda_),
+        # mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, over pairs of cameras
+        relative_prior_graph(cameras, T_hat, weight=mu, pairs=config.relative_prior_pairs),
+    )
+
+
+def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """One graph with the factors of all."""
+    graph = gtsam.NonlinearFactorGraph()
+    for part in graphs:
+        graph.push_back(part)
+    return graph
+
+
+def values_of(cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
+    """GTSAM values of the extrinsics."""
+    values = gtsam.Values()
+    for name in cameras:
+        values.insert(pose_key(cameras, name), to_T_lidar_camera(T_camera_lidar[name]))
+    return values
+
+
+def optimize(
+    graph: gtsam.NonlinearFactorGraph,
+    cameras: Sequence[str],
+    T_camera_lidar: Mapping[str, Array],
+) -> Optimum:
+    """Minimize a graph by Levenberg-Marquardt from the given extrinsics."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(MAX_ITERATIONS)
+    parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
+    parameters.setAbsoluteErrorTol(0.0)
+    start = values_of(cameras, T_camera_lidar)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
+    found = optimizer.optimize()
+    transforms = {
+        name: to_T_camera_lidar(found.atPose3(pose_key(cameras, name))) for name in cameras
+    }
+    iterations = int(optimizer.iterations())
+    return Optimum(transforms, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)

@@ -1,0 +1,176 @@
+"""The objective of the joint refinement (paper, Eq. 5), its minimum, and its outliers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.config import Config, Terms
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.factor_graph import Optimum, objective_graph, optimize
+from calibgraph.solver.residual_scale import ResidualScale
+from factors import ProjectionBlock
+
+Array = NDArray[np.float64]
+Transforms = dict[str, Array]
+"""Per camera, (4, 4) T_camera_lidar."""
+Scales = dict[str, ResidualScale]
+
+_MAX_RESCALINGS = 10
+_CONVERGED = 0.01  # relative change of the spread
+_NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px to 1 px
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Everything that Eq. 5 sums over.
+
+    Attributes:
+        rig: its cameras are the unknowns; its ``relative_poses`` are measurements.
+        blocks: per camera that has enough correspondences.
+        T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: what the priors pull to.
+        config: the weights lambda and mu, the loss and its scales.
+        terms: which terms of Eq. 5 are used.
+        gate_hessian: of blocks without outliers, see ``CameraBlock.gate_hessian``; else empty.
+    """
+
+    rig: Rig
+    blocks: dict[str, CameraBlock]
+    T_hat: Transforms
+    config: Config
+    terms: Terms
+    gate_hessian: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The unknowns, in the rig's order."""
+        return tuple(self.rig.cameras)
+
+    @property
+    def uses_correspondences(self) -> bool:
+        """Whether the terms include the reprojection term."""
+        return self.terms in ("full", "reprojection")
+
+    def graph(self, scales: Scales) -> gtsam.NonlinearFactorGraph:
+        """Eq. 5 as a GTSAM graph that can be printed.
+
+        Args:
+            scales: of the residuals; the reprojection term has the cameras that are named.
+        """
+        return objective_graph(
+            self.rig, self.scaled_blocks(scales), self.T_hat, self.config, self.terms
+        )
+
+    @cached_property
+    def pose_graph(self) -> gtsam.NonlinearFactorGraph:
+        """All terms but the reprojection term: priors and measured relative poses."""
+        return self.graph({})
+
+    def scaled_blocks(self, scales: Scales) -> dict[str, ProjectionBlock]:
+        """The correspondences with their loss, in units of the residuals' sigma."""
+        return {name: self.blocks[name].scaled(scale) for name, scale in scales.items()}
+
+    def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
+        """The same objective with other (fewer) correspondences."""
+        return replace(self, blocks=dict(blocks))
+
+    def data_only(self) -> Objective:
+        """The reprojection term alone, of the cameras that have correspondences."""
+        rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
+        return replace(self, rig=rig, T_hat={})
+
+    def minimize(self, start: Transforms, scales: Scales) -> Optimum:
+        """The minimum by Levenberg-Marquardt, with the residuals' scales held."""
+        if self.terms == "stage1":
+            return Optimum(start, math.nan, 0, True)
+        return optimize(self.graph(scales), self.cameras, start)
+
+    def minimize_with_scale(self, start: Transforms) -> tuple[Transforms, Scales]:
+        """Pass 1. With `auto` scales: minimize and re-measure the spread until it is constant.
+
+        A camera whose residuals then have no core, with a spread far above that of good matches, is
+        either far from the minimum or has few good matches. Its scale is narrowed step by step
+        (graduated non-convexity), which leads to where matches are densest, until a core appears.
+        """
+        T, scales = self._alternate(start)
+        limit_px = self.config.pnp_threshold_px
+        left = {name for name, scale in scales.items() if scale.sigma_px > limit_px}
+        if not left or not self.uses_correspondences or self.config.loss_scale_px is not None:
+            return T, scales
+        narrowed, tried, found = scales, T, set[str]()
+        for _ in range(_NARROWINGS):
+            narrowed = narrowed | {name: narrowed[name].narrowed(_NARROWING) for name in left}
+            tried = self.minimize(tried, narrowed).T_camera_lidar
+            measured = {name: self.blocks[name].scale(tried[name], self.config) for name in left}
+            cores = {name for name in left if measured[name].sigma < narrowed[name].sigma}
+            narrowed = narrowed | {name: measured[name] for name in cores}
+            left, found = left - cores, found | cores
+            if not left:
+                break
+        if not found:
+            return T, scales
+        return self._alternate(tried | {name: T[name] for name in left})
+
+    def _alternate(self, start: Transforms) -> tuple[Transforms, Scales]:
+        """Minimize and measure the scales in turn until these are constant."""
+        T, scales = start, self.scales_at(start)
+        for _ in range(_MAX_RESCALINGS):
+            T = self.minimize(T, scales).T_camera_lidar
+            before, scales = scales, self.scales_at(T)
+            ratios = [scales[name].sigma / before[name].sigma for name in scales]
+            if all(abs(ratio - 1.0) < _CONVERGED for ratio in ratios):
+                break
+        return T, scales
+
+    def scales_at(self, T_camera_lidar: Transforms) -> Scales:
+        """The configured scales, or those of the residuals' own spread at some extrinsics.
+
+        Raises:
+            CorrespondenceError: if a camera has all its correspondences behind it.
+        """
+        scales = {
+            name: block.scale(T_camera_lidar[name], self.config)
+            for name, block in self.blocks.items()
+        }
+        for name, scale in scales.items():
+            if math.isinf(scale.sigma_px):
+                raise CorrespondenceError(
+                    f"camera {name!r}: all its correspondences are behind it at the estimate; do "
+                    "its guess and the relative_poses hold (p_camera = T_camera_lidar * p_lidar, "
+                    "p_a = T_a_b * p_b), and are the cameras' names right?",
+                    camera=name,
+                )
+        return scales
+
+    def without_outliers(self, T_camera_lidar: Transforms, scales: Scales) -> Objective:
+        """The objective without the correspondences beyond the gate tau (paper, section 3.4).
+
+        Raises:
+            CorrespondenceError: if a camera is left with too few.
+        """
+        inliers = {
+            name: block.without_outliers(T_camera_lidar[name], scales[name])
+            for name, block in self.blocks.items()
+        }
+        for name, left in inliers.items():
+            if len(left.frame) < MIN_MATCHES:
+                raise CorrespondenceError(
+                    f"camera {name!r}: only {len(left.frame)} of {len(self.blocks[name].frame)} "
+                    f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at "
+                    f"least {MIN_MATCHES} are needed; the matches do not agree on a pose, or the "
+                    "gate is too narrow",
+                    camera=name,
+                )
+        at_edge = {
+            name: block.gate_hessian(T_camera_lidar[name], scales[name])
+            for name, block in self.blocks.items()
+        }
+        return replace(self.with_blocks(inliers), gate_hessian=at_edge)

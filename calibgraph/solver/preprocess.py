@@ -1,0 +1,174 @@
+"""The paper's correspondence preprocessing (section 3.4), with a count at every filter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.io.correspondence_tables import parts_of_file
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.rig import Rig
+from calibgraph.solver.grid import best_in_cell
+
+Array = NDArray[np.float64]
+
+FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
+"""The stages at which a camera's correspondences are counted, in order."""
+
+_MERGED_ROWS = 250_000  # rows of parts that may wait to be merged, about 15 to 25 MB
+
+
+@dataclass(frozen=True)
+class Preprocessed:
+    """Correspondences fit for the graph, sorted by camera and frame.
+
+    Attributes:
+        table: the kept correspondences.
+        counts: per camera, how many are left after each of FILTERS.
+    """
+
+    table: Correspondences
+    counts: dict[str, dict[str, int]]
+
+
+def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
+    """Depth filter, confidence filter, best match per grid cell, cap per camera and frame.
+
+    The table may be a file larger than memory, which is read in parts: memory is needed for one row
+    group of it and for what the grid keeps, at most one match of each cell, camera and frame, in
+    whatever order the rows are. A CSV file is read whole.
+
+    Raises:
+        CorrespondenceError: if the table names a camera that the rig does not have.
+        FileError: as of :func:`calibgraph.load_correspondences`.
+    """
+    parts = [table] if isinstance(table, Correspondences) else parts_of_file(Path(table))
+    return preprocess_parts(rig, parts, config)
+
+
+def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config) -> Preprocessed:
+    """The same of a table that comes in parts, at least one."""
+    kept: list[Correspondences] = []
+    counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
+    settled = 0
+    for part in parts:
+        best, passed = _filtered(rig, part, config)
+        counts[:3] += passed
+        kept.append(best)
+        if sum(map(len, kept)) > 2 * settled + _MERGED_ROWS:
+            kept = [_merged(rig, kept, config)]
+            settled = len(kept[0])
+    table = _merged(rig, kept, config)
+    camera = _places(rig, table)
+    counts[3] = np.bincount(camera, minlength=len(rig.cameras))
+    rows = np.flatnonzero(_capped(table, camera, config))
+    counts[4] = np.bincount(camera[rows], minlength=len(rig.cameras))
+    order = rows[np.lexsort((table.frame[rows], camera[rows]))]
+    named = {
+        name: dict(zip(FILTERS, column, strict=True))
+        for name, column in zip(rig.cameras, counts.T.tolist(), strict=True)
+    }
+    return Preprocessed(table.select(order), named)
+
+
+def _filtered(
+    rig: Rig, table: Correspondences, config: Config
+) -> tuple[Correspondences, NDArray[np.int64]]:
+    """What of a part may be kept; (3, N) per camera its rows: given, projectable, confident."""
+    camera = _places(rig, table)
+    projectable = _projectable(rig, table, camera)
+    rows = np.flatnonzero(projectable & (table.confidence >= config.confidence_min))
+    passed = [np.bincount(c, minlength=len(rig.cameras))
+              for c in (camera, camera[projectable], camera[rows])]  # fmt: skip
+    confident = table.select(rows)
+    best = confident.select(best_in_cell(rig, confident, camera[rows], config))
+    return best, np.array(passed)
+
+
+def _merged(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
+    """The best of what is best in the parts, in the order of the table."""
+    if len(kept) == 1:
+        return kept[0]
+    table = concatenate(kept)
+    return table.select(best_in_cell(rig, table, _places(rig, table), config))
+
+
+def _places(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
+    """(n,) the place of each row's camera in the rig."""
+    for name in table.cameras:
+        if name not in rig.cameras:
+            raise CorrespondenceError(
+                f"camera {name!r} of the correspondences is not in the rig, which has "
+                f"{', '.join(map(repr, rig.cameras))}; give it the same name in both",
+                camera=name,
+            )
+    numbers = np.array([list(rig.cameras).index(name) for name in table.cameras], dtype=np.int64)
+    return numbers[table.camera_index] if len(table) else np.empty(0, np.int64)
+
+
+def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
+    keep = np.empty(len(table), dtype=np.bool_)
+    for place, model in enumerate(rig.cameras.values()):
+        rows, T = np.flatnonzero(camera == place), model.T_camera_lidar
+        keep[rows] = model.lens.project(table.points_lidar_m[rows] @ T[:3, :3].T + T[:3, 3])[1]
+    return keep
+
+
+def _capped(table: Correspondences, camera: NDArray[np.int64], config: Config) -> NDArray[np.bool_]:
+    """The most confident ``matches_max`` of each camera and frame."""
+    order = np.lexsort((-table.confidence, table.frame, camera))
+    starts = np.ones(len(order), dtype=np.bool_)
+    starts[1:] = (np.diff(camera[order]) != 0) | (np.diff(table.frame[order]) != 0)
+    first = np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
+    keep = np.empty(len(order), dtype=np.bool_)
+    keep[order] = np.arange(len(order)) - first < config.matches_max
+    return keep
+
+
+def sqrt_information(table: Correspondences, config: Config) -> Array | None:
+    """Whitening matrices of the residuals, w_k times the root of the information.
+
+    Returns:
+        (n, 3) entries (0,0), (0,1), (1,1) of upper triangular S with S^T S = w^2 I; None if every
+        weight is one and no information is given.
+    """
+    if table.information_px is None and not config.confidence_weights:
+        return None
+    if table.information_px is None:
+        root = np.tile([1.0, 0.0, 1.0], (len(table), 1))
+    else:
+        root = _upper_root(table.information_px)
+    if config.confidence_weights:  # the paper's w = sqrt(clip(c, 0.1, 1))
+        root *= np.sqrt(np.clip(table.confidence, 0.1, 1.0))[:, None]
+    return root
+
+
+def _upper_root(information: Array) -> Array:
+    """Upper triangular S with S^T S = I, row-wise; rank one gives s11 = 0 (or s00 = s01 = 0)."""
+    uu, uv, vv = information.T
+    s00 = np.sqrt(uu)
+    s01 = np.where(uu > 0, uv / np.where(uu > 0, s00, 1.0), 0.0)
+    s11 = np.sqrt(np.maximum(vv - s01**2, 0.0))
+    return np.stack([s00, s01, s11], axis=1)
+
+
+def constrained_error_px(residuals: Array, information: Array | None) -> Array:
+    """(n,) length of the residual along the directions that the match constrains [px].
+
+    The plain reprojection error where no information is given; for an edge, the distance from it.
+    """
+    if information is None:
+        x, y = residuals.T
+        return np.asarray(np.sqrt(x * x + y * y))  # hypot takes ten times as long
+    uu, uv, vv = information.T
+    largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
+    x, y = residuals.T
+    squared = uu * x**2 + 2 * uv * x * y + vv * y**2
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0) / largest))

@@ -1,0 +1,106 @@
+"""How large residuals are: the robust spread, and the scales of loss and gate read from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.config import Config
+
+Array = NDArray[np.float64]
+
+CAUCHY_SCALE_SIGMAS = 2.385
+"""Robust scale in standard deviations: 95 % efficiency on Gaussian noise with Cauchy's loss."""
+
+GATE_SIGMAS = 3.035
+"""Gate in standard deviations: 99 % of two-dimensional Gaussian errors lie inside."""
+
+MIN_SIGMA_PX = 0.05
+"""Spread below which `auto` does not shrink: noise-free data would have none."""
+
+_START_QUANTILE, _START_FACTOR = 0.2, 1.762  # that quantile of a Rayleigh law, to its median
+_HALF = 0.5
+_CUT = 4.0  # medians: inliers lie below, in one and in two dimensions
+
+
+@dataclass(frozen=True)
+class ResidualScale:
+    """How large the residuals of one camera are taken to be.
+
+    Attributes:
+        sigma: what whitened residuals are divided by, so that they have unit variance: 1 with a
+            fixed loss scale (the paper's objective), else their robust spread.
+        loss_scale: delta, of the whitened residual before that division.
+        gate_px: tau.
+        sigma_px: robust spread of the unweighted residuals, per axis; infinite if there are none;
+            NaN if it was not measured, because loss and gate are configured.
+    """
+
+    sigma: float
+    loss_scale: float
+    gate_px: float
+    sigma_px: float
+
+    def narrowed(self, factor: float) -> ResidualScale:
+        """With a smaller loss: so many times the sigma and the loss's scale."""
+        return replace(self, sigma=factor * self.sigma, loss_scale=factor * self.loss_scale)
+
+
+def scale_from(sigma_px: float, spread: float, config: Config) -> ResidualScale:
+    """The configured scales, or those of the residuals' spread.
+
+    Args:
+        sigma_px: robust spread of the unweighted residuals.
+        spread: robust spread of the whitened residuals.
+        config: may fix either scale.
+    """
+    fixed = config.loss_scale_px
+    return ResidualScale(
+        sigma=spread if fixed is None else 1.0,
+        loss_scale=CAUCHY_SCALE_SIGMAS * spread if fixed is None else fixed,
+        gate_px=config.gate_px or GATE_SIGMAS * max(sigma_px, MIN_SIGMA_PX),
+        sigma_px=sigma_px,
+    )
+
+
+def robust_spread(values: Array) -> float:
+    """The median of the values that belong together, among others that may be the majority.
+
+    Starts from a low quantile and takes the median of what lies within _CUT of it until it stands
+    still: clean values give their median; a broad background, up to three quarters of all, hardly
+    moves it; and values without a core give a large spread, since their median then grows.
+    """
+    if not len(values):
+        return math.inf
+    ordered = np.sort(values)
+
+    def quantile_below(limit: float, share: float) -> float:
+        last = int(np.searchsorted(ordered, limit, side="right")) - 1
+        if last < 0:
+            return math.nan
+        place = share * last
+        low = int(place)
+        below, above = ordered[low], ordered[min(low + 1, last)]
+        return float(below + (place - low) * (above - below))
+
+    return settled_spread(quantile_below)
+
+
+def settled_spread(quantile_below: Callable[[float, float], float]) -> float:
+    """The iteration of :func:`robust_spread`.
+
+    Args:
+        quantile_below: quantile, of a given share, of the values up to a limit; NaN without any.
+    """
+    spread = _START_FACTOR * quantile_below(math.inf, _START_QUANTILE)
+    for _ in range(100):
+        before, spread = spread, quantile_below(_CUT * spread, _HALF)
+        if math.isnan(spread):
+            return before
+        if abs(spread - before) <= 1e-6 * before:
+            break
+    return spread

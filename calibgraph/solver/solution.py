@@ -1,0 +1,68 @@
+"""What the joint solve returns: the optimum, and everything that is needed to judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.config import Config, Terms
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Rig
+from calibgraph.progress import Stopwatch
+from calibgraph.solver.factor_graph import Optimum
+from calibgraph.solver.objective import Objective, Scales, Transforms
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The result of the two passes.
+
+    Attributes:
+        rig: lenses, and the initial guess.
+        correspondences: as preprocessed.
+        objective: with all usable correspondences.
+        inliers: with those within the gate, which the solution was fitted to.
+        scales: per camera, of the residuals.
+        optimum: where the last pass stopped.
+        counts: per camera, correspondences left after each filter and gate, and frames.
+        watch: seconds per stage.
+    """
+
+    rig: Rig
+    correspondences: Correspondences
+    objective: Objective
+    inliers: Objective
+    scales: Scales
+    optimum: Optimum
+    counts: Mapping[str, Mapping[str, int]]
+    watch: Stopwatch
+
+    @property
+    def T_camera_lidar(self) -> Transforms:
+        """Per camera, the (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
+        return self.optimum.T_camera_lidar
+
+    @property
+    def T_hat(self) -> Transforms:
+        """Per camera that has one, the (4, 4) Stage-1 estimate."""
+        return self.objective.T_hat
+
+    @property
+    def config(self) -> Config:
+        """The settings."""
+        return self.objective.config
+
+    @property
+    def terms(self) -> Terms:
+        """The terms of the objective that were used."""
+        return self.objective.terms
+
+    @property
+    def solved_rig(self) -> Rig:
+        """The rig with the estimated extrinsics."""
+        return self.rig.moved_to(self.T_camera_lidar)

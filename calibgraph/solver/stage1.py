@@ -1,0 +1,171 @@
+"""Stage 1 (paper, section 3.3): one pose per camera and frame by PnP, then one per camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.solver.pnp import frame_pose
+
+Array = NDArray[np.float64]
+
+_MEDOID_OF = 500  # rotations at most: it is a start, and its cost is quadratic
+_STRAY = 6.0  # median distances from the median: farther frames do not count
+_STRAY_RAD, _STRAY_M = np.radians(0.05), 0.01  # nearer ones always do
+
+
+@dataclass(frozen=True, eq=False)
+class CameraStage1:
+    """The pairwise estimates of one camera.
+
+    Attributes:
+        T_camera_lidar: (4, 4) T_hat of the paper; None if no frame was solved.
+        solved: (4, 4) T_camera_lidar from PnP, by frame number.
+        per_frame: (f, 4, 4) those that are not far from all others.
+        failed_frames: how many frames gave no pose, or one far from all others.
+    """
+
+    T_camera_lidar: Array | None
+    solved: Mapping[int, Array] = field(default_factory=lambda: MappingProxyType({}))
+    per_frame: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
+    failed_frames: int = 0
+
+
+Stage1 = Mapping[str, CameraStage1]
+"""The pairwise estimates, by camera."""
+
+
+def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
+    """The pairwise estimates T_hat: by PnP, or the extrinsics of the rig as they are.
+
+    Args:
+        rig: lenses; its extrinsics are used with ``config.stage1 == "rig"`` alone.
+        table: preprocessed correspondences, those of a camera sorted by frame.
+        config: ``stage1``, ``aggregate``, ``pnp_threshold_px``, ``seed``.
+    """
+    if config.stage1 == "rig":
+        named = [name for name in rig.cameras if name in table.cameras]
+        return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
+    with ThreadPoolExecutor() as pool:
+        return {
+            name: _of_camera(camera, table.of_camera(name), config, pool)
+            for name, camera in rig.cameras.items()
+        }
+
+
+def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
+    """The (4, 4) estimate of every camera that has one."""
+    return {
+        name: estimate.T_camera_lidar
+        for name, estimate in pairwise_estimates.items()
+        if estimate.T_camera_lidar is not None
+    }
+
+
+def _of_camera(
+    camera: Camera, rows: Correspondences, config: Config, pool: ThreadPoolExecutor
+) -> CameraStage1:
+    """PnP in every frame, then one pose over the frames."""
+    numbers, starts = np.unique(rows.frame, return_index=True)
+    edges = np.append(starts, len(rows))
+    frames = [rows.select(slice(*edge)) for edge in pairwise(edges)]
+    found = pool.map(partial(frame_pose, camera, config=config), frames)
+    solved = {int(n): T for n, T in zip(numbers, found, strict=True) if T is not None}
+    stacked = np.array([*solved.values()]).reshape(-1, 4, 4)
+    kept = stacked[agreeing(stacked)]
+    return CameraStage1(
+        T_camera_lidar=aggregate(kept, config.aggregate) if len(stacked) else None,
+        solved=MappingProxyType(solved),
+        per_frame=kept,
+        failed_frames=len(frames) - len(kept),
+    )
+
+
+def agreeing(poses: Array) -> NDArray[np.bool_]:
+    """Which of (f, 4, 4) poses are not far from all others, judged by the poses alone.
+
+    Far is more than 6 times the median distance from their median, in rotation or translation;
+    up to 0.05 degrees and 1 cm never are. Fewer than 3 poses cannot be judged.
+    """
+    if len(poses) < 3:  # noqa: PLR2004
+        return np.ones(len(poses), dtype=np.bool_)
+    rotations, translations = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    angles = (rotations * geodesic_median(rotations).inv()).magnitude()
+    lengths = np.linalg.norm(translations - np.median(translations, axis=0), axis=1)
+    near = [
+        distances <= max(least, _STRAY * float(np.median(distances)))
+        for distances, least in ((angles, _STRAY_RAD), (lengths, _STRAY_M))
+    ]
+    return np.asarray(near[0] & near[1])
+
+
+def aggregate(poses: Array, how: str) -> Array:
+    """One pose from several.
+
+    Args:
+        poses: (f, 4, 4), f >= 1.
+        how: ``median``: component-wise for the translation, geodesic L1 for the rotation;
+            ``mean``: arithmetic and chordal; ``mode``: half-sample mode of each component, the
+            rotation's in the tangent at its median.
+    """
+    T = np.eye(4)
+    rotations, translations = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    median = geodesic_median(rotations)
+    if how == "median":
+        rotation, T[:3, 3] = median, np.median(translations, axis=0)
+    elif how == "mean":
+        rotation, T[:3, 3] = rotations.mean(), translations.mean(axis=0)
+    elif how == "mode":
+        tangents = (rotations * median.inv()).as_rotvec()
+        mode = np.array([half_sample_mode(column) for column in tangents.T])
+        rotation = Rotation.from_rotvec(mode) * median
+        T[:3, 3] = [half_sample_mode(column) for column in translations.T]
+    else:
+        raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
+    T[:3, :3] = rotation.as_matrix()
+    return T
+
+
+def geodesic_median(rotations: Rotation) -> Rotation:
+    """Rotation with the least sum of angles to the given ones (Weiszfeld on SO(3))."""
+    medoid = rotations[_medoid(rotations)]
+    median: Rotation = medoid
+    for _ in range(100):
+        tangents = (rotations * median.inv()).as_rotvec()
+        weights = 1.0 / np.maximum(np.linalg.norm(tangents, axis=1), 1e-12)
+        step = weights @ tangents / weights.sum()
+        median = Rotation.from_rotvec(step) * median
+        if np.linalg.norm(step) < 1e-12:  # noqa: PLR2004 - far below any rotation that matters
+            break
+    return median
+
+
+def _medoid(rotations: Rotation) -> int:
+    """Which of the rotations has the least sum of angles to the others; of many, to some."""
+    quaternions = rotations.as_quat()
+    places = np.unique(np.linspace(0, len(quaternions) - 1, _MEDOID_OF).round().astype(int))
+    some = quaternions[places]
+    cosines = np.abs(some @ some.T).clip(max=1.0)
+    return int(places[np.argmin(np.arccos(cosines).sum(axis=0))])
+
+
+def half_sample_mode(samples: Sequence[float] | Array) -> float:
+    """Mode of a sample: keep the densest half, again and again (Bickel and Fruehwirth 2006)."""
+    x = np.sort(np.asarray(samples, dtype=np.float64))
+    while len(x) > 2:  # noqa: PLR2004 - two values have no denser half
+        half = (len(x) + 1) // 2
+        widths = x[half - 1 :] - x[: len(x) - half + 1]
+        start = int(np.argmin(widths))
+        x = x[start : start + half]
+    return float(x.mean())

@@ -1,0 +1,108 @@
+"""Where the joint solve starts, and whether every camera can be determined at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.config import Config, Terms
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.objective import Transforms
+from calibgraph.solver.preprocess import FILTERS
+from calibgraph.solver.stage1 import Stage1
+
+Array = NDArray[np.float64]
+
+
+def best_start(
+    rig: Rig,
+    blocks: Mapping[str, CameraBlock],
+    stage1: Stage1,
+    config: Config,
+    terms: Terms,
+) -> Transforms:
+    """Per camera, (4, 4) T_camera_lidar from which the first pass starts.
+
+    The best of Stage 1, the poses of single frames and the rig's guess, by the mean Cauchy loss of
+    all frames' correspondences at half the PnP threshold; with the terms ``stage1``, Stage 1
+    itself. Cameras without correspondences start where a relative pose puts them.
+
+    Raises:
+        CorrespondenceError: with the terms ``stage1``, if PnP failed in every frame of a camera.
+    """
+    start = {}
+    for name, block in blocks.items():
+        estimate = stage1.get(name)
+        T_hat = estimate.T_camera_lidar if estimate else None
+        if terms == "stage1" and T_hat is None:
+            raise CorrespondenceError(
+                f"camera {name!r}: PnP failed in every frame, so there is no Stage-1 estimate; "
+                "solve with other terms, or give more matches per frame",
+                camera=name,
+            )
+        candidates = [] if T_hat is None else [T_hat]
+        if terms != "stage1":
+            candidates.append(rig.cameras[name].T_camera_lidar)
+            candidates += estimate.solved.values() if estimate else ()
+        start[name] = candidates[block.best_candidate(candidates, config.pnp_threshold_px / 2)]
+    for _ in rig.cameras:
+        for pair in rig.relative_poses:
+            if pair.b in start:
+                start.setdefault(pair.a, pair.T_a_b @ start[pair.b])
+            if pair.a in start:
+                start.setdefault(pair.b, invert(pair.T_a_b) @ start[pair.a])
+    return {name: start[name] for name in rig.cameras}
+
+
+def require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> None:
+    """Check that every camera has correspondences, or relative poses to one that has.
+
+    Args:
+        rig: with its relative poses.
+        counts: per camera, correspondences left after each filter.
+
+    Raises:
+        CorrespondenceError: naming the first camera that has neither.
+    """
+    tied = {name for name, count in counts.items() if count["capped"] >= MIN_MATCHES}
+    for _ in rig.cameras:
+        tied |= {p.a for p in rig.relative_poses if p.b in tied}
+        tied |= {p.b for p in rig.relative_poses if p.a in tied}
+    for name, count in counts.items():
+        if name not in tied:
+            left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
+            raise CorrespondenceError(
+                f"camera {name!r} has {count['capped']} usable correspondences, at least "
+                f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
+                f"(left after each filter: {left}): {_why_few(count)}{_of_others(tied)}",
+                camera=name,
+            )
+
+
+def _of_others(tied: set[str]) -> str:
+    """What to do for the cameras that have enough."""
+    if not tied:
+        return ""
+    return f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file"
+
+
+def _why_few(count: Mapping[str, int]) -> str:
+    """What to do about too few correspondences, by the filter that took them."""
+    if count["given"] < MIN_MATCHES:
+        return (
+            "none or few were found; check that its images show something, that the cloud lies "
+            "where T_camera_lidar looks (p_camera = T_camera_lidar * p_lidar), and its name"
+        )
+    if count["projectable"] < MIN_MATCHES:
+        return (
+            "the points are not in front of it; check the direction of T_camera_lidar "
+            "(p_camera = T_camera_lidar * p_lidar), its axes and its units"
+        )
+    if count["confident"] < MIN_MATCHES:
+        return "their confidence is below confidence_min; lower it if they can be trusted"
+    return "they crowd in few cells of the image; match more of it"

@@ -1,0 +1,244 @@
+"""What the estimate is worth right now: covariance, verdict, and the result as a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.calibration import Calibration, Residuals
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.verdict import Check, Verdict, above
+from calibgraph.solver.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
+from calibgraph.tracking.posterior import Posterior, is_determined, posterior
+from calibgraph.tracking.state import CameraState, State, block_diagonal
+from calibgraph.tracking.window import known_of_poses
+from calibgraph.trust.assess import relative_pose_conflict
+from calibgraph.trust.solution_checks import Conflict, Evidence, camera_verdict
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+
+_PRIOR_FRAMES = 10.0  # that the usual scatter counts for, while a camera has few frames
+_LEFT_OUT_WARN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Health:
+    """What all estimates are worth.
+
+    Attributes:
+        joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
+            with too few frames.
+        verdicts: per camera.
+    """
+
+    joint_covariance: Array
+    verdicts: dict[str, Verdict]
+
+
+def joint_covariance(state: State, sums: Posterior, known: Array) -> Array:
+    """(6 n, 6 n) cluster-robust covariance; NaN for cameras with too few frames.
+
+    While a camera has few frames, the scatter that its frames usually have counts too.
+    """
+    share = np.array([
+        0.0 if one.memory.walk else _PRIOR_FRAMES / (frames + _PRIOR_FRAMES)
+        for one, frames in zip(state.cameras, sums.frames, strict=True)
+    ])  # fmt: skip
+    usual = np.sqrt(share * sums.frames / np.maximum(state.total_frames, 1.0))
+    scatter = _scaled(sums.scatter, np.sqrt(1 - share)) + _scaled(state.total, usual)
+    hessian = block_diagonal(sums.hessian) + known
+    scatter = with_pseudo_frames(state.widened(scatter), hessian, np.repeat(sums.frames, 6))
+    covariance = replace(sums, scatter=scatter).covariance(known)
+    rotation, translation = state.systematic_sigmas
+    shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
+    covariance += np.diag(np.tile(shared**2, len(state.cameras)))
+    few = np.repeat(sums.frames < MIN_FRAMES, 6)
+    covariance[few], covariance[:, few] = np.nan, np.nan
+    return covariance
+
+
+def _scaled(scatter: Array, factors: Array) -> Array:
+    """(6 n, 6 n) with each camera's gradients multiplied by a factor."""
+    each = np.repeat(factors, 6)
+    return scatter * np.outer(each, each)
+
+
+def health_of(state: State, sums: Posterior, known: Array) -> Health:
+    """Judge the present estimates.
+
+    Args:
+        state: the tracker's.
+        sums: over everything it remembers.
+        known: (6 n, 6 n) Hessian of what is known of poses apart from correspondences.
+    """
+    covariance = joint_covariance(state, sums, known)
+    conflicts = _conflicts(state, sums, covariance)
+    verdicts = {}
+    for camera, name in enumerate(state.names):
+        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts)
+    return Health(covariance, verdicts)
+
+
+def _verdict(
+    state: State, sums: Posterior, camera: int, covariance: Array, conflicts: list[Conflict]
+) -> Verdict:
+    name, one = state.names[camera], state.cameras[camera]
+    if not one.started:
+        return _not_started(state, one)
+    rows = slice(6 * camera, 6 * camera + 6)
+    own = covariance[rows, rows]
+    evidence = Evidence(
+        residuals=residuals_of(one),
+        used=int(one.counts.get("used", 0)),
+        frames=int(sums.frames[camera]),
+        covariance=None if np.isnan(own).any() else own,
+        data_sigmas=_data_sigmas(sums.hessian[camera]),
+        halves=_halves(state, camera),
+        conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
+        pulled=None,
+        converged=True,
+        terms="full",
+    )
+    verdict = camera_verdict(state.rig.cameras[name], evidence)
+    return verdict.and_also(_now(state, one))
+
+
+def _not_started(state: State, one: CameraState) -> Verdict:
+    needed = state.config.tracking.start_frames
+    waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
+    return Verdict(
+        tuple(
+            Check("start", "FAIL", f"no estimate yet: {reason}")
+            for reason in one.refused or waiting
+        )
+    )
+
+
+def _now(state: State, one: CameraState) -> list[Check]:
+    """What the last frames say of a camera."""
+    checks = []
+    if one.absent >= state.config.tracking.blind_frames:
+        text = f"no usable matches in the last {one.absent} frames"
+        checks.append(Check("blind frames", "WARN", text, one.absent))
+    if one.memory.walk:
+        text = "drifts: the estimate follows, over fewer frames"
+        checks.append(Check("drift", "WARN", text))
+    agreed = [good for _, good in one.verdicts]
+    if agreed:
+        share = 1 - float(np.mean(agreed))
+        name = f"share of the last {len(agreed)} frames that disagree with the estimate"
+        checks.append(above(name, share, _LEFT_OUT_WARN, 1.0, "share"))
+    return checks
+
+
+def residuals_of(one: CameraState) -> Residuals:
+    """How well the estimate explains the recent frames."""
+    return Residuals(
+        median_px=float(np.median(one.recent[:, 1])),
+        inlier_share=one.inlier_share,
+        sigma_px=one.scale.sigma_px,
+        loss_scale_px=one.scale.loss_scale,
+        gate_px=one.scale.gate_px,
+    )
+
+
+def _data_sigmas(hessian: Array) -> Array:
+    """(6,) what the matches could tell at best, if each were independent."""
+    if not is_determined(hessian):
+        return np.full(6, np.inf)
+    return np.sqrt(np.diag(np.linalg.inv(hessian)))
+
+
+def _halves(state: State, camera: int) -> tuple[Array, Array] | None:
+    """(4, 4) T_camera_lidar twice: from every other epoch, and from the epochs between."""
+    memory = state.cameras[camera].memory
+    hessian, gradient = memory.halves_hessian.copy(), memory.halves_gradient.copy()
+    half = memory.next_half
+    for epoch in state.epochs:
+        for frame in epoch.frames:
+            hessian[half] += frame.hessian[camera]
+            gradient[half] += frame.gradient[camera]
+        half = 1 - half
+    if not all(map(is_determined, hessian)):
+        return None
+    steps = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
+    poses = [to_T_camera_lidar(state.references[camera].retract(step)) for step in steps]
+    return poses[0], poses[1]
+
+
+def _conflicts(state: State, sums: Posterior, covariance: Array) -> list[Conflict]:
+    """How the relative poses of the rig fit what the correspondences alone say."""
+    places = {name: camera for camera, name in enumerate(state.names)}
+    conflicts = []
+    for place, pair in enumerate(state.rig.relative_poses):
+        cameras = [places[pair.a], places[pair.b]]
+        if place in state.dropped_pairs or not all(state.cameras[c].started for c in cameras):
+            continue
+        one, two = (sums.step(c) for c in cameras)
+        rows = np.concatenate([6 * c + np.arange(6) for c in cameras])
+        alone = replace(
+            sums,
+            hessian=sums.hessian[cameras],
+            scatter=sums.scatter[np.ix_(rows, rows)],
+            frames=sums.frames[cameras],
+        )
+        if one is None or two is None or np.isnan(covariance[np.ix_(rows, rows)]).any():
+            continue
+        T = {
+            name: to_T_camera_lidar(state.references[c].retract(step))
+            for name, c, step in zip((pair.a, pair.b), cameras, (one, two), strict=True)
+        }
+        joint = alone.covariance(np.zeros((12, 12)))
+        conflicts.append(relative_pose_conflict(pair, (pair.a, pair.b), T, joint))
+    return conflicts
+
+
+def known_hessian(state: State) -> Array:
+    """(6 n, 6 n) Hessian of what is known of poses apart from correspondences."""
+    T = {name: to_T_camera_lidar(p) for name, p in zip(state.names, state.poses, strict=True)}
+    return pose_hessian(known_of_poses(state), state.names, T)
+
+
+def covariance_of(health: Health, names: tuple[str, ...]) -> dict[str, Array | None]:
+    """Per camera (6, 6), None where there are too few frames."""
+    covariance: dict[str, Array | None] = {}
+    for camera, name in enumerate(names):
+        rows = slice(6 * camera, 6 * camera + 6)
+        own = health.joint_covariance[rows, rows]
+        covariance[name] = None if np.isnan(own).any() else own
+    return covariance
+
+
+def _counts(one: CameraState) -> dict[str, int]:
+    """Correspondences and frames, by what became of them."""
+    counts = {key: one.counts.get(key, 0) for key in ("given", "used", "left_out", "failed")}
+    used, waiting = one.counts.get("absorbed", 0), len(one.waiting)
+    frames = used + counts["left_out"] + waiting
+    return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
+
+
+def calibration_of(state: State) -> Calibration:
+    """The present estimate as a result, like that of a batch."""
+    sums = posterior(state)
+    health = health_of(state, sums, known_hessian(state))
+    poses = zip(state.names, state.poses, strict=True)
+    joint = health.joint_covariance
+    return Calibration(
+        rig=state.rig.moved_to({name: to_T_camera_lidar(pose) for name, pose in poses}),
+        initial_rig=state.rig,
+        covariance=covariance_of(health, state.names),
+        joint_covariance=None if np.isnan(joint).any() else joint,
+        camera_verdicts=health.verdicts,
+        residuals={
+            name: residuals_of(one)
+            for name, one in zip(state.names, state.cameras, strict=True)
+            if one.started
+        },
+        counts={n: _counts(one) for n, one in zip(state.names, state.cameras, strict=True)},
+        timings_s={},
+        terms="full",
+        config=state.config,
+    )

@@ -1,0 +1,93 @@
+"""Frames of a dataset, matched one by one from the estimate of the moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from calibgraph.errors import CalibrationError, CorrespondenceError
+from calibgraph.io.dataset import Dataset
+from calibgraph.matching.protocol import FullMatcher
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Rig
+from calibgraph.pipeline import calibrate
+from calibgraph.progress import no_progress
+from calibgraph.solver.joint import solve_joint
+from calibgraph.tracking.stream import Item, Refused, StreamFrame
+
+
+def first_frames(dataset: Dataset, matcher: FullMatcher, config: Config) -> Calibration:
+    """The first frames calibrated as a batch: a matcher finds far more from several at once.
+
+    Raises:
+        CalibrationError: if that fails.
+    """
+    count = config.tracking.start_frames
+    head = replace(dataset, frames=dataset.frames[:count])
+    return calibrate(head, rig=dataset.rig, matcher=matcher, config=config)
+
+
+def frames_of_batch(result: Calibration) -> Iterator[Item]:
+    """The frames of a batch's matches, one by one."""
+    table = result.correspondences
+    assert table is not None  # calibrate keeps those of its last round
+    for frame in np.unique(table.frame):
+        yield _stream_frame(int(frame), table.select(table.frame == frame))
+
+
+def matched_frames(
+    dataset: Dataset, matcher: FullMatcher, config: Config, rig_now: Callable[[], Rig]
+) -> Iterator[Item]:
+    """Match each frame from the present estimate.
+
+    Args:
+        dataset: its frames, in order of time.
+        matcher: which goes through its rounds for tracking, see ``Matcher``.
+        config: settings of the solves between its rounds.
+        rig_now: the rig with the present estimate, asked before each frame.
+    """
+    for frame in dataset.frames:
+        alone = replace(dataset, frames=(frame,))
+        try:
+            table = _matched(alone, matcher, config, rig_now())
+        except (CalibrationError, OSError) as error:
+            yield Refused(f"frame {frame.name} ({frame.index}): {error}")
+        else:
+            yield _stream_frame(frame.index, table)
+
+
+def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> Correspondences:
+    """One frame's matches: coarse from the estimate, then finer from where these say."""
+    *coarse, last = tracking_rounds(matcher)
+    settings = config.changed(stage1=matcher.stage1)
+    for index in coarse:
+        table = matcher.match(alone, rig, round_index=index, progress=no_progress)
+        rig = _refined(rig, table, settings)
+    return matcher.match(alone, rig, round_index=last, progress=no_progress)
+
+
+def tracking_rounds(matcher: FullMatcher) -> tuple[int, ...]:
+    """The rounds that a matcher goes through for a single frame: its own choice, or all."""
+    return matcher.tracking_rounds or tuple(range(matcher.rounds))
+
+
+def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
+    """The rig with each camera moved to what one frame says, where it says something."""
+    for name in table.cameras:
+        own = table.of_camera(name)
+        own = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
+        one = Rig(cameras={name: rig.cameras[name]})
+        try:
+            rig = rig.moved_to(solve_joint(one, own, config).T_camera_lidar)
+        except CorrespondenceError:  # too few matches to move it: the next round starts as this one
+            continue
+    return rig
+
+
+def _stream_frame(number: int, table: Correspondences) -> StreamFrame:
+    stamp = None if table.stamp_ns is None or not len(table) else int(table.stamp_ns.max())
+    return StreamFrame(number, stamp, table)

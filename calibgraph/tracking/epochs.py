@@ -1,0 +1,180 @@
+"""The end of an epoch: the oldest live one goes into the memory, a new one begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.camera_block import MIN_MATCHES, merged
+from calibgraph.tracking.drift import drifting, told
+from calibgraph.tracking.epoch_summary import step_between
+from calibgraph.tracking.events import Event
+from calibgraph.tracking.posterior import true_hessian
+from calibgraph.tracking.state import CameraState, Epoch, State, block_diagonal
+
+Array = NDArray[np.float64]
+
+
+def closed(state: State, poses: Sequence[tuple[gtsam.Pose3, ...]]) -> tuple[State, list[Event]]:
+    """The state with its open epoch closed and a new one begun.
+
+    Args:
+        state: before.
+        poses: the newest estimates, per live epoch and camera.
+    """
+    epochs = tuple(
+        replace(epoch, poses=of_epoch) for epoch, of_epoch in zip(state.epochs, poses, strict=True)
+    )
+    state = replace(state, epochs=epochs)
+    if len(epochs) > state.config.tracking.live_epochs:
+        state = _oldest_remembered(state)
+    state = _seen_from(state, state.poses)
+    cameras = tuple(
+        replace(known, scale=known.spread.scale(state.config)) if known.started else known
+        for known in state.cameras
+    )
+    state = replace(state, cameras=cameras)
+    epochs = tuple(_gated_anew(state, epoch) for epoch in state.epochs)
+    return told(replace(state, epochs=(*epochs, Epoch((), state.poses))))
+
+
+def _gated_anew(state: State, epoch: Epoch) -> Epoch:
+    """The epoch with its frames gated at its newest estimate."""
+    frames = []
+    for frame in epoch.frames:
+        used = {
+            camera: raw.without_outliers(
+                to_T_camera_lidar(epoch.poses[camera]), state.cameras[camera].scale
+            )
+            for camera, raw in frame.raw.items()
+        }
+        kept = {camera: m for camera, m in used.items() if len(m.frame) >= MIN_MATCHES}
+        frames.append(replace(frame, used={**frame.used, **kept}))
+    return replace(epoch, frames=tuple(frames))
+
+
+def _seen_from(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
+    """The state with its sums about other reference poses."""
+    steps = np.array([*map(step_between, state.references, poses)])
+    cameras = tuple(
+        replace(known, memory=known.memory.seen_from(step))
+        for known, step in zip(state.cameras, steps, strict=True)
+    )
+    drift = state.drift
+    if drift is not None:
+        anchors = zip(drift.anchors, steps, strict=True)
+        drift = replace(drift, anchors=tuple(anchor.seen_from(step) for anchor, step in anchors))
+    epochs = tuple(
+        replace(
+            epoch,
+            frames=tuple(
+                replace(f, gradient=f.gradient + np.einsum("nij,nj->ni", f.hessian, steps))
+                for f in epoch.frames
+            ),
+        )
+        for epoch in state.epochs
+    )
+    return replace(state, cameras=cameras, epochs=epochs, references=poses, drift=drift)
+
+
+@dataclass(frozen=True, eq=False)
+class _EpochSums:
+    """An epoch's matches, gated anew, as sums about a camera's reference.
+
+    Attributes:
+        hessian: (6, 6).
+        gradient: (6,) at the reference.
+        scores: (f, 6) gradients at the estimate of all its frames; zero where there is none.
+        frames: how many have matches.
+    """
+
+    hessian: Array
+    gradient: Array
+    scores: Array
+    frames: int
+
+
+def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
+    numbers = np.array([frame.number for frame in epoch.frames])
+    scores = np.zeros((len(numbers), 6))
+    raw = [frame.raw[camera] for frame in epoch.frames if camera in frame.raw]
+    nothing = _EpochSums(np.zeros((6, 6)), np.zeros(6), scores, 0)
+    if not raw:
+        return nothing
+    pose, scale = epoch.poses[camera], state.cameras[camera].scale
+    everything = merged(raw)
+    inliers = everything.without_outliers(to_T_camera_lidar(pose), scale)
+    if len(inliers.frame) < MIN_MATCHES:
+        return nothing
+    block = inliers.scaled(scale)
+    own, starts = np.unique(inliers.frame, return_index=True)
+    gradients = block.frame_sums(pose, np.append(starts, len(inliers.frame))).gradient
+    scores[np.searchsorted(numbers, own)] = gradients
+    hessian = true_hessian(everything, block, scale, pose)
+    to_reference = step_between(pose, state.references[camera])
+    gradient = gradients.sum(axis=0) + hessian @ to_reference
+    return _EpochSums(hessian, gradient, scores, len(own))
+
+
+def _oldest_remembered(state: State) -> State:
+    """The state with its oldest epoch in the memories."""
+    epoch, *younger = state.epochs
+    sums = [_epoch_sums(state, epoch, camera) for camera in range(len(state.cameras))]
+    judged = [_judged(state, camera, s) for camera, s in enumerate(sums)]
+    state = replace(state, cameras=tuple(judged))
+    state = _with_walks(state)
+    gains, cameras = [], []
+    for camera, (known, s) in enumerate(zip(state.cameras, sums, strict=True)):
+        memory = known.memory
+        if s.frames:
+            memory = memory.plus(s.hessian, s.gradient, s.scores.T @ s.scores, s.frames)
+        memory, gain = memory.after_walk(
+            state.walk_variance(len(epoch.frames)), state.overconfidence(camera)
+        )
+        cameras.append(replace(known, memory=memory))
+        gains.append(gain)
+    scores = np.hstack([s.scores for s in sums])
+    cross, gain = state.cross + _between_cameras(scores), block_diagonal(np.array(gains))
+    return replace(
+        state, cameras=tuple(cameras), cross=gain @ cross @ gain.T, epochs=tuple(younger)
+    )
+
+
+def _between_cameras(scores: Array) -> Array:
+    """(6 n, 6 n) scatter of (f, 6 n) gradients, without that of each camera with itself."""
+    scatter: Array = scores.T @ scores
+    for rows in range(0, len(scatter), 6):
+        scatter[rows : rows + 6, rows : rows + 6] = 0.0
+    return scatter
+
+
+def _judged(state: State, camera: int, sums: _EpochSums) -> CameraState:
+    """A camera whose walks are judged by how well they predicted an epoch.
+
+    What groups of frames show is learned here too, from epochs old enough for a move within them
+    to have been found.
+    """
+    known, alone = state.cameras[camera], state.scatter_of_frames(camera)
+    noise = state.frame_noise(camera)
+    if noise is None or alone is None or not sums.frames:
+        return known
+    score = sums.scores.sum(axis=0)
+    groups = tuple(one.plus(score, sums.frames, alone) for one in known.groups)
+    memory = known.memory.judged(sums.hessian, sums.gradient, noise * sums.frames)
+    return replace(known, memory=memory, groups=groups)
+
+
+def _with_walks(state: State) -> State:
+    """The state with the walks believed that the evidence speaks for."""
+    for camera, known in enumerate(state.cameras):
+        memory = known.memory.reconsidered()
+        if memory.walk > 0 == known.memory.walk:
+            state = drifting(state, camera, memory.walk)
+        else:
+            state = state.with_camera(camera, replace(known, memory=memory))
+    return state

@@ -1,0 +1,86 @@
+"""Frames that disagree with a camera's estimate: failed matches, or a camera that has moved."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.rig import Camera
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.factor_graph import optimize, projection_graph
+from calibgraph.solver.pnp import frame_pose
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.state import CameraState, Suspect
+
+Array = NDArray[np.float64]
+
+AGREEMENT = 0.7
+"""A frame agrees with a pose that explains this share of the matches that are usually explained."""
+
+
+def inlier_share(matches: CameraBlock, pose: gtsam.Pose3, scale: ResidualScale) -> float:
+    """Share of the matches within the gate at a T_lidar_camera."""
+    errors, valid = matches.errors_px(to_T_camera_lidar(pose))
+    return float(np.mean(valid & (errors <= scale.gate_px)))
+
+
+def agrees(matches: CameraBlock, pose: gtsam.Pose3, known: CameraState) -> bool:
+    """Whether a pose explains about as many of a frame's matches as usual."""
+    share = inlier_share(matches, pose, known.scale)
+    enough = share * len(matches.frame) >= MIN_MATCHES
+    return enough and share >= AGREEMENT * known.inlier_share
+
+
+def suspect(
+    number: int,
+    matches: CameraBlock,
+    pose: gtsam.Pose3,
+    *,
+    camera: Camera,
+    known: CameraState,
+    config: Config,
+) -> Suspect | None:
+    """The frame with a pose of its own, if there is one that explains it; else it has failed."""
+    for start in _starts(matches, pose, camera, config):
+        found = refined(matches, start, known.scale, config)
+        if agrees(matches, found, known):
+            return Suspect(number, matches, found)
+    return None
+
+
+def _starts(
+    matches: CameraBlock, pose: gtsam.Pose3, camera: Camera, config: Config
+) -> list[gtsam.Pose3]:
+    """Where to look for the frame's own pose: by PnP if points are matched, else nearby."""
+    if matches.information is not None or config.stage1 == "rig":
+        return [pose]
+    table = Correspondences.from_arrays(
+        camera="camera",
+        frame=0,
+        pixels_px=matches.block.pixels_px,
+        points_lidar_m=matches.block.points_lidar_m,
+    )
+    by_pnp = frame_pose(camera, table, config)
+    return [pose] if by_pnp is None else [to_T_lidar_camera(by_pnp), pose]
+
+
+def refined(
+    matches: CameraBlock, start: gtsam.Pose3, scale: ResidualScale, config: Config
+) -> gtsam.Pose3:
+    """The T_lidar_camera that matches of a camera say, with a wide loss first."""
+    T = to_T_camera_lidar(start)
+    widening = max(config.pnp_threshold_px / scale.gate_px, 1.0)
+    for factor in (widening, 1.0):
+        wide = ResidualScale(
+            scale.sigma, scale.loss_scale * factor, scale.gate_px * factor, scale.sigma_px
+        )
+        inliers = matches.without_outliers(T, wide)
+        if len(inliers.frame) < MIN_MATCHES:
+            return start
+        graph = projection_graph(["camera"], {"camera": inliers.scaled(wide)})
+        T = optimize(graph, ["camera"], {"camera": T}).T_camera_lidar["camera"]
+    return to_T_lidar_camera(T)

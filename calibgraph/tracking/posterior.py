@@ -1,0 +1,185 @@
+"""The quadratics of blocks of matches, and what their running sums say of all cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.covariance import robust_hessian
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.epoch_summary import STRENGTHS, kept_share, step_between
+from calibgraph.tracking.state import Epoch, LiveFrame, State, block_diagonal
+from factors import ProjectionBlock
+
+Array = NDArray[np.float64]
+
+
+def quadratic(
+    raw: CameraBlock,
+    used: CameraBlock,
+    scale: ResidualScale,
+    pose: gtsam.Pose3,
+    reference: gtsam.Pose3,
+) -> tuple[Array, Array]:
+    """What one frame says of a camera.
+
+    Args:
+        raw: its matches.
+        used: those within the gate at the pose.
+        scale: of the residuals.
+        pose: T_lidar_camera near the minimum.
+        reference: T_lidar_camera where the gradient is wanted.
+
+    Returns:
+        (6, 6) true Hessian of half the cost near the pose; (6,) gradient at the reference.
+    """
+    block = used.scaled(scale)
+    hessian = true_hessian(raw, block, scale, pose)
+    gradient = block.sums(pose).gradient + hessian @ step_between(pose, reference)
+    return hessian, gradient
+
+
+def true_hessian(
+    raw: CameraBlock, block: ProjectionBlock, scale: ResidualScale, pose: gtsam.Pose3
+) -> Array:
+    """(6, 6) of the robust cost of the matches in the gate, which moves with the pose."""
+    return robust_hessian(block, pose) + raw.gate_hessian(to_T_camera_lidar(pose), scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What frames say of all cameras at one time, as sums about the references.
+
+    Attributes:
+        hessian: (n, 6, 6) per camera: projections tie no two cameras.
+        gradient: (n, 6).
+        scatter: (6 n, 6 n).
+        frames: (n,) effective numbers of frames.
+    """
+
+    hessian: Array
+    gradient: Array
+    scatter: Array
+    frames: Array
+
+    @staticmethod
+    def of_memory(state: State) -> Posterior:
+        """What the marginalised epochs say of the first live one."""
+        memories = [camera.memory for camera in state.cameras]
+        scatter = state.cross.copy()
+        for place, memory in enumerate(memories):
+            rows = slice(6 * place, 6 * place + 6)
+            scatter[rows, rows] = memory.scatter[memory.walk]
+        return Posterior(
+            np.array([m.hessian[m.walk] for m in memories]),
+            np.array([m.gradient[m.walk] for m in memories]),
+            scatter,
+            np.array([m.frames[m.walk] for m in memories]),
+        )
+
+    def plus(self, frames: Iterable[LiveFrame], steps: Array) -> Posterior:
+        """With frames added.
+
+        Args:
+            frames: that share one extrinsic.
+            steps: (n, 6) from the references to the estimate, where the gradients are taken.
+        """
+        listed = list(frames)
+        if not listed:
+            return self
+        hessian = np.array([frame.hessian for frame in listed])
+        gradient = np.array([frame.gradient for frame in listed])
+        scores = gradient + np.einsum("fnij,nj->fni", hessian, steps)
+        flat = scores.reshape(len(listed), -1)
+        seen = np.array([[c in frame.used for c in range(len(steps))] for frame in listed])
+        return Posterior(
+            self.hessian + hessian.sum(axis=0),
+            self.gradient + gradient.sum(axis=0),
+            self.scatter + flat.T @ flat,
+            self.frames + seen.sum(axis=0),
+        )
+
+    def after_walk(self, state: State, frames: int) -> Posterior:
+        """After an epoch of so many frames in which the cameras that walk have walked."""
+        if not any(camera.memory.walk for camera in state.cameras):
+            return self
+        gains, walked = [], []
+        for place, camera in enumerate(state.cameras):
+            strength = STRENGTHS[camera.memory.walk]
+            variance = strength**2 * state.walk_variance(frames)
+            gains.append(kept_share(self.hessian[place], variance / state.overconfidence(place)))
+            walked.append(variance)
+        gain = np.array(gains)
+        hessian = gain @ self.hessian
+        hessian = (hessian + hessian.transpose(0, 2, 1)) / 2
+        whole, after = block_diagonal(gain), block_diagonal(hessian)
+        return Posterior(
+            hessian,
+            np.einsum("nij,nj->ni", gain, self.gradient),
+            whole @ self.scatter @ whole.T + after @ np.diag(np.ravel(walked)) @ after,
+            self.frames * np.trace(gain, axis1=1, axis2=2) / 6,
+        )
+
+    def step(self, camera: int) -> Array | None:
+        """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""
+        if not is_determined(self.hessian[camera]):
+            return None
+        return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
+
+    def covariance(self, known: Array) -> Array:
+        """(6 n, 6 n) cluster-robust, with the (6 n, 6 n) Hessian of what is known beside them."""
+        inverse = np.linalg.inv(block_diagonal(self.hessian) + known)
+        finite = np.repeat(np.sqrt(self.frames / np.maximum(self.frames - 1, 1)), 6)
+        covariance: Array = inverse @ self.scatter @ inverse * np.outer(finite, finite)
+        return covariance
+
+
+def posterior(state: State, before: int | None = None) -> Posterior:
+    """The sums over the memory and all live frames, or those before a frame's number."""
+    sums = closed_posterior(state, before)
+    return with_open_epoch(sums, state, before)
+
+
+def closed_posterior(state: State, before: int | None = None) -> Posterior:
+    """The same without the frames of the open epoch."""
+    sums, steps = Posterior.of_memory(state), _steps(state)
+    for epoch in state.epochs[:-1]:
+        sums = sums.plus(_until(epoch, before), steps).after_walk(state, len(epoch.frames))
+    return sums
+
+
+def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:
+    """The sums over closed epochs with the frames of the open one added."""
+    return sums.plus(_until(state.epochs[-1], before), _steps(state))
+
+
+def _steps(state: State) -> Array:
+    """(n, 6) from the references to the estimates."""
+    return np.array([*map(step_between, state.references, state.poses)])
+
+
+def _until(epoch: Epoch, number: int | None) -> list[LiveFrame]:
+    return [frame for frame in epoch.frames if number is None or frame.number < number]
+
+
+def inverse(matrices: Array) -> Array:
+    """Inverses of (n, 6, 6) matrices."""
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
+def is_determined(hessian: Array) -> bool:
+    """Whether no direction of the pose is free."""
+    diagonal = np.diag(hessian)
+    if not (diagonal > 0).all():
+        return False
+    units = np.sqrt(diagonal)
+    return bool(np.linalg.eigvalsh(hessian / np.outer(units, units))[0] > _LEAST_EIGENVALUE)
+
+
+_LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibgraph import (
+    Config,
+    Correspondences,
+    MatcherErrors,
+    Rig,
+    concatenate,
+    evaluate,
+    simulate_correspondences,
+)
+from calibgraph.solver.pnp import normalized
+from calibgraph.solver.stage1 import (
+    T_hat,
+    aggregate,
+    agreeing,
+    estimate_stage1,
+    geodesic_median,
+    half_sample_mode,
+)
+
+
+def poses(rng: np.random.Generator, count: int, sigma: float) -> np.ndarray:
+    """Transforms scattered about a known one."""
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(sigma * rng.standard_normal((count, 3))).as_matrix()
+    T[:, :3, 3] = [1, 2, 3] + sigma * rng.standard_normal((count, 3))
+    return T
+
+
+def test_undistorting_inverts_every_lens(mixed_rig: Rig) -> None:
+    rng = np.random.default_rng(0)
+    for name, camera in mixed_rig.cameras.items():
+        plane = rng.uniform(-0.6, 0.6, (200, 2)) * [1.2, 0.4]
+        pixels, _ = camera.lens.project(np.column_stack([plane, np.ones(200)]))
+        np.testing.assert_allclose(normalized(camera, pixels), plane, atol=1e-7, err_msg=name)
+
+
+def test_every_frame_is_solved_without_noise(mixed_rig: Rig) -> None:
+    table = simulate_correspondences(
+        mixed_rig, frames=4, matches=100, errors=MatcherErrors(noise_px=0.0)
+    )
+    found = estimate_stage1(mixed_rig, table, Config())
+    for name, T in mixed_rig.T_camera_lidar.items():
+        assert found[name].failed_frames == 0
+        for pose in found[name].per_frame:
+            np.testing.assert_allclose(pose, T, atol=1e-6)
+
+
+def test_outliers_do_not_spoil_a_frame(pair: Rig) -> None:
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.4)
+    table = simulate_correspondences(pair, frames=6, matches=300, errors=errors)
+    found = estimate_stage1(pair, table, Config())
+    estimate = pair.moved_to(T_hat(found))
+    for error in evaluate(estimate, pair).cameras.values():
+        assert error.rotation_error_deg < 0.05
+        assert error.translation_error_cm < 2
+
+
+def test_failed_frames_are_counted_and_dropped(pair: Rig) -> None:
+    good = simulate_correspondences(pair, frames=5, matches=100)
+    few = good.select((good.frame < 4) | (np.arange(len(good)) % 40 == 0))
+    found = estimate_stage1(pair, few, Config())
+    assert {name: camera.failed_frames for name, camera in found.items()} == {"left": 1, "right": 1}
+    assert len(found["left"].per_frame) == 4
+
+
+def test_matches_that_leave_a_direction_free_give_no_pose(pair: Rig) -> None:
+    table = simulate_correspondences(pair, frames=1, matches=50, errors=MatcherErrors(noise_px=0.0))
+    right = table.of_camera("right")
+    camera = pair.cameras["left"]
+    T = camera.T_camera_lidar
+    line = np.outer(np.linspace(5, 50, 50), [0.1, 0.05, 1.0]) + [0.0, 0.2, 0.0]
+    on_a_line = Correspondences.from_arrays(
+        camera="left",
+        frame=0,
+        pixels_px=camera.lens.project(line)[0],
+        points_lidar_m=(line - T[:3, 3]) @ T[:3, :3],
+    )
+    for left in (on_a_line, on_a_line.select(np.zeros(50, np.intp))):  # and in one place
+        found = estimate_stage1(pair, concatenate([left, right]), Config())
+        assert list(T_hat(found)) == ["right"]
+        assert {name: camera.failed_frames for name, camera in found.items()} == {
+            "left": 1,
+            "right": 0,
+        }
+
+
+def test_median_and_mode_ignore_what_the_mean_does_not() -> None:
+    rng = np.random.default_rng(0)
+    scattered = poses(rng, 100, 0.01)
+    scattered[:30] = poses(rng, 30, 0.01)
+    scattered[:30, :3, 3] += [5, 0, 0]
+    scattered[:30, :3, :3] @= Rotation.from_rotvec([0, 0.5, 0]).as_matrix()
+    for how, near in (("median", 0.01), ("mode", 0.02)):
+        T = aggregate(scattered, how)
+        assert abs(T[0, 3] - 1) < near
+        assert Rotation.from_matrix(T[:3, :3]).magnitude() < 2 * near
+    mean = aggregate(scattered, "mean")
+    assert mean[0, 3] == pytest.approx(1 + 5 * 0.3, abs=0.01)
+    assert Rotation.from_matrix(mean[:3, :3]).magnitude() == pytest.approx(0.15, abs=0.02)
+
+
+def test_the_geodesic_median_of_rotations_about_one_axis_is_the_median_angle() -> None:
+    angles = np.array([-0.3, -0.1, 0.05, 0.4, 1.2])
+    rotations = Rotation.from_rotvec(np.outer(angles, [0, 0, 1]))
+    np.testing.assert_allclose(geodesic_median(rotations).as_rotvec(), [0, 0, 0.05], atol=1e-6)
+
+
+def test_the_half_sample_mode_is_where_samples_are_densest() -> None:
+    rng = np.random.default_rng(0)
+    samples = np.concatenate([rng.normal(3, 0.01, 60), rng.uniform(0, 10, 40)])
+    assert half_sample_mode(samples) == pytest.approx(3, abs=0.02)
+    assert half_sample_mode([7.0]) == 7.0
+
+
+def test_unknown_aggregates_are_refused() -> None:
+    with pytest.raises(ValueError, match="unknown aggregate"):
+        aggregate(np.eye(4)[None], "best")
+
+
+def test_stray_frames_are_recognised_without_a_reference() -> None:
+    rng = np.random.default_rng(7)
+    good, bad = poses(rng, 20, 0.01), poses(rng, 5, 0.5)
+    both = np.concatenate([good, bad])
+    kept = agreeing(both)
+    # A Gaussian vector in 3 dimensions lies within 6 medians (9 sigma) of its centre.
+    assert kept[:20].all() and not kept[20:].any()
+    np.testing.assert_allclose(aggregate(both[kept], "mean"), aggregate(good, "mean"))
+    assert agreeing(np.tile(np.eye(4), (4, 1, 1))).all()
+    assert agreeing(bad[:2]).all()  # of two, none can be said to be the wrong one
+
+
+def test_stray_frames_count_as_failed(pair: Rig) -> None:
+    """One of ten frames has the matches of a camera half a metre away."""
+    wrong = pair.cameras["left"].T_camera_lidar.copy()
+    wrong[0, 3] += 0.5
+    good = simulate_correspondences(pair, frames=9, matches=200)
+    bad = simulate_correspondences(pair.moved_to({"left": wrong}), frames=1, matches=200)
+    table = concatenate([good, replace(bad, frame=bad.frame + 9)])
+    found = estimate_stage1(pair, table, Config())
+    assert {name: camera.failed_frames for name, camera in found.items()} == {"left": 1, "right": 0}
+    assert len(found["left"].per_frame) == 9

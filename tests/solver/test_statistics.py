@@ -1,0 +1,55 @@
+"""Many draws: the reported covariance is the scatter of the result. Marked, run apart."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calibgraph import MatcherErrors, Rig, simulate_correspondences
+from calibgraph.model.geometry import relative_covariance
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import scatter_covariance
+
+pytestmark = pytest.mark.statistics
+
+DRAWS = 200
+
+
+def error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """xi in estimate = exp(xi) truth."""
+    return gtsam.Pose3.Logmap(gtsam.Pose3(estimate @ np.linalg.inv(truth)))
+
+
+@pytest.mark.parametrize("frames", [6, 30])
+def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> None:
+    """Errors shared by a frame: (J^T J)^-1 would be too small by far, clusters are not.
+
+    With few frames the allowance for what they leave unsaid makes the error bar wide: never too
+    small, but down to 0.5 in the mean.
+    """
+    errors = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+    squares: dict[str, list[float]] = {"left": [], "right": [], "left->right": []}
+    for seed in range(DRAWS):
+        table = simulate_correspondences(pair, frames=frames, matches=100, errors=errors, seed=seed)
+        solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time
+        found, true = solved.poses, pair.T_camera_lidar
+        joint = scatter_covariance(solved.inliers, found, solved.scales)
+        assert joint is not None
+        T_right_left = found["right"] @ np.linalg.inv(found["left"])
+        xi_pair = error(T_right_left, true["right"] @ np.linalg.inv(true["left"]))
+        for name, xi, covariance in (
+            ("left", error(found["left"], true["left"]), joint[:6, :6]),
+            ("right", error(found["right"], true["right"]), joint[6:, 6:]),
+            ("left->right", xi_pair, relative_covariance(joint, 0, 1, T_right_left)),
+        ):
+            squares[name].append(float(xi @ np.linalg.solve(covariance, xi)))
+    for name, values in squares.items():
+        inside = np.mean(np.array(values) < chi2.ppf(0.95, 6))
+        if frames == 30:
+            assert 0.7 < np.mean(values) / 6 < 1.4, name
+            assert 0.9 <= inside <= 0.98, name
+        else:
+            assert 0.5 < np.mean(values) / 6 < 1.4, name
+            assert inside >= 0.9, name

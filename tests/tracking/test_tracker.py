@@ -1,0 +1,455 @@
+"""Recalibration while driving: what a batch would say, what moved, and input that cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import (
+    Config,
+    CorrespondenceError,
+    Correspondences,
+    Event,
+    FileError,
+    IncrementalCalibrator,
+    MatcherErrors,
+    Rig,
+    Update,
+    perturb,
+    simulate_correspondences,
+    solve,
+)
+from calibgraph.simulation.correspondences import simulate_drive
+from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking import tracker as tracker_module
+from calibgraph.tracking.epoch_summary import STRENGTHS, Memory
+from calibgraph.tracking.events import Steps, cause_of
+from calibgraph.tracking.spread import Spread
+from calibgraph.tracking.step_detection import Found, shifted
+from tests.conftest import make_camera, stereo_relative_pose
+
+Array = np.ndarray
+
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
+
+
+def difference(T: Array, other: Array) -> Array:
+    """(6,) xi in T = exp(xi) other."""
+    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(other))))
+
+
+def moved(rig: Rig, name: str, step: Array) -> Rig:
+    T = gtsam.Pose3.Expmap(step).matrix()
+    return rig.moved_to({name: T @ rig.T_camera_lidar[name]})
+
+
+def step_of(deg: float, cm: float) -> Array:
+    return np.array([0, np.radians(deg), 0, cm / 100, 0, 0])
+
+
+def drive(rig_at: Callable[[int], Rig], frames: int, **options: object) -> list[Correspondences]:
+    settings = {"matches": 100, "errors": ERRORS, "seed": 1, **options}
+    return list(simulate_drive(rig_at, frames=frames, **settings))  # type: ignore[arg-type]
+
+
+def tracked(
+    guess: Rig, tables: list[Correspondences], **tracking: int
+) -> tuple[IncrementalCalibrator, list[Update]]:
+    tracker = IncrementalCalibrator(guess, Config().changed(tracking=tracking))
+    return tracker, [tracker.update(table) for table in tables]
+
+
+def events_of(updates: list[Update]) -> list[Event]:
+    return [event for update in updates for event in update.events if event.kind != "started"]
+
+
+def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
+    """The rest is the hard gate: a match at its edge is in for one and out for the other.
+
+    At 100 frames of 200 matches, of which about 1.5 % lie within the 0.1 px by which gates differ,
+    sqrt(300) matches of a pull of 1.3 against sqrt(20000) of 0.8: 0.2 sigma for the worst of 18
+    components (2.5 of theirs); 0.1 root mean square.
+    """
+    guess = perturb(mixed_rig, rotation_deg=1, translation_m=0.1, seed=1)
+    table = simulate_correspondences(mixed_rig, frames=100, matches=200, errors=ERRORS, seed=1)
+    tables = [table.select(table.frame == frame) for frame in range(100)]
+    _, updates = tracked(guess, tables, live_epochs=4)
+    batch = solve(guess, table)
+    last = updates[-1]
+    apart = []
+    for name in mixed_rig.cameras:
+        expected, found = batch.covariance[name], last.covariance[name]
+        assert expected is not None and found is not None
+        sigmas = np.sqrt(np.diag(expected))
+        apart.append(difference(last.T_camera_lidar[name], batch.T_camera_lidar[name]) / sigmas)
+        # The shrunk scatter of 100 frames: (10 / 110) of the difference from the usual one.
+        np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
+        assert last.verdicts[name].status == "PASS"
+    assert np.sqrt(np.mean(np.square(apart))) < 0.1
+    assert not events_of(updates)
+
+
+def test_one_result_type_serves_both_solvers(pair: Rig, tmp_path: Path) -> None:
+    tracker, updates = tracked(pair, drive(lambda frame: pair, 30))
+    result = tracker.calibration()
+    for name, T in updates[-1].T_camera_lidar.items():
+        np.testing.assert_array_equal(result.T_camera_lidar[name], T)
+    result.save(tmp_path)
+    loaded = calibgraph.load_calibration(tmp_path)
+    np.testing.assert_allclose(loaded.joint_covariance, result.joint_covariance)
+    assert loaded.counts["left"]["frames_used"] == 30
+
+
+@pytest.mark.parametrize("who", ["left", "right"])
+def test_a_step_of_one_camera_is_found_within_3_frames_and_named(pair: Rig, who: str) -> None:
+    after = moved(pair, who, step_of(0.5, 3))
+    tables = drive(lambda frame: after if frame >= 40 else pair, 70)
+    _, updates = tracked(pair, tables)
+    (event,) = events_of(updates)
+    assert (event.kind, event.camera, event.frame) == ("moved", who, 40)
+    assert event.detected_frame <= 42
+    assert event.size is not None
+    assert abs(event.size.rotation_deg - 0.5) < 4 * event.size.rotation_sigma_deg
+    for name, T in updates[-1].T_camera_lidar.items():
+        covariance = updates[-1].covariance[name]
+        assert covariance is not None
+        xi = difference(T, after.T_camera_lidar[name])
+        # 6 degrees of freedom, of which few are estimated from 30 frames: 50 is beyond 1e-7.
+        assert xi @ np.linalg.solve(covariance, xi) < 50
+
+
+def test_a_step_of_the_lidar_is_not_blamed_on_a_camera(mixed_rig: Rig) -> None:
+    by = gtsam.Pose3.Expmap(step_of(0.5, 3)).matrix()
+    after = mixed_rig.moved_to({name: T @ by for name, T in mixed_rig.T_camera_lidar.items()})
+    tables = drive(lambda frame: after if frame >= 40 else mixed_rig, 60)
+    _, updates = tracked(mixed_rig, tables)
+    (event,) = events_of(updates)
+    assert (event.kind, event.camera, event.frame) == ("moved", None, 40)
+    assert "the LiDAR has moved since frame 40" in str(event)
+    for name, T in updates[-1].T_camera_lidar.items():
+        xi = difference(T, after.T_camera_lidar[name])
+        assert np.degrees(np.linalg.norm(xi[:3])) < 0.1
+
+
+def test_a_camera_that_was_blind_when_the_lidar_moved_is_carried_along(mixed_rig: Rig) -> None:
+    by = gtsam.Pose3.Expmap(step_of(1.0, 5)).matrix()
+    after = mixed_rig.moved_to({name: T @ by for name, T in mixed_rig.T_camera_lidar.items()})
+    tables = drive(
+        lambda frame: after if frame >= 60 else mixed_rig, 70, blind={"side": range(30, 200)}
+    )
+    _, updates = tracked(mixed_rig, tables)
+    assert [(e.kind, e.camera) for e in events_of(updates)] == [("blind", "side"), ("moved", None)]
+    xi = difference(updates[-1].T_camera_lidar["side"], after.T_camera_lidar["side"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.2
+    assert updates[-1].covariance["side"] is None
+
+
+def test_a_large_knock_is_found_too(pair: Rig) -> None:
+    after = moved(pair, "left", np.array([0.02, 0.12, -0.05, 0.2, 0.1, 0]))  # 7.5 deg, 22 cm
+    tables = drive(lambda frame: after if frame >= 20 else pair, 30)
+    _, updates = tracked(pair, tables)
+    (event,) = events_of(updates)
+    assert (event.camera, event.frame) == ("left", 20)
+    xi = difference(updates[-1].T_camera_lidar["left"], after.T_camera_lidar["left"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.1
+
+
+def test_failed_matches_are_left_out_and_counted(pair: Rig) -> None:
+    tables = drive(lambda frame: pair, 60, failed_share=0.3)
+    tracker, updates = tracked(pair, tables)
+    assert not events_of(updates)
+    left_out = sum("left" in update.left_out for update in updates)
+    assert 8 <= left_out <= 28  # 30 % of 60 is 18 +- 3.5
+    assert tracker.calibration().counts["left"]["left_out"] == left_out
+    xi = difference(updates[-1].T_camera_lidar["left"], pair.T_camera_lidar["left"])
+    covariance = updates[-1].covariance["left"]
+    assert covariance is not None
+    assert xi @ np.linalg.solve(covariance, xi) < 50
+
+
+def test_a_blind_camera_is_told_once_and_told_when_it_is_back(pair: Rig) -> None:
+    tables = drive(lambda frame: pair, 120, blind={"right": range(30, 100)})
+    _, updates = tracked(pair, tables)
+    blind, back = events_of(updates)
+    assert (blind.kind, blind.camera, blind.frame, blind.detected_frame) == (
+        "blind",
+        "right",
+        30,
+        49,
+    )
+    assert (back.kind, back.camera, back.frame) == ("back", "right", 100)
+    assert any("no usable matches" in reason for reason in updates[60].verdicts["right"].reasons)
+    assert updates[-1].verdicts["right"].status == "PASS"
+
+
+def test_a_drift_is_followed_with_an_honest_error_bar(pair: Rig) -> None:
+    """0.001 deg a frame, ten times faster than in the long runs.
+
+    The configured walk remembers 38 frames of this noise, so the estimate is 0.038 deg late; half
+    of that again for noise.
+    """
+    rate = step_of(1e-3, 0)
+    rig_at = lambda frame: moved(pair, "left", rate * max(0, frame - 100))  # noqa: E731
+    tables = drive(rig_at, 500)
+    _, updates = tracked(pair, tables)
+    events = events_of(updates)
+    assert events and all(event.camera == "left" for event in events)
+    assert len(events) <= 2
+    xi = difference(updates[-1].T_camera_lidar["left"], rig_at(499).T_camera_lidar["left"])
+    covariance = updates[-1].covariance["left"]
+    assert covariance is not None
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.057
+    assert abs(xi[1]) < 4 * np.sqrt(covariance[1, 1])
+
+
+def test_a_move_ends_the_belief_in_the_rigs_relative_pose(pair: Rig) -> None:
+    """1 mrad would hold the camera back: 0.5 deg is 9 of its sigmas."""
+    tied = pair.model_copy(update={"relative_poses": (stereo_relative_pose(pair),)})
+    after = moved(pair, "left", step_of(0.5, 0))
+    tables = drive(lambda frame: after if frame >= 40 else pair, 60)
+    _, updates = tracked(tied, tables)
+    assert [event.camera for event in events_of(updates)] == ["left"]
+    for name, T in updates[-1].T_camera_lidar.items():
+        assert np.degrees(np.linalg.norm(difference(T, after.T_camera_lidar[name])[:3])) < 0.05
+
+
+def test_a_camera_without_matches_is_held_by_a_relative_pose(pair: Rig) -> None:
+    tied = pair.model_copy(update={"relative_poses": (stereo_relative_pose(pair),)})
+    guess = perturb(tied, rotation_deg=1, translation_m=0.1, seed=2)
+    tables = drive(lambda frame: pair, 30, blind={"right": range(100)})
+    _, updates = tracked(guess, tables)
+    xi = difference(updates[-1].T_camera_lidar["right"], pair.T_camera_lidar["right"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.2
+    assert updates[-1].verdicts["right"].status == "FAIL"  # it has no estimate of its own
+
+
+def test_the_guess_is_given_and_failed_until_there_is_an_estimate(pair: Rig) -> None:
+    guess = perturb(pair, rotation_deg=2, translation_m=0.2, seed=4)
+    _, updates = tracked(guess, drive(lambda frame: pair, 6))
+    first = updates[0]
+    np.testing.assert_allclose(first.T_camera_lidar["left"], guess.T_camera_lidar["left"])
+    assert first.verdicts["left"].status == "FAIL" and first.covariance["left"] is None
+    assert "1 of 5 frames" in first.verdicts["left"].reasons[0]
+    assert [event.kind for event in updates[4].events] == ["started", "started"]
+
+
+def test_wrong_input_is_refused_and_changes_nothing(pair: Rig) -> None:
+    tables = drive(lambda frame: pair, 12)
+    tracker, _ = tracked(pair, tables[:11])
+    before = tracker.to_bytes()
+    stranger = replace(tables[11], cameras=("left", "stranger"))
+    stamped = replace(tables[11], stamp_ns=np.zeros(len(tables[11]), np.int64))
+    for wrong, said in (
+        (tables[10], "comes again"),
+        (tables[3], "comes after frame 10"),
+        (stranger, "'stranger'"),
+        (
+            calibgraph.concatenate([tables[11], replace(tables[11], frame=tables[11].frame + 1)]),
+            "one",
+        ),
+        (tables[11].select(slice(0, 0)), "which frame"),
+    ):
+        with pytest.raises(CorrespondenceError, match=said):
+            tracker.update(wrong)
+        assert tracker.to_bytes() == before
+    tracker.update(stamped)
+    late = replace(stamped, frame=stamped.frame + 1)
+    with pytest.raises(CorrespondenceError, match="stamp_ns 0 is not after 0"):
+        tracker.update(late)
+    assert tracker.frame == 11
+
+
+def test_frames_that_determine_nothing_do_no_harm(pair: Rig) -> None:
+    """Few matches, on one line, in one place, behind the camera, far away: iSAM2 never throws."""
+    rng = np.random.default_rng(0)
+    good = drive(lambda frame: pair, 40)
+    tracker, _ = tracked(pair, good[:20])
+
+    def table(frame: int, points: Array) -> Correspondences:
+        pixels = rng.uniform(0, 300, (len(points), 2))
+        return Correspondences.from_arrays(
+            camera="left", frame=frame, pixels_px=pixels, points_lidar_m=points
+        )
+
+    line = np.outer(np.linspace(5, 20, 50), [1.0, 0.1, 0.05])
+    for number, points in enumerate((
+        np.full((30, 3), 7.0), line, line[:6], line[:5], -line, 1e4 * line, line * [1, 1e-9, 1e-9],
+        rng.uniform(-50, 50, (200, 3)),
+    )):  # fmt: skip
+        tracker.update(table(20 + number, points))
+    degenerate = good[30].select(np.arange(8))
+    tracker.update(degenerate)
+    update = tracker.update(good[31])
+    assert update.verdicts["left"].status == "PASS"
+    xi = difference(update.T_camera_lidar["left"], pair.T_camera_lidar["left"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.1
+
+
+def test_a_tracker_of_degenerate_frames_alone_never_throws() -> None:
+    rig = Rig(cameras={"only": make_camera()})
+    tracker = IncrementalCalibrator(rig)
+    line = np.outer(np.linspace(5, 20, 50), [1.0, 0.1, 0.05])
+    pixels, _ = rig.cameras["only"].lens.project(line @ rig.T_camera_lidar["only"][:3, :3].T)
+    for frame in range(30):
+        update = tracker.update(
+            Correspondences.from_arrays(
+                camera="only", frame=frame, pixels_px=pixels, points_lidar_m=line
+            )
+        )
+    assert update.verdicts["only"].status == "FAIL"
+
+
+@pytest.mark.parametrize("cut", [0, 3, 5, 29, 43, 44, 50])
+def test_a_saved_tracker_goes_on_with_the_same_numbers(pair: Rig, tmp_path: Path, cut: int) -> None:
+    """Saved while starting, between epochs, within one, with suspects, after a step."""
+    after = moved(pair, "left", step_of(0.5, 3))
+    tables = drive(lambda frame: after if frame >= 42 else pair, 56, failed_share=0.1)
+    _, whole = tracked(pair, tables)
+    tracker, _ = tracked(pair, tables[:cut])
+    tracker.save(tmp_path / "tracker")
+    resumed = IncrementalCalibrator.load(tmp_path / "tracker")
+    for table, expected in zip(tables[cut:], whole[cut:], strict=True):
+        found = resumed.update(table)
+        assert found.events == expected.events and found.verdicts == expected.verdicts
+        for name, T in expected.T_camera_lidar.items():
+            np.testing.assert_array_equal(found.T_camera_lidar[name], T)
+            np.testing.assert_array_equal(found.covariance[name], expected.covariance[name])
+
+
+def test_a_damaged_saved_tracker_is_named(pair: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "tracker"
+    IncrementalCalibrator(pair).save(path)
+    data = path.read_bytes()
+    for damaged in (data[:-1], data[:-9] + b"\0" * 9, b"", b"calibgraph-tracker/2\n" + data[21:]):
+        path.write_bytes(damaged)
+        with pytest.raises(FileError, match="tracker"):
+            IncrementalCalibrator.load(path)
+
+
+def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
+    """H'^-1 B' H'^-1 = H^-1 B H^-1 + Q, whatever the gain."""
+    rng = np.random.default_rng(0)
+    A, C = rng.standard_normal((2, 6, 6))
+    memory = Memory.empty().plus(A @ A.T + np.eye(6), rng.standard_normal(6), C @ C.T, 10)
+    variance = np.linspace(0.1, 0.6, 6)
+    after, gain = memory.after_walk(variance, inflation=3.0)
+    for walk, strength in enumerate(STRENGTHS):
+        expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
+        np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)
+    np.testing.assert_array_equal(gain, np.eye(6))  # it stands still
+    np.testing.assert_allclose(
+        np.linalg.solve(after.hessian, after.gradient[..., None]),
+        np.linalg.solve(memory.hessian, memory.gradient[..., None]),
+    )
+
+
+def inverse_sandwich(memory: Memory, walk: int) -> Array:
+    inverse = np.linalg.inv(memory.hessian[walk])
+    return np.asarray(inverse @ memory.scatter[walk] @ inverse)
+
+
+def matches_of(rig: Rig, table: Correspondences, name: str) -> CameraBlock:
+    kept = preprocess(rig, table, Config())
+    return camera_blocks(rig, kept.table, Config())[name]
+
+
+def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
+    """Its bins are 1 % wide and values within them are taken as even: 0.3 % is a third of one."""
+    table = simulate_correspondences(pair, frames=40, matches=300, errors=ERRORS, seed=5)
+    T = pair.T_camera_lidar["left"]
+    spread = Spread()
+    for frame in range(40):
+        spread = spread.plus(matches_of(pair, table.select(table.frame == frame), "left"), T)
+    expected = matches_of(pair, table, "left").scale(T, Config())
+    found = spread.scale(Config())
+    assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
+    assert found.gate_px == pytest.approx(expected.gate_px, rel=3e-3)
+
+
+def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> None:
+    """By differences: 60,000 matches, 2 % of them near the edge, so about 1 / sqrt(1200) = 3 %;
+
+    of a band that the two take differently: within 15 %.
+    """
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.3)
+    table = simulate_correspondences(pair, frames=60, matches=1000, errors=errors, seed=6)
+    matches = matches_of(pair, table, "left")
+    T = pair.T_camera_lidar["left"]
+    scale = matches.scale(T, Config())
+    pose = gtsam.Pose3(T).inverse()
+    added = matches.gate_hessian(T, scale)
+    for axis in range(3):
+        step = np.zeros(6)
+        step[axis] = 4e-4  # 0.3 px, as wide as the band
+        pulls = [
+            matches.without_outliers(pose.retract(way * step).inverse().matrix(), scale)
+            .scaled(scale)
+            .sums(pose)
+            .gradient
+            for way in (1, -1)
+        ]
+        by_differences = (pulls[0] - pulls[1])[axis] / (2 * step[axis])
+        assert added[axis, axis] == pytest.approx(by_differences, rel=0.15)
+
+
+def steps_of(rig: Rig, steps: list[Array], sigma: float) -> Steps:
+    poses = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
+    n = len(poses)
+    return Steps(
+        tuple(range(n)), np.ravel(steps), sigma**2 * np.eye(6 * n), np.full(n, 60.0), poses
+    )
+
+
+def test_the_cause_of_a_step_is_told_by_what_all_cameras_did(mixed_rig: Rig) -> None:
+    poses = [gtsam.Pose3(T).inverse() for T in mixed_rig.T_camera_lidar.values()]
+    D = gtsam.Pose3.Expmap(step_of(0.3, 2))
+    by_lidar = [np.asarray(p.localCoordinates(D.compose(p))) for p in poses]
+    cause = cause_of(steps_of(mixed_rig, by_lidar, 1e-4))
+    assert cause.lidar is not None
+    np.testing.assert_allclose(cause.lidar[0], step_of(0.3, 2), atol=1e-9)
+    still = np.zeros(6)
+    assert cause_of(steps_of(mixed_rig, [still, by_lidar[1], still], 1e-4)).cameras == (1,)
+    two = cause_of(steps_of(mixed_rig, [by_lidar[0], -by_lidar[1], still], 1e-4))
+    assert two.lidar is None and two.cameras == (0, 1)
+    assert cause_of(steps_of(mixed_rig, [still] * 3, 1e-4)).cameras == ()
+
+
+def test_an_update_that_fails_leaves_nothing_behind(
+    pair: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the end of an epoch, when most has changed already."""
+    tables = drive(lambda frame: pair, 22)
+    tracker, _ = tracked(pair, tables[:19])
+    before = tracker.to_bytes()
+
+    judge, calls = tracker_module.health_of, []
+
+    def broken_once(*arguments: object) -> object:
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise RuntimeError("broken")
+        return judge(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tracker_module, "health_of", broken_once)
+    with pytest.raises(CorrespondenceError, match=r"frame 19: .*broken.*left out"):
+        tracker.update(tables[19])
+    assert tracker.to_bytes() == before
+    _, whole = tracked(pair, tables)
+    for table, expected in zip(tables[19:], whole[19:], strict=True):
+        found = tracker.update(table)
+        np.testing.assert_array_equal(found.T_camera_lidar["left"], expected.T_camera_lidar["left"])
+
+
+@pytest.mark.parametrize("live_epochs", [1, 2, 8])
+def test_a_change_at_any_live_epoch_can_be_followed(pair: Rig, live_epochs: int) -> None:
+    tracker, _ = tracked(pair, drive(lambda frame: pair, 100), live_epochs=live_epochs)
+    state = tracker._state
+    for epoch in state.epochs[:-1]:  # the last one is open, and empty here
+        shifted(state, Found(epoch.frames[0].number, frozenset([0])))
