@@ -6,7 +6,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist l
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install run test test-slow lint type bench clean
+.PHONY: help install run test test-ci test-slow lint type bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,12 +30,16 @@ run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
 test: $(VENV)/test ## Run the tests
 	$(PYTEST)
 
+test-ci: $(VENV)/test ## Run a short choice of the slow tests (about 3 minutes)
+	$(PYTEST) --dist worksteal -m ci
+
 test-slow: $(VENV)/test ## Run the slow tests, on real data too, and the statistics (many minutes)
 	$(PYTEST) --dist worksteal -m "slow or realdata or statistics"
 
-lint: type ## Check style and types
+lint: type ## Check style, types and the layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
 
 type: $(VENV)/test ## Check types
 	$(BIN)/mypy

@@ -1,0 +1,1 @@
+"""Files in: datasets, clouds, rigs, correspondence tables, results. One module per format."""

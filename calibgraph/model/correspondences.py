@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.table_columns import save_correspondences
+from calibgraph.model.table_columns import (
+    COORDINATES,
+    INFORMATION,
+    OPTIONAL_WHOLE,
+    TABLE_FORMAT,
+    write_table,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 Array = NDArray[np.float64]
 
@@ -139,7 +148,7 @@ class Correspondences:
         adjacent = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view, if it can
 
-    @cached_property
+    @property
     def findings(self) -> MatcherFindings:
         """What the matcher reported, from the metadata.
 
@@ -155,7 +164,27 @@ class Correspondences:
 
     def save(self, path: Path | str) -> None:
         """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
-        save_correspondences(self, Path(path))
+        write_table(self.to_arrow(), Path(path))
+
+    def to_arrow(self) -> pa.Table:
+        """The table in the file format's columns, its metadata in the schema."""
+        import pyarrow as pa
+
+        columns: dict[str, Any] = {
+            "camera": pa.DictionaryArray.from_arrays(
+                self.camera_index, pa.array(self.cameras, pa.string())
+            ),
+            "frame": self.frame,
+            **dict(zip(COORDINATES[:2], self.pixels_px.T, strict=True)),
+            **dict(zip(COORDINATES[2:], self.points_lidar_m.T, strict=True)),
+            "confidence": self.confidence,
+        }
+        optional = {name: getattr(self, name) for name in OPTIONAL_WHOLE}
+        columns |= {name: column for name, column in optional.items() if column is not None}
+        if self.information_px is not None:
+            columns |= dict(zip(INFORMATION, self.information_px.T, strict=True))
+        metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
+        return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
         u, v = self.pixels_px, self.points_lidar_m

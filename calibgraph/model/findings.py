@@ -104,7 +104,7 @@ def _number(key: str, value: Any, largest: float) -> float:
     number = _to_float(value)
     if isinstance(value, bool) or not (isinstance(number, float) and 0 <= number <= largest):
         raise CorrespondenceError(
-            f"metadata {key!r} must be a number from 0 to {largest:.3g}, found {value!r}"
+            f"metadata {key!r} must be a number from 0 to {largest:.3g}, found {number!r}"
         )
     return number
 

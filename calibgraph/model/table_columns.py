@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from calibgraph.model.correspondences import Correspondences
 
 TABLE_FORMAT = "calibgraph-correspondences/1"
 
@@ -26,37 +23,15 @@ _COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION)
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 
-def save_correspondences(table: Correspondences, path: Path) -> None:
+def write_table(arrow: pa.Table, path: Path) -> None:
     """Write a table as Parquet, or as CSV if the name ends in .csv, atomically."""
     from pyarrow import csv, parquet
 
-    arrow = to_arrow(table)
     if path.suffix == ".csv":
         strings = arrow.set_column(0, "camera", arrow["camera"].cast("string"))
         write_atomically(path, lambda part: csv.write_csv(strings, part))
     else:
         write_atomically(path, lambda part: parquet.write_table(arrow, part))
-
-
-def to_arrow(table: Correspondences) -> pa.Table:
-    """The table in the file format's columns, its metadata in the schema."""
-    import pyarrow as pa
-
-    columns: dict[str, Any] = {
-        "camera": pa.DictionaryArray.from_arrays(
-            table.camera_index, pa.array(table.cameras, pa.string())
-        ),
-        "frame": table.frame,
-        **dict(zip(COORDINATES[:2], table.pixels_px.T, strict=True)),
-        **dict(zip(COORDINATES[2:], table.points_lidar_m.T, strict=True)),
-        "confidence": table.confidence,
-    }
-    optional = {name: getattr(table, name) for name in OPTIONAL_WHOLE}
-    columns |= {name: column for name, column in optional.items() if column is not None}
-    if table.information_px is not None:
-        columns |= dict(zip(INFORMATION, table.information_px.T, strict=True))
-    metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(table.metadata)}
-    return pa.table(columns).replace_schema_metadata(metadata)
 
 
 def check_schema(schema: pa.Schema) -> None:

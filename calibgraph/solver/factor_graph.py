@@ -18,12 +18,32 @@ from numpy.typing import NDArray
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import relative_transform, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import RelativePose, Rig
-from factors import ProjectionBlock
-from factors import block_factor as block_factor
-from factors import camera_prior_factor as camera_prior_factor
-from factors import projection_factor as projection_factor
-from factors import relative_pose_factor as relative_pose_factor
-from factors import relative_prior_factor as relative_prior_factor
+from factors import (
+    ProjectionBlock,
+    block_factor,
+    camera_prior_factor,
+    projection_factor,
+    relative_pose_factor,
+    relative_prior_factor,
+)
+
+__all__ = [  # with the factors that calibgraph re-exports
+    "Optimum",
+    "block_factor",
+    "camera_prior_factor",
+    "joined",
+    "objective_graph",
+    "optimize",
+    "pose_key",
+    "prior_graph",
+    "projection_factor",
+    "projection_graph",
+    "relative_pose_factor",
+    "relative_pose_graph",
+    "relative_prior_factor",
+    "relative_prior_graph",
+    "values_of",
+]
 
 Array = NDArray[np.float64]
 

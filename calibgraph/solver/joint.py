@@ -56,7 +56,7 @@ def solve_joint(
         inliers = objective.without_outliers(rough, scales)
         optimum = inliers.minimize(rough, scales)
     counts = _counts(kept.counts, objective, inliers, pairwise, weighed)
-    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch)  # fmt: skip
+    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch)
 
 
 def _counts(

@@ -1,0 +1,1 @@
+"""Can the result be used? A list of checks per camera; start at ``assess``."""

@@ -15,13 +15,13 @@ import yaml
 from calibgraph import (
     MatcherErrors,
     Rig,
-    cli,
     load_calibration,
     load_correspondences,
     load_rig,
     perturb,
     simulate_correspondences,
 )
+from calibgraph.cli import app
 from tests.conftest import SAMPLE, Call, make_camera
 
 
@@ -245,13 +245,13 @@ def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     missing = str(tmp_path / "nothing.yaml")
     monkeypatch.setattr(sys, "argv", ["calibgraph", "--debug", "evaluate", missing, missing])
     with pytest.raises(Exception, match="no such file"):
-        cli.main()
+        app.main()
 
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; sys.argv = ['calibgraph', '--help']\n"
-        "from calibgraph.cli import main\n"
+        "from calibgraph.cli.app import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         "heavy = {'gtsam', 'numpy', 'numba', 'cv2', 'scipy', 'pyarrow', 'pydantic', 'jinja2'}\n"

@@ -54,10 +54,10 @@ def cost_left_by_trf(seed: int) -> list[float]:
     """Per camera, by what share of the cost the paper's solver ends above ours."""
     sample = source_of("kitti").draw(3, seed=seed)
     theirs = Bench.of(sample, KITTI, seed=1).of_paper("full")
-    ours = solve_joint(sample.rig, sample.table, KITTI, "full", stage1=sample.stage1(KITTI))
+    ours = solve_joint(sample.rig, sample.table, KITTI, "full", pairwise=sample.stage1(KITTI))
     left = []
     for name, matches in ours.inliers.blocks.items():
-        pose, other = to_T_lidar_camera(ours.poses[name]), to_T_lidar_camera(theirs[name])
+        pose, other = to_T_lidar_camera(ours.T_camera_lidar[name]), to_T_lidar_camera(theirs[name])
         away = pose.localCoordinates(other)
         hessian = matches.scaled(ours.scales[name]).sums(pose).hessian
         left.append(float(away @ hessian @ away) / ours.optimum.cost)

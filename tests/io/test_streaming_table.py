@@ -24,9 +24,10 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.io import correspondence_tables
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
+
+to_arrow = Correspondences.to_arrow
 
 COLUMNS = (
     "frame", "pixels_px", "points_lidar_m", "confidence", "information_px", "stamp_ns",

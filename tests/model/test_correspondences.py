@@ -20,8 +20,9 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.io.correspondence_tables import from_arrow
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.solver.preprocess import constrained_error_px, preprocess, sqrt_information
+
+to_arrow = Correspondences.to_arrow
 
 
 def table(**changes: Any) -> Correspondences:

@@ -371,5 +371,5 @@ def test_real_recordings_are_reported(realdata: Path, name: str, tmp_path: Path)
 
 def test_the_template_is_part_of_the_package() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert "calibgraph.report" in setuptools["packages"]
+    assert "calibgraph*" in setuptools["packages"]["find"]["include"]
     assert setuptools["package-data"]["calibgraph.report"] == ["page.html.j2"]

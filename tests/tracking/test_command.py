@@ -33,13 +33,12 @@ from calibgraph import (
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
-    cli,
     concatenate,
     perturb,
 )
+from calibgraph.cli import app
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.rigs import load_rig
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking import command, durable
 from calibgraph.tracking.command import Tracking, track
@@ -49,6 +48,8 @@ from calibgraph.tracking.run import follow
 from calibgraph.tracking.store import Store
 from calibgraph.tracking.stream import StreamFrame
 from tests.conftest import KANNALA, SAMPLE, Call, make_camera, stereo_relative_pose
+
+to_arrow = Correspondences.to_arrow
 
 FRAMES = 14
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
@@ -873,7 +874,7 @@ def _command(arguments: list[str], lines: Path, snapshot_every: int) -> None:
     durable._SNAPSHOT_EVERY = snapshot_every
     History.draw = lambda self, path: path.write_bytes(b"")  # type: ignore[method-assign]
     sys.argv = ["calibgraph", "track", *arguments]
-    cli.main()
+    app.main()
 
 
 @dataclass
@@ -988,7 +989,7 @@ def test_forty_random_kills_under_load_lose_nothing_and_change_nothing(
 @pytest.fixture
 def running(world: World, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     arguments = [world.rig, "-", "--out", tmp_path / "out"]
-    program = "from calibgraph import cli; cli.main()"
+    program = "from calibgraph.cli import app; app.main()"
     with subprocess.Popen(
         [sys.executable, "-c", program, "track", *map(str, arguments)],
         stdin=subprocess.PIPE,

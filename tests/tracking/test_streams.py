@@ -19,9 +19,10 @@ import pytest
 from pyarrow import ipc, parquet
 
 from calibgraph import Correspondences, FileError, concatenate
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.tracking import stream_folder, stream_input
 from calibgraph.tracking.stream import Refused, StreamFrame, frames_of
+
+to_arrow = Correspondences.to_arrow
 
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 

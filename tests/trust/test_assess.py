@@ -20,6 +20,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.model.verdict import above, below, rig_verdict
 from calibgraph.solver.covariance import with_pseudo_frames
@@ -227,9 +228,11 @@ class TestTrials:
 
     def test_a_camera_thrown_round_by_contradictions_is_one_line(self, pair: Rig) -> None:
         solved = solve_joint(pair, simulated(pair))
-        backwards = {name: np.diag([-1.0, 1, -1, 1]) @ T for name, T in solved.poses.items()}
+        backwards = {
+            name: np.diag([-1.0, 1, -1, 1]) @ T for name, T in solved.T_camera_lidar.items()
+        }
         with pytest.raises(calibgraph.CorrespondenceError, match="'left': all its .* are behind"):
-            solved.problem.scales_at(backwards, solved.config)
+            solved.objective.scales_at(backwards)
 
 
 class TestSmells:
@@ -300,7 +303,7 @@ class TestGuess:
     def test_a_near_guess_is_not_questioned(self, pair: Rig) -> None:
         guess = calibgraph.perturb(pair, rotation_deg=10, translation_m=1, seed=1)
         for name, T in pair.T_camera_lidar.items():
-            checks = guess_checks(guess.T_camera_lidar[name], T, {})
+            checks = guess_checks(guess.T_camera_lidar[name], T, MatcherFindings())
             assert all(check.status == "PASS" for check in checks)
 
     def test_swapped_cameras_are_named(self, pair: Rig) -> None:

@@ -129,7 +129,7 @@ class TestSample:
         rig = Rig(cameras={name: far.cameras[name] for name in ("front_left", "left")})
         data = calibgraph.load_dataset(SAMPLE, rig)
         start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
-        assert start.metadata["found"].keys() == rig.cameras.keys()
+        assert start.findings.found.keys() == rig.cameras.keys()
         assert start.first_round == 3
         for name, error in calibgraph.evaluate(start.rig, truth).cameras.items():
             assert error.rotation_error_deg < 0.7, name  # what the next round reaches
@@ -165,7 +165,7 @@ class TestSample:
         rig = Rig(cameras=cameras, relative_poses=(pair,))
         data = calibgraph.load_dataset(SAMPLE, rig).select("0:3")
         start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
-        assert names[1] in start.metadata["found"]
+        assert names[1] in start.findings.found
         error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
         assert error.rotation_error_deg < 0.7
 
@@ -198,7 +198,7 @@ class TestSample:
         rig = Rig(cameras={names[0]: truth.cameras[names[0]], names[1]: far.cameras[names[1]]})
         data = calibgraph.load_dataset(SAMPLE, rig).select("0:3")
         start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
-        assert names[1] in start.metadata["found"]
+        assert names[1] in start.findings.found
         error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
         assert error.rotation_error_deg < 0.7
 
@@ -279,7 +279,7 @@ class TestSample:
         rig = Rig(cameras={name: truth.cameras[name] for name in ("front_left", "left")})
         data = with_noise(calibgraph.load_dataset(SAMPLE, rig).select("0:2"), tmp_path)
         start = StructureMatcher().locate(data, rig, out_of_time=never, progress=silent)
-        assert start.metadata["missed"].keys() == {"left"}
+        assert start.findings.missed.keys() == {"left"}
         np.testing.assert_allclose(
             start.rig.T_camera_lidar["left"], truth.T_camera_lidar["left"], atol=1e-12
         )
@@ -318,7 +318,7 @@ class TestSample:
             data, rig, out_of_time=lambda: len(settled) > 3, progress=silent
         )
         assert len(settled) == 4  # the guess, and three poses
-        assert "left" in start.metadata["missed"]
+        assert "left" in start.findings.missed
 
     def test_no_time_makes_it_partial(self, truth: Rig) -> None:
         data = calibgraph.load_dataset(SAMPLE).select("0:2")
@@ -355,7 +355,7 @@ def fake_search(
     contrast: dict[tuple[float, ...], float],
     found: dict[str, np.ndarray],
 ) -> list[str]:
-    """Transforms settle where they are, with contrasts as said (else 1); what searches try, as said."""
+    """Poses settle where they are, with contrasts as said (else 1); what searches try, as said."""
     searches: list[str] = []
 
     def settle(view: locate.View, camera: Camera) -> locate.Found:

@@ -1,0 +1,1 @@
+"""Training of the matcher ``cmrnext`` on trusted extrinsics."""
