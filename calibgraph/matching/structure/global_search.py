@@ -75,12 +75,12 @@ def locate_cameras(
         progress: called as the work goes on.
 
     Returns:
-        The best candidate per camera; its camera has been located if it is accepted.
+        The best candidate per camera, accepted if the camera has been located.
     """
-    names = list(rig.cameras)
-    progress("trying the guess", 0, SEARCHES * len(names))
-    refined = pool.map(lambda name: refine(frames[name], rig.cameras[name]), names)
-    state = _SearchState(dict(zip(names, refined, strict=True)))
+    total = SEARCHES * len(rig.cameras)
+    progress("trying the guess", 0, total)
+    refined = pool.map(lambda name: refine(frames[name], rig.cameras[name]), rig.cameras)
+    state = _SearchState(dict(zip(rig.cameras, refined, strict=True)))
     search = _CameraSearch(rig, frames, search_range, seed, out_of_time)
     while True:
         best, new = state.select()
@@ -88,15 +88,11 @@ def locate_cameras(
         if not missing or out_of_time():
             return best
         if new:
-            state.proposers |= new.keys()
-            work = partial(search.try_proposals, new)
+            work = partial(search.try_proposals, state.count_proposers(new))
         else:
-            what = f"searching: {', '.join(missing)}"
-            progress(what, sum(state.searches.values()), SEARCHES * len(names))
-            state.count_search(missing)
-            work = partial(search.search_range, dict(state.searches))
-        for name, candidate in zip(missing, pool.map(work, missing), strict=True):
-            state.add(name, candidate)
+            progress(f"searching: {', '.join(missing)}", sum(state.searches.values()), total)
+            work = partial(search.search_range, state.count_searches(missing))
+        state.add(missing, pool.map(work, missing))
 
 
 class _SearchState:
@@ -142,15 +138,21 @@ class _SearchState:
         left = [name for name in self.missing(best) if self.searches[name] < SEARCHES]
         return sorted(left, key=self.searches.__getitem__)[:MAX_PARALLEL]
 
-    def count_search(self, names: Iterable[str]) -> None:
-        """Count a search of each of these cameras."""
-        for name in names:
-            self.searches[name] += 1
+    def count_proposers(self, new: dict[str, Candidate]) -> dict[str, Candidate]:
+        """Count these cameras among those that have proposed, and return them."""
+        self.proposers |= new.keys()
+        return new
 
-    def add(self, name: str, candidate: Candidate) -> None:
-        """Keep a candidate if it is the best of its camera away from the guess."""
-        before = self.far.get(name, candidate)
-        self.far[name] = max(candidate, before, key=lambda each: each.z_score)
+    def count_searches(self, names: Iterable[str]) -> dict[str, int]:
+        """Count a search of each of these cameras, and return the number of searches per camera."""
+        self.searches |= {name: self.searches[name] + 1 for name in names}
+        return dict(self.searches)
+
+    def add(self, names: Iterable[str], candidates: Iterable[Candidate]) -> None:
+        """Keep each candidate that is the best of its camera away from the guess."""
+        for name, candidate in zip(names, candidates, strict=True):
+            before = self.far.get(name, candidate)
+            self.far[name] = max(candidate, before, key=lambda each: each.z_score)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.windows import WINDOW_POINTS, build_windows
+from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows, build_windows
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
 Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
@@ -52,13 +53,7 @@ class ShiftScores:
 
 
 def score_frame(
-    gray: NDArray[np.uint8],
-    cloud: PreparedCloud,
-    camera: Camera,
-    level: Level,
-    *,
-    frame: int,
-    max_windows: int,
+    gray: Gray, cloud: PreparedCloud, camera: Camera, level: Level, *, frame: int, max_windows: int
 ) -> ShiftScores:
     """Score one image against one cloud, about the camera's estimated pose.
 
@@ -78,13 +73,10 @@ def score_frame(
     kept, group, groups = _group_windows(points[::WINDOW_POINTS], level.group_rad)
     pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
     places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
-    windows = windows.select(kept)
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    first = np.array([-reach, -reach])
-    score_windows(image, places, windows.counts, windows.basis, group, first, level.fine, grids)
-    grids -= grids.mean(axis=(1, 2), keepdims=True)
+    _add_scores(grids, image, places, windows.select(kept), group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
     centres = _mean_by_group(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
     pixels_px, jacobian_px = project_with_jacobian(camera, centres)
@@ -107,7 +99,7 @@ def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
 
 
 def downscale_log_gray(
-    gray: NDArray[np.uint8], camera: Camera, step_rad: float, blur_steps: float
+    gray: Gray, camera: Camera, step_rad: float, blur_steps: float
 ) -> tuple[NDArray[np.float32], Array]:
     """Logarithm of gray, down-scaled so that a pixel is a step; its (2,) scales of u and v.
 
@@ -148,6 +140,22 @@ def _group_windows(
 def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
     sums = [np.bincount(group, column, minlength=len(counts)) for column in points.T]
     return np.stack(sums, axis=1) / counts[:, None]
+
+
+def _add_scores(
+    grids: Grids,
+    image: NDArray[np.float32],
+    places: NDArray[np.int32],
+    windows: Windows,
+    group: NDArray[np.int32],
+    *,
+    likelihood: bool,
+) -> None:
+    """Add the windows' scores to their groups' grids, and subtract each grid's mean."""
+    reach = (grids.shape[1] - 1) // 2
+    first = np.array([-reach, -reach])
+    score_windows(image, places, windows.counts, windows.basis, group, first, likelihood, grids)
+    grids -= grids.mean(axis=(1, 2), keepdims=True)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
