@@ -33,6 +33,7 @@ def locate(data: calibgraph.Dataset, rig: Rig) -> Start:
 
 
 class TestSearch:
+    @pytest.mark.ci
     @pytest.mark.slow
     def test_cameras_are_found_from_far_away(self, truth: Rig) -> None:
         far = far_from(truth, seed=1)
