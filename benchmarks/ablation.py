@@ -22,8 +22,15 @@ from data_cases import Folders
 from scipy.stats import qmc
 
 from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
-from calibgraph.matching.structure import locate, matcher, scores, search, windows
-from calibgraph.matching.structure.correlation_maps import Responses
+from calibgraph.matching.structure import (
+    box_search,
+    global_search,
+    matcher,
+    pose_refinement,
+    shift_scores,
+    windows,
+)
+from calibgraph.matching.structure.correlation_maps import CorrelationMaps
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
@@ -57,12 +64,12 @@ def main() -> None:
 def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
     """Errors after the last rounds."""
     frames, truth = data
-    found, contrasts, begun = [], [], time.perf_counter()
+    found, z_scores, begun = [], [], time.perf_counter()
     for seed in range(starts):
         guess = perturb(truth, rotation_deg=0.3, translation_m=0.06, seed=seed, uniform=True)
         rounds = StructureMatcher(search_deg=None, search_m=None, levels=matcher.LEVELS[3:])
         matched = match_in_rounds(frames, guess, rounds, progress=no_progress)
-        contrasts += matched.correspondences.metadata["contrast"].values()
+        z_scores += matched.correspondences.findings.z_score.values()
         found.append(evaluate(matched.solution.solved_rig, truth))
     cameras = [_error(camera) for one in found for camera in one.cameras.values()]
     pairs = [_error(pair) for one in found for pair in one.pairs.values()]
@@ -70,7 +77,7 @@ def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
     return (
         "{:.3f} deg {:.2f} cm, ".format(*np.mean(cameras, axis=0))
         + "between {:.3f} deg {:.2f} cm, ".format(*np.mean(pairs, axis=0))
-        + f"contrast {np.mean(contrasts):.1f}, {seconds:.1f} s"
+        + f"z-score {np.mean(z_scores):.1f}, {seconds:.1f} s"
     )
 
 
@@ -83,7 +90,7 @@ def _search(data: tuple[Dataset, Rig], starts: int) -> str:
         structure = StructureMatcher(seed=seed)
         start = structure.locate(frames, guess, out_of_time=lambda: False, progress=no_progress)
         errors = evaluate(start.rig, truth).cameras
-        for name in start.metadata["found"]:
+        for name in start.findings.found:
             degrees, centimetres = _error(errors[name])
             reached = degrees < REACHED_DEG and centimetres < REACHED_CM
             right, wrong = right + reached, wrong + (not reached)
@@ -98,14 +105,14 @@ def _error(error: Any) -> tuple[float, float]:
 
 def _without_column(column: int) -> Part:
     """Windows without inverse range (0) or intensity (1)."""
-    basis = windows._basis
+    basis = windows._window_basis
 
     def flat(*arguments: Any) -> Any:
         values, texture = basis(*arguments)
         values[..., column] = 0.0
         return values, texture
 
-    return lambda: patch.object(windows, "_basis", flat)
+    return lambda: patch.object(windows, "_window_basis", flat)
 
 
 def _changed(module: Any, name: str, **fixed: Any) -> Part:
@@ -118,7 +125,7 @@ def _shares(*arguments: Any) -> None:
     _SCORE_WINDOWS(*arguments[:6], False, arguments[7])
 
 
-_SCORE_WINDOWS = scores.score_windows
+_SCORE_WINDOWS = shift_scores.score_windows
 
 
 def _not_forward(ranges: Any) -> tuple[Any, Any]:
@@ -133,47 +140,49 @@ ROUNDS: Mapping[str, Part] = {
     "all of it": nullcontext,
     "no intensity": _without_column(1),
     "no inverse range": _without_column(0),
-    "silhouettes not drawn forward": lambda: patch.object(windows, "_drawn_forward", _not_forward),
+    "silhouettes not corrected": lambda: patch.object(
+        windows, "_move_to_silhouettes", _not_forward
+    ),
     "windows with hidden points": lambda: patch.object(
-        windows, "unoccluded", lambda angles, *_: np.ones(len(angles), np.bool_)
+        windows, "find_visible", lambda angles, *_: np.ones(len(angles), np.bool_)
     ),
     "linear parts taken out": _changed(windows, "cut_windows", keep_linear=False),
-    "shares, not likelihoods": lambda: patch.object(scores, "score_windows", _shares),
+    "shares, not likelihoods": lambda: patch.object(shift_scores, "score_windows", _shares),
     "without round 4": _levels(LEVELS[4:]),
     "without round 6": _levels(LEVELS[3:5]),
     "without rounds 5 and 6": _levels(LEVELS[3:4]),
 }
 
 
-def _no_proposals(*_: Any) -> Iterator[Any]:
+def _no_proposals(*_: Any, **__: Any) -> Iterator[Any]:
     return iter(())
 
 
-def _not_turned(coarse: Responses, box: search.Box, rng: np.random.Generator) -> list[Any]:
+def _sample_without_shifts(
+    coarse: CorrelationMaps, box: box_search.Box, rng: np.random.Generator
+) -> list[Any]:
     """Samples of the box, best first, as they are."""
-    unit = qmc.Sobol(6, seed=rng).random(search.SAMPLES)
+    unit = qmc.Sobol(6, seed=rng).random(box_search.SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
-    return list(displacements[np.argsort(-coarse.contrasts(box.poses(displacements)))])
+    return list(displacements[np.argsort(-coarse.z_scores(box.transforms(displacements)))])
 
 
 def _plain_sums() -> AbstractContextManager[Any]:
     """Sums of scores over the spread of all groups, not of those that are seen."""
     return patch.multiple(
-        Responses,
+        CorrelationMaps,
         variances=property(lambda self: np.zeros(len(self.maps))),
-        _least_variance=property(lambda self: float(self.maps.var(axis=(1, 2)).sum())),
+        _variance_floor=property(lambda self: float(self.maps.var(axis=(1, 2)).sum())),
     )
 
 
 SEARCH: Mapping[str, Part] = {
     "all of it": nullcontext,
-    "cameras do not help each other": lambda: patch.object(
-        locate._Seeker, "_proposals", _no_proposals
-    ),
-    "samples not turned": lambda: patch.object(search, "_turned", _not_turned),
+    "cameras do not help each other": lambda: patch.object(global_search, "propose", _no_proposals),
+    "samples not shifted": lambda: patch.object(box_search, "_sample", _sample_without_shifts),
     "all groups' spread": _plain_sums,
-    "one search per camera": lambda: patch.object(locate, "SEARCHES", 1),
-    "settling once": lambda: patch.object(locate, "PROMISING", np.inf),
+    "one search per camera": lambda: patch.object(global_search, "SEARCHES", 1),
+    "refined once": lambda: patch.object(pose_refinement, "REPEATED", np.inf),
     "no intensity": _without_column(1),
     "no inverse range": _without_column(0),
 }

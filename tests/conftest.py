@@ -47,6 +47,14 @@ def make_camera(
     )
 
 
+def points_in_front(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 3) points in front of a camera that looks along the LiDAR's x axis."""
+    distance = np.exp(rng.uniform(np.log(4), np.log(40), count))
+    return distance[:, None] * np.column_stack(
+        [np.ones(count), rng.uniform(-0.7, 0.7, count), rng.uniform(-0.2, 0.2, count)]
+    )
+
+
 def stereo_relative_pose(rig: Rig, a: str = "left", b: str = "right") -> RelativePose:
     T = rig.T_camera_lidar
     return RelativePose(

@@ -1,21 +1,26 @@
-"""The matcher that the user chose: by name, by the file of its correspondences, or an object."""
+"""Find the matcher that the user chose: by name, by a file of correspondences, or an object."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.protocol import FullMatcher, Matcher, Stage1Source, completed
+from calibgraph.matching.protocol import FullMatcher, Matcher, Stage1Source, to_full_matcher
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
 
 
-class Precomputed:
-    """A matcher that has already run: its table, from a file or in memory."""
+class TableMatcher:
+    """A matcher that returns correspondences found before: a table, from a file or in memory.
+
+    Args:
+        table: of any frames; those that the dataset lacks are left out.
+    """
 
     rounds = 1
     stage1: Stage1Source = "pnp"
@@ -32,26 +37,26 @@ class Precomputed:
 
 
 def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> FullMatcher:
-    """A matcher with every member, from whatever the user gave.
+    """Find a matcher, and complete it with the defaults of the protocol.
 
     Args:
         matcher: ``structure``; a table of correspondences, or its file; a matcher.
         seed: for a matcher by name that draws random numbers.
 
     Raises:
-        ValueError: if it is a name, but not of a matcher; or if the matcher wants no round.
+        ValueError: if it is a name, but not of a matcher; or if the matcher has no round.
         FileError, CorrespondenceError: if it is a file, but not a table.
     """
     if isinstance(matcher, Correspondences):
-        return completed(Precomputed(matcher))
+        return to_full_matcher(TableMatcher(matcher))
     if not isinstance(matcher, (str, Path)):
-        return completed(matcher)
+        return to_full_matcher(matcher)
     if str(matcher) == "structure":
         from calibgraph.matching.structure import StructureMatcher
 
-        return completed(StructureMatcher(seed=seed))
+        return StructureMatcher(seed=seed)
     if Path(matcher).suffix in (".parquet", ".csv"):
-        return completed(Precomputed(load_correspondences(matcher)))
+        return to_full_matcher(TableMatcher(load_correspondences(matcher)))
     if str(matcher) == "cmrnext":
         raise ValueError(
             "the matcher 'cmrnext' needs weights: --weights iter1.tar iter5.tar iter6.tar, or "
@@ -61,3 +66,9 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
         f"unknown matcher {str(matcher)!r}; known are 'structure', 'cmrnext' and a table of "
         "correspondences (.parquet or .csv)"
     )
+
+
+if TYPE_CHECKING:  # mypy checks that the matchers of this package have every member
+    from calibgraph.matching.structure import StructureMatcher
+
+    _FULL_MATCHERS: tuple[type[FullMatcher], ...] = (StructureMatcher,)

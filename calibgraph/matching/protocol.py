@@ -1,4 +1,15 @@
-"""What a matcher is: three members that every matcher has, and four that it may have."""
+"""The matcher protocol: three members that every matcher has, and four more that it may have.
+
+`Matcher` is what a matcher of your own needs. The program works with `FullMatcher`, which has every
+member; `to_full_matcher` adds the defaults of those that are missing. In calibration they are used
+in this order:
+
+1. `most_frames`: so many frames of the dataset are used.
+2. `locate`: from where the rounds begin, and with which round.
+3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
+4. `tracking_rounds`: run again from a start displaced from the result.
+5. `fails_on_images`: whether the checks on images may FAIL the result.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +24,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
 
 Stage1Source = Literal["pnp", "rig"]
+"""Source of Stage 1's per-camera estimates T_hat, see :class:`Matcher`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +34,7 @@ class Start:
     Attributes:
         rig: with the extrinsics to begin from.
         first_round: index of the first round.
-        findings: of the search; they join those of every round.
+        findings: of the search; they are added to those of every round.
     """
 
     rig: Rig
@@ -31,20 +43,25 @@ class Start:
 
 
 class Matcher(Protocol):
-    """What finds correspondences: the least that a matcher of your own needs.
+    """Finds correspondences: the least that a matcher of your own needs.
 
-    The other members of :class:`FullMatcher` are optional. The metadata of the tables may carry the
-    keys of :class:`calibgraph.model.findings.MatcherFindings`, which the verdict reads.
-
-    Attributes:
-        rounds: how many rounds of matching it wants, each from a better estimate.
-        stage1: where Stage 1's per-camera estimates come from: ``pnp``, one pose per frame from the
-            correspondences, then their median (paper, section 3.3); or ``rig``, the estimate that
-            the round was matched from.
+    The members of :class:`FullMatcher` are optional. A class attribute, an attribute or a property
+    will do for each member but ``match``.
     """
 
-    rounds: int
-    stage1: Stage1Source
+    @property
+    def rounds(self) -> int:
+        """Number of rounds of matching, each from the estimate of the round before; at least 1."""
+        ...
+
+    @property
+    def stage1(self) -> Stage1Source:
+        """Source of Stage 1's per-camera estimates.
+
+        ``pnp``: one pose per frame from the correspondences, then their median (paper, section
+        3.3). ``rig``: the extrinsics that the round was matched from.
+        """
+        ...
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
@@ -56,43 +73,57 @@ class Matcher(Protocol):
             rig: lenses, and the current estimate of the extrinsics.
             round_index: 0 .. rounds - 1.
             progress: called as the work goes on.
+
+        Returns:
+            One table. Its metadata may carry findings, which the verdict reads: the keys that
+            :meth:`calibgraph.model.findings.MatcherFindings.to_metadata` returns.
         """
         ...
 
 
 class FullMatcher(Matcher, Protocol):
-    """A matcher with every member.
+    """A matcher with every member."""
 
-    Attributes:
-        most_frames: how many frames it is given at most, evenly spread over the dataset; None for
-            all.
-        tracking_rounds: indices of the rounds to run near a good estimate: for single frames of a
-            drive, and from a start displaced from the result, to see whether it comes back. Empty:
-            single frames go through all rounds, and there is no displaced start.
-        fails_on_images: whether image evidence, which the matcher ``structure`` measures, may FAIL
-            its result; else it can only WARN.
-    """
+    @property
+    def most_frames(self) -> int | None:
+        """Most frames of a dataset to use, evenly spread over it; None (default) for all."""
+        ...
 
-    most_frames: int | None
-    tracking_rounds: tuple[int, ...]
-    fails_on_images: bool
+    @property
+    def tracking_rounds(self) -> tuple[int, ...]:
+        """Indices of the rounds to run from an estimate that is nearly right.
+
+        They match the single frames of a drive, and a start displaced from a result, which tests
+        whether the result is found again. Empty (default): single frames go through all rounds, and
+        there is no displaced start.
+        """
+        ...
+
+    @property
+    def fails_on_images(self) -> bool:
+        """Whether the checks on images may FAIL a result; if not (default), they WARN at most.
+
+        The image evidence is measured by the matcher ``structure``, from which another matcher may
+        differ with good reason.
+        """
+        ...
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
-        """Find where the rounds begin.
+        """Find where the rounds begin; by default, at the initial guess.
 
         Args:
             dataset: images and clouds.
             rig: lenses, and the initial guess.
-            out_of_time: returns whether to hurry.
+            out_of_time: whether the time limit has passed; then return what there is.
             progress: called as the work goes on.
         """
         ...
 
 
 class CompletedMatcher:
-    """A matcher of the user's own with the members that it lacks: the defaults, in one place."""
+    """A matcher with defaults in place of the members that it lacks: the only place of defaults."""
 
     def __init__(self, matcher: Matcher) -> None:
         self._matcher = matcher
@@ -119,13 +150,13 @@ class CompletedMatcher:
         return self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
 
 
-def completed(matcher: Matcher) -> FullMatcher:
+def to_full_matcher(matcher: Matcher) -> FullMatcher:
     """The matcher with every member.
 
     Raises:
-        ValueError: if it wants less than one round.
+        ValueError: if it has less than one round.
     """
     full = CompletedMatcher(matcher)
     if full.rounds < 1:
-        raise ValueError(f"the matcher wants {full.rounds} rounds, expected at least 1")
+        raise ValueError(f"the matcher has {full.rounds} rounds, expected at least 1")
     return full

@@ -1,4 +1,4 @@
-"""What matching and solving in rounds has produced: the input of the checks on images."""
+"""The result of matching and solving in rounds: the input of the checks on images."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from calibgraph.progress import Stopwatch
 from calibgraph.solver.solution import Solution
 
 RoundSummary = Mapping[str, Mapping[str, float]]
-"""Per camera: ``matches``, and by how much the round moved it, ``moved_deg`` and ``moved_cm``."""
+"""Per camera: number of ``matches``, and the motion of the estimate in the round, ``moved_deg`` and
+``moved_cm``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rematch:
-    """Where matching ended from two starts, the second displaced from the end of the first.
+    """The ends of matching from two starts, the second displaced from the end of the first.
 
     Attributes:
         first: the end of the rounds.
         again: the end of matching from the displaced start; None if it failed.
-        failure: why it failed.
+        failure: the error message if it failed.
     """
 
     first: Rig
@@ -33,20 +34,20 @@ class Rematch:
 
 @dataclass(frozen=True, eq=False)
 class MatchingRun:
-    """The outcome of all rounds.
+    """The result of all rounds.
 
     Attributes:
         dataset: images and clouds.
-        matcher: what found the correspondences.
+        matcher: of the rounds.
         guess: the initial guess.
-        correspondences: of the last round; of cameras that were taken from the displaced start,
-            those of its last round.
-        solution: of the joint solve of them.
-        rounds: per round and camera, see ``RoundSummary``.
+        correspondences: of the last round; for cameras taken from the displaced start, of its last
+            round.
+        solution: of the joint solve of these correspondences.
+        rounds: summary of each round.
         watch: seconds per stage.
-        missed_rounds: how many rounds there was no time for.
+        missed_rounds: number of rounds that the time limit cut off.
         out_of_time: whether the time limit has passed.
-        rematch: from a displaced start; None if it was not tried.
+        rematch: the test from a displaced start; None if it was not made.
     """
 
     dataset: Dataset

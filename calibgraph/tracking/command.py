@@ -14,7 +14,7 @@ from types import FrameType
 
 from calibgraph.errors import FileError
 from calibgraph.io.dataset import load_dataset
-from calibgraph.matching.protocol import Matcher, completed
+from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
@@ -97,7 +97,7 @@ def _opened(
     if wanted.matcher is None:
         items = frames_of(str(source[0]), follow=wanted.follow, stop=stop)
         return items, _told(DurableCalibrator(folder, wanted.rig, wanted.config), tell)
-    matcher = completed(wanted.matcher)
+    matcher = to_full_matcher(wanted.matcher)
     data = load_dataset(source, wanted.rig)
     data = replace(data, frames=data.frames[:: wanted.every])
     config = wanted.config.changed(stage1=matcher.stage1)

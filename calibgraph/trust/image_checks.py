@@ -10,7 +10,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, above, below, grade
 from calibgraph.progress import Progress
-from calibgraph.trust.image_evidence import ImageEvidence, look_again
+from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
 
 FOCAL_WARN, FOCAL_FAIL = 0.008, 0.025
@@ -74,7 +74,7 @@ def image_checks(
     Returns:
         Checks of every camera.
     """
-    evidence = look_again(dataset, rig, seed=seed, progress=progress)
+    evidence = measure_image_evidence(dataset, rig, seed=seed, progress=progress)
     offsets = time_offsets(dataset, rig, table)
     of_time = {
         name: (*pairing_checks(found), *offset_checks(offsets.get(name)))
@@ -100,7 +100,7 @@ def _clouds_checks(camera: str, of_time: Mapping[str, Sequence[Check]]) -> list[
 
 def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Judge what the images say of one camera's result."""
-    if math.isnan(found.contrast):
+    if math.isnan(found.displaced_z_score):
         text = (
             f"the images could not be asked about the result: only {found.groups} places with "
             "structure in both image and cloud"
@@ -108,14 +108,14 @@ def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
         return (Check("image evidence", "WARN", text, found.groups),)
     checks = [
         below(
-            "contrast to displaced poses", found.contrast, DISPLACED_WARN, DISPLACED_FAIL,
+            "contrast to displaced poses", found.displaced_z_score, DISPLACED_WARN, DISPLACED_FAIL,
             "standard deviations",
             "poses a degree or 40 cm away explain the images nearly as well; check the guess, "
             "or record where there is more structure",
         ),
         _frames_check(found),
     ]  # fmt: skip
-    if found.contrast >= LENS_CONTRAST and found.frames_best > FRAMES_BEST_FAIL:
+    if found.displaced_z_score >= LENS_CONTRAST and found.frames_best > FRAMES_BEST_FAIL:
         # a wrong pose, or images of other clouds, say nothing of the lens
         lens = _lens_checks(found)
         checks += [*lens, *_gain_check(found, lens)]

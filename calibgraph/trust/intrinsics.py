@@ -15,14 +15,9 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, above, grade
-from calibgraph.solver.augmented_fit import (
-    AugmentedFit,
-    camera_flow,
-    fit_augmented,
-    imitation,
-    moved_by,
-)
+from calibgraph.solver.augmented_fit import AugmentedFit, compensating_twists, fit_augmented
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
 from calibgraph.solver.residual_scale import ResidualScale
 
 Array = NDArray[np.float64]
@@ -102,7 +97,7 @@ def smell_checks(
     table = some.select(in_front).as_table(camera="camera")
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the
     # centre would explain everything.
-    columns = suspects(camera, camera_flow(at_solution, table.points_lidar_m)[0])
+    columns = suspects(camera, project_with_jacobian(at_solution, table.points_lidar_m)[0])
     checks = [
         _freed_check(_freed(name, fit, at_solution))
         for name, column in columns.items()
@@ -114,7 +109,7 @@ def smell_checks(
 
 
 def _freed(name: str, fit: AugmentedFit, camera: Camera) -> Freed:
-    moved = moved_by(camera, fit.twist).T_camera_lidar
+    moved = apply_twist(camera, fit.twist).T_camera_lidar
     degrees, centimetres = pose_difference(moved, camera.T_camera_lidar)
     return Freed(name, fit.values, fit.sigmas, degrees, centimetres)
 
@@ -142,8 +137,10 @@ def _freed_check(one: Freed) -> Check:
 
 def _sensitivity_check(camera: Camera, table: Correspondences, focal_px: Array) -> Check:
     """How much hangs on the focal length: what one percent that nobody notices would do."""
-    twist = 0.01 * imitation(camera, table, focal_px)[:, 0]
-    _, centimetres = pose_difference(moved_by(camera, twist).T_camera_lidar, camera.T_camera_lidar)
+    twist = 0.01 * compensating_twists(camera, table, focal_px)[:, 0]
+    _, centimetres = pose_difference(
+        apply_twist(camera, twist).T_camera_lidar, camera.T_camera_lidar
+    )
     return above(
         "a focal length wrong by 1 % would move the camera by",
         centimetres, SENSITIVITY_WARN_CM, np.inf, "cm",

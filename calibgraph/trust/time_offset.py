@@ -94,7 +94,7 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
     fit = fit_augmented(camera, table, motion_px[:, :, None])
     if fit is None:
         return None
-    sigma = float(np.hypot(fit.sigmas[0], SYSTEMATIC_PX / (fit.own_shares[0] * typical)))
+    sigma = float(np.hypot(fit.sigmas[0], SYSTEMATIC_PX / (fit.independent_shares[0] * typical)))
     return TimeOffset(float(fit.values[0]), sigma, frames, typical)
 
 

@@ -1,23 +1,28 @@
 """The weight-free matcher `structure`: local correlation of clouds and images, pose consensus.
 
-First every camera is found, from a guess that may be far off:
+First a global search locates every camera, from a guess that may be far off (`global_search`):
 
-1. ``responses``: small windows of LiDAR points, and what varies in them, inverse range and
-   intensity; how well the image agrees with them at all its places.
-2. ``search``: the poses at which they agree best together.
-3. ``locate``: which of these, if any, is good enough to begin from; cameras help each other.
+1. `correlation_maps`: windows of LiDAR points are correlated with the image at all its places, by
+   inverse range and intensity (`correlation_kernels`: their compiled loops).
+2. `box_search`: the poses within the range at which most windows agree (`cross_entropy`).
+3. `pose_refinement`: each candidate pose is refined, and accepted if its z-score is high enough.
+4. `proposals`: a located camera proposes poses for the others: by known relative poses, by features
+   that both see (`epipolar`), and by the guess.
 
-Then per round, from the present estimate of the poses:
+Then one round per level of a coarse-to-fine `schedule`, each from the last estimate:
 
-1. ``windows``: the windows that the camera would see.
-2. ``scores``: how well the image under each window, at every shift of a grid, agrees with it; the
-   windows of one direction and depth are one group.
-3. ``consensus``: the pose at which the groups' shifts agree best.
-4. ``peaks``: every group's own best shift next to it, with the directions that it constrains: one
-   correspondence each.
+1. `windows`: the windows of the cloud that the camera sees (`directions`: angles and visibility).
+2. `shift_scores`: the score of the image under each window, at every shift of a grid; windows of
+   one direction and depth are one group.
+3. `consensus`: the pose at which the groups' shifts agree best, and its z-score.
+4. `peaks`: each group's own best shift near the consensus, with the directions that it constrains:
+   one correspondence.
 
-Shifts and resolutions are angles, so that one schedule of rounds serves every focal length. Nothing
-depends on the order of the points in a file, or on rings.
+`matcher` joins these steps; `prepared_cloud` and `frame_cache` hold its input. A z-score is the
+summed score at a pose in standard deviations of chance agreement.
+
+Shifts and resolutions are angles, so that one schedule serves every focal length. Results depend
+neither on the order of the points in a file nor on rings.
 """
 
 from calibgraph.matching.structure.matcher import StructureMatcher

@@ -1,4 +1,4 @@
-"""The pose at which the shifts of all groups agree best."""
+"""Pose consensus: the pose at which the shifts of all groups agree best."""
 
 from __future__ import annotations
 
@@ -8,20 +8,26 @@ from numpy.typing import NDArray
 
 from calibgraph.matching.structure.cross_entropy import maximize
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.shift_scores import Scores
+from calibgraph.matching.structure.shift_scores import ShiftScores
 
 Array = NDArray[np.float64]
 
 SAMPLES, STEPS = 400, 14  # of a search
-PRIOR = 6.0  # penalty, in chance spreads of the score, of a twist sqrt(2 / 6) of the box from 0
+PRIOR = 6.0
+"""Penalty, in standard deviations of chance agreement, of a twist sqrt(2 / 6) of the box from 0."""
 
 
-def chance_spread(scores: Scores) -> float:
-    """Standard deviation of the summed score over unrelated shifts."""
+def chance_sigma(scores: ShiftScores) -> float:
+    """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
     return float(np.sqrt(scores.grids.var(axis=(1, 2), dtype=np.float64).sum()))
 
 
-def find_consensus(scores: Scores, level: Level, *, seed: int) -> tuple[Array, float]:
+def z_score(scores: ShiftScores, unknowns: Array) -> float:
+    """Summed score at unknowns (k,), in standard deviations of chance agreement."""
+    return float(sum_scores(scores, unknowns[None])[0]) / (chance_sigma(scores) + 1e-12)
+
+
+def find_consensus(scores: ShiftScores, level: Level, *, seed: int) -> tuple[Array, float]:
     """Maximise the summed score over twists, less a weak prior on their size.
 
     Args:
@@ -30,53 +36,55 @@ def find_consensus(scores: Scores, level: Level, *, seed: int) -> tuple[Array, f
         seed: of the search's samples.
 
     Returns:
-        (6,) twist (rotation [rad], translation [m]); its summed score in chance spreads.
+        (6,) twist (rotation [rad], translation [m]); its z-score.
     """
-    box = np.repeat([level.rotation_rad, level.translation_m], 3)
-    twist = search(scores, box, seed=seed, times=level.searches)
-    contrast = float(summed_score(scores, twist[None])[0]) / (chance_spread(scores) + 1e-12)
-    return twist, contrast
+    half_widths = np.repeat([level.rotation_rad, level.translation_m], 3)
+    twist = maximize_score(scores, half_widths, seed=seed, searches=level.searches)
+    return twist, z_score(scores, twist)
 
 
-def search(scores: Scores, box: Array, *, seed: int, times: int = 3, prior: float = PRIOR) -> Array:
-    """Maximise the summed score over as many unknowns as the flow has columns.
+def maximize_score(
+    scores: ShiftScores, half_widths: Array, *, seed: int, searches: int = 3, prior: float = PRIOR
+) -> Array:
+    """Maximise the summed score over as many unknowns as the Jacobian has columns.
 
     Args:
-        scores: the groups of one camera; its flow may have more columns than the six of a twist.
-        box: (k,) half-width of the search, per column.
+        scores: the groups of one camera; the Jacobian may have more columns than a twist's six.
+        half_widths: (k,) of the box that is searched.
         seed: of the search's samples.
-        times: how often to search; the best counts.
+        searches: number of searches, of which the best counts.
         prior: see ``PRIOR``.
 
     Returns:
         (k,) the best unknowns.
     """
     rng = np.random.default_rng(seed)
-    found = [_search_once(scores, box, prior, rng) for _ in range(times)]
-    return max(found, key=lambda pair: pair[1])[0]
+    maxima = [_maximize_once(scores, half_widths, prior, rng) for _ in range(searches)]
+    return max(maxima, key=lambda pair: pair[1])[0]
 
 
-def summed_score(scores: Scores, twists: Array) -> Array:
+def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
     """(n,) sum over groups of the score at the shift that each row of unknowns (n, k) implies."""
-    out = np.zeros(len(twists))
-    _sum_scores(scores.grids, scores.flow, np.ascontiguousarray(twists), out)
+    out = np.zeros(len(unknowns))
+    _sum_interpolated(scores.grids, scores.jacobian, np.ascontiguousarray(unknowns), out)
     return out
 
 
-def _search_once(
-    scores: Scores, box: Array, prior: float, rng: np.random.Generator
+def _maximize_once(
+    scores: ShiftScores, half_widths: Array, prior: float, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """One cross-entropy search: the unknowns and their penalised score."""
-    weight = 0.5 * prior * chance_spread(scores)
+    weight = 0.5 * prior * chance_sigma(scores)
 
-    def penalised(twists: Array) -> Array:
-        return np.asarray(summed_score(scores, twists) - weight * ((twists / box) ** 2).sum(axis=1))
+    def penalised(unknowns: Array) -> Array:
+        penalty = weight * ((unknowns / half_widths) ** 2).sum(axis=1)
+        return np.asarray(sum_scores(scores, unknowns) - penalty)
 
     return maximize(
         penalised,
-        start=np.zeros(len(box)),
-        spread=0.6 * box,
-        limit=box,
+        start=np.zeros(len(half_widths)),
+        sigmas=0.6 * half_widths,
+        half_widths=half_widths,
         samples=SAMPLES,
         steps=STEPS,
         rng=rng,
@@ -84,16 +92,16 @@ def _search_once(
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _sum_scores(grids, flow, twists, out):  # type: ignore[no-untyped-def]
+def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
     """Sum bilinearly interpolated scores; shifts outside the grid count 0."""
     reach = (grids.shape[1] - 1) // 2
-    for i in range(twists.shape[0]):
+    for i in range(unknowns.shape[0]):
         total = 0.0
         for g in range(grids.shape[0]):
             u = v = float(reach)
-            for k in range(flow.shape[2]):
-                u += flow[g, 0, k] * twists[i, k]
-                v += flow[g, 1, k] * twists[i, k]
+            for k in range(jacobian.shape[2]):
+                u += jacobian[g, 0, k] * unknowns[i, k]
+                v += jacobian[g, 1, k] * unknowns[i, k]
             if u < 0 or v < 0 or u >= 2 * reach or v >= 2 * reach:
                 continue
             a, b = int(u), int(v)

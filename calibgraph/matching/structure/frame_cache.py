@@ -1,4 +1,4 @@
-"""Clouds and gray images of the frames at hand, decoded once."""
+"""Cache of the prepared clouds and gray images of the current frames."""
 
 from __future__ import annotations
 
@@ -9,42 +9,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Frame
-from calibgraph.matching.structure.windows import Cloud
+from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.model.rig import Camera
 
-Version = tuple[Path, int, int]
+FileVersion = tuple[Path, int, int]
+"""Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
 
 
-class Decoded:
-    """What has been decoded. A file that was written again since is decoded again."""
+class FrameCache:
+    """Clouds and images, decoded once from round to round."""
 
     def __init__(self) -> None:
-        self._clouds: dict[Version, Cloud] = {}
-        self._images: dict[tuple[Version, int, int], NDArray[np.uint8]] = {}
+        self._clouds: dict[FileVersion, PreparedCloud] = {}
+        self._images: dict[tuple[FileVersion, int, int], NDArray[np.uint8]] = {}
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
-        """Forget what is not of these frames: along a drive memory must not grow."""
-        wanted = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
-        self._clouds = {key: value for key, value in self._clouds.items() if key[0] in wanted}
-        self._images = {key: value for key, value in self._images.items() if key[0][0] in wanted}
+        """Drop all other frames: memory stays bounded along a drive."""
+        kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
+        self._clouds = {key: value for key, value in self._clouds.items() if key[0] in kept}
+        self._images = {key: value for key, value in self._images.items() if key[0][0] in kept}
 
-    def cloud(self, frame: Frame) -> Cloud:
+    def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
-        key = _version(frame.cloud_path)
+        key = _file_version(frame.cloud_path)
         if key not in self._clouds:
-            self._clouds[key] = Cloud.of(frame.load_cloud())
+            self._clouds[key] = PreparedCloud.from_points(frame.load_cloud())
         return self._clouds[key]
 
     def image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the camera's image, gray; its size is checked against the camera's."""
-        key = (_version(frame.image_paths[name]), camera.width_px, camera.height_px)
+        key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
         if key not in self._images:
             self._images[key] = frame.load_gray(name, camera)
         return self._images[key]
 
 
-def _version(path: Path) -> Version:
-    """A file as it is now; what is not there is for the decoder to complain of."""
+def _file_version(path: Path) -> FileVersion:
+    """The version of a file; zeros if it is missing, which the decoder reports."""
     try:
         found = path.stat()
     except OSError:

@@ -1,32 +1,38 @@
-"""Each group's own best shift next to the consensus, and the directions that it constrains."""
+"""Peaks: each group's own best shift next to the consensus, as one correspondence."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.structure.shift_scores import Grids, Scores
+from calibgraph.matching.structure.shift_scores import Grids, ShiftScores
 from calibgraph.model.correspondences import Correspondences
 
 Array = NDArray[np.float64]
 
 PEAK_STEPS = 2  # how far from the consensus a group may peak, in grid steps
 MIN_QUALITY = 0.05  # as of a level; the confidence's unit
-WEAK_DIRECTION = 0.1  # of the larger curvature: below, a direction is not constrained (an edge)
+MIN_CURVATURE_RATIO = 0.1  # to the larger curvature; below, a direction is unconstrained (an edge)
 
 
-def correspondences_at_peaks(
-    scores: Scores, twist: Array, camera: str, *, min_quality: float = MIN_QUALITY
+def extract_correspondences(
+    scores: ShiftScores, unknowns: Array, camera: str, *, min_quality: float = MIN_QUALITY
 ) -> Correspondences:
-    """One correspondence per group that peaks near the consensus.
+    """Make one correspondence of each group that peaks near the consensus.
 
-    The information of a pixel is the curvature of the group's score, of rank one where the group
-    is an edge, times the mean score of its windows at the peak, their quality. The confidence is
-    twice the quality: of MIN_QUALITY, the least that a solve keeps by default.
+    The information of a pixel is the curvature of the group's score (of rank one where the group
+    is an edge) times the mean score of its windows at the peak, their quality. The confidence is
+    twice the quality, and at least twice MIN_QUALITY, which a solve keeps by default.
+
+    Args:
+        scores: the groups of one camera.
+        unknowns: (k,) the consensus, one value per column of the Jacobian.
+        camera: name of the camera.
+        min_quality: groups of less quality are dropped.
     """
     if not len(scores.counts):  # nothing of the cloud is in view
         return _no_correspondences(camera)
-    shift, hessian, peak = local_peaks(scores.grids, scores.flow @ twist)
+    shift, hessian, peak = find_local_peaks(scores.grids, scores.jacobian @ unknowns)
     quality = np.maximum(peak / scores.counts, 0.0)  # 0: no peak
     good = quality > min_quality
     scale = scores.steps_per_px
@@ -53,12 +59,12 @@ def _no_correspondences(camera: str) -> Correspondences:
     )
 
 
-def local_peaks(grids: Grids, centre: Array) -> tuple[Array, Array, Array]:
-    """Find each grid's peak near a shift, with a quadratic fit.
+def find_local_peaks(grids: Grids, centre: Array) -> tuple[Array, Array, Array]:
+    """Find each grid's peak near a shift, to a fraction of a step by a quadratic fit.
 
     Args:
         grids: (g, s, s) scores by shift [v, u].
-        centre: (g, 2) the shift (u, v) to look near, in steps.
+        centre: (g, 2) the shift (u, v) to search about, in steps.
 
     Returns:
         (g, 2) shift in steps; (g, 2, 2) Hessian of the negative score [1/steps^2]; (g,) the score
@@ -75,14 +81,14 @@ def local_peaks(grids: Grids, centre: Array) -> tuple[Array, Array, Array]:
     column = base[:, 0] + span[top % len(span)]
     around = np.arange(-1, 2)
     near = grids[index, row[:, None, None] + around[:, None], column[:, None, None] + around]
-    offset, hessian = _quadratic(near.astype(np.float64))
+    offset, hessian = _fit_quadratics(near.astype(np.float64))
     inside = (np.abs(offset).max(axis=1) < 1.5) & (np.abs(centre).max(axis=1) < limit)  # noqa: PLR2004
     shift = np.stack([column, row], axis=1) - reach + np.clip(offset, -1, 1)
     return shift, hessian, np.where(inside, near[:, 1, 1], -np.inf)
 
 
-def _quadratic(patches: Array) -> tuple[Array, Array]:
-    """Least-squares quadratic of 3x3 scores (g, 3, 3), [v, u], its weak directions dropped.
+def _fit_quadratics(patches: Array) -> tuple[Array, Array]:
+    """Fit a quadratic to 3x3 scores (g, 3, 3), [v, u]; unconstrained directions are dropped.
 
     Returns:
         (g, 2) offset (u, v) of the maximum; (g, 2, 2) Hessian of the negative score.
@@ -91,7 +97,7 @@ def _quadratic(patches: Array) -> tuple[Array, Array]:
     terms = np.stack([u**0, u, v, u**2 / 2, u * v, v**2 / 2]).reshape(6, 9).T
     fit = patches.reshape(len(patches), 9) @ np.linalg.pinv(terms).T
     values, vectors = np.linalg.eigh(-fit[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
-    kept = values > np.maximum(WEAK_DIRECTION * values[:, 1:], 1e-9)
+    kept = values > np.maximum(MIN_CURVATURE_RATIO * values[:, 1:], 1e-9)
     inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
     along = np.einsum("gji,gj->gi", vectors, fit[:, 1:3]) * inverse
     offset = np.einsum("gij,gj->gi", vectors, along)

@@ -1,4 +1,4 @@
-"""The rounds of the matcher: how far it looks, and how finely. All in angles."""
+"""The coarse-to-fine schedule: the reach and the resolution of each round, as angles."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Level:
-    """One round's reach and resolution.
+    """Reach and resolution of one level of the schedule.
 
     Attributes:
         step_rad: step of the grid of shifts, and pixel of the down-scaled image.
         reach_rad: largest shift that is scored.
         rotation_rad, translation_m: half-widths of the pose search, per axis.
         spacing_rad: spacing of the LiDAR samples in a window.
-        strict: score for accuracy, not for reach: leave out windows that hold an occluded point
-            (unbiased), not only the point (more windows: what the coarse search needs where
-            sensors are far apart); let windows keep their linear parts; and score their
-            log-likelihood, so that one that fits well outweighs many that fit somewhat.
+        fine: score for accuracy, not for reach. Windows that hold an occluded point are left out
+            (unbiased); a coarse level leaves out only the point (more windows, which it needs
+            where sensors are far apart). Windows keep their linear parts. Their log-likelihoods
+            are summed, so that one window that fits well outweighs many that fit somewhat.
         stride_spacings: spacing of the windows, in sample spacings.
-        blur_steps: Gaussian blur of the image, in steps.
-        group_rad: cell of directions in which the shift is nearly one.
-        max_windows: per camera, over all frames: bounds the time. More of them average more of the
-            image; what one place shows cannot be averaged out.
-        searches: how often the pose is searched; the best counts. Once is enough where one
+        blur_steps: standard deviation of the Gaussian blur of the image, in steps.
+        group_rad: cell of directions in which the shift is nearly constant.
+        max_windows: per camera, over all frames: bounds the time. More windows average more of
+            the image; errors that all windows of a place share remain.
+        searches: number of pose searches, of which the best counts. One is enough where a single
             maximum is in reach.
         min_quality: least mean score of a group's windows at its peak, above the grid's mean.
     """
@@ -35,7 +35,7 @@ class Level:
     rotation_rad: float
     translation_m: float
     spacing_rad: float
-    strict: bool = False
+    fine: bool = False
     stride_spacings: float = 2.0
     blur_steps: float = 1.0
     group_rad: float = np.radians(3.8)
@@ -50,7 +50,8 @@ def _level(
     rotation_deg: float,
     translation_m: float,
     spacing_deg: float,
-    strict: bool,
+    *,
+    fine: bool,
 ) -> Level:
     return Level(
         step_rad=np.radians(step_deg),
@@ -58,24 +59,25 @@ def _level(
         rotation_rad=np.radians(rotation_deg),
         translation_m=translation_m,
         spacing_rad=np.radians(spacing_deg),
-        strict=strict,
-        searches=1 if strict else 3,
+        fine=fine,
+        searches=1 if fine else 3,
     )
 
 
-def _final(level: Level) -> Level:
-    """More windows, in smaller groups, of which only clear ones count."""
+def _last(level: Level) -> Level:
+    """The level with more windows, in smaller groups, and a higher quality demanded of them."""
     return replace(level, group_rad=np.radians(2.0), max_windows=30_000, min_quality=0.1)
 
 
 LEVELS = (
-    _level(0.25, 4.5, 2.5, 0.25, 0.35, False),
-    _level(0.20, 2.5, 1.2, 0.25, 0.30, False),
-    _level(0.14, 1.8, 0.7, 0.20, 0.20, False),
-    _level(0.10, 1.2, 0.7, 0.25, 0.14, True),
-    _final(_level(0.06, 0.8, 0.7, 0.25, 0.14, True)),
-    _final(_level(0.06, 0.6, 0.7, 0.25, 0.14, True)),
+    _level(0.25, 4.5, 2.5, 0.25, 0.35, fine=False),
+    _level(0.20, 2.5, 1.2, 0.25, 0.30, fine=False),
+    _level(0.14, 1.8, 0.7, 0.20, 0.20, fine=False),
+    _level(0.10, 1.2, 0.7, 0.25, 0.14, fine=True),
+    _last(_level(0.06, 0.8, 0.7, 0.25, 0.14, fine=True)),
+    _last(_level(0.06, 0.6, 0.7, 0.25, 0.14, fine=True)),
 )
 """From errors of about 2.5 degrees and 25 cm down to the resolution of a camera pixel.
 
-The last searches stay wide: in narrow ones the prior would hold the poses where they began."""
+The last levels search as widely as those before: in a narrow search the prior would hold a camera
+at its start."""

@@ -1,4 +1,4 @@
-"""How well the image agrees with a group of LiDAR windows, at every shift of a grid."""
+"""Shift scores: agreement of the image with each group of LiDAR windows, over a grid of shifts."""
 
 from __future__ import annotations
 
@@ -10,29 +10,32 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.windows import WINDOW_POINTS, Cloud, build_windows, view_angles
+from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows, build_windows
 from calibgraph.model.rig import Camera
-from calibgraph.solver.augmented_fit import camera_flow
+from calibgraph.solver.camera_twist import project_with_jacobian
 
 Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 
-GRAY_NOISE = 0.05  # logarithm of gray: below, a window counts as flat in the image
-OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly one
+GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
+OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly constant
 MIN_GROUP_WINDOWS = 4
-LEAST_REACH = 6  # steps: with wide or small lenses a pixel is much of a level's reach
-MISFIT = 0.1  # share of its variance that an image cannot share with a cloud, at its best
+MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
+MIN_RESIDUAL_SHARE = 0.1  # of an image's variance, which no cloud explains
 
 
 @dataclass(frozen=True, eq=False)
-class Scores:
+class ShiftScores:
     """Score grids of the groups of one camera.
 
     Attributes:
         grids: (g, s, s) score by shift [v, u], from -reach to reach steps; the mean is zero.
-        flow: (g, 2, 6) shift in steps (u, v) per unit of the twist xi = (rotation [rad],
-            translation [m]) of T_camera_lidar = exp(xi) estimate.
+        jacobian: (g, 2, 6) derivative of the shift in steps (u, v) by the twist xi = (rotation
+            [rad], translation [m]) of T_camera_lidar = exp(xi) estimate.
         points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame.
         pixels_px: (g, 2) where it projects at the estimate.
         frame: (g,) the number of its frame.
@@ -41,7 +44,7 @@ class Scores:
     """
 
     grids: Grids
-    flow: Array
+    jacobian: Array
     points_lidar_m: Array
     pixels_px: Array
     frame: NDArray[np.int64]
@@ -50,38 +53,36 @@ class Scores:
 
 
 def score_frame(
-    gray: NDArray[np.uint8], cloud: Cloud, camera: Camera, level: Level, *, frame: int, most: int
-) -> Scores:
-    """Score one image against one cloud, from the camera's present pose.
+    gray: Gray, cloud: PreparedCloud, camera: Camera, level: Level, *, frame: int, max_windows: int
+) -> ShiftScores:
+    """Score one image against one cloud, about the camera's estimated pose.
 
     Args:
         gray: (height, width) image.
         cloud: the frame's cloud.
-        camera: lens, and the estimate of the pose.
+        camera: lens, and the estimated extrinsic.
         level: reach and resolution.
         frame: number of the frame.
-        most: most windows to use.
+        max_windows: at most so many windows of the cloud.
     """
+    image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
+    windows = build_windows(cloud, camera, level, max_windows=max_windows)
+    points_lidar_m = windows.rays_m.reshape(-1, 3) + cloud.viewpoint_lidar_m(camera)
     T = camera.T_camera_lidar
-    image, scale = small_logarithm(gray, camera, level.step_rad, level.blur_steps)
-    windows = build_windows(cloud, camera, level, most)
-    points_lidar_m = windows.rays_m.reshape(-1, 3) + cloud.viewpoint_m(camera)
     points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    kept, group, groups = _groups(points[::WINDOW_POINTS], level.group_rad)
+    kept, group, groups = _group_windows(points[::WINDOW_POINTS], level.group_rad)
     pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
     places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
-    reach = max(reach, LEAST_REACH)
+    reach = max(reach, MIN_REACH_STEPS)
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    used, basis, first = windows.counts[kept], windows.basis[kept], np.array([-reach, -reach])
-    score_windows(image, places, used, basis, group, first, level.strict, grids)
-    grids -= grids.mean(axis=(1, 2), keepdims=True)
+    _add_scores(grids, image, places, windows.select(kept), group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
-    centres = _group_means(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
-    pixels_px, flow_px = camera_flow(camera, centres)
-    return Scores(
+    centres = _mean_by_group(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
+    pixels_px, jacobian_px = project_with_jacobian(camera, centres)
+    return ShiftScores(
         grids=grids,
-        flow=flow_px * scale[:, None],
+        jacobian=jacobian_px * scale[:, None],
         points_lidar_m=centres,
         pixels_px=pixels_px,
         frame=np.full(groups, frame, np.int64),
@@ -90,15 +91,15 @@ def score_frame(
     )
 
 
-def joined(scores: Sequence[Scores]) -> Scores:
-    """The groups of several frames of one camera, together."""
-    columns = ("grids", "flow", "points_lidar_m", "pixels_px", "frame", "counts")
+def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
+    """The groups of several frames of one camera in one object."""
+    columns = ("grids", "jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
-    return Scores(**stacked, steps_per_px=scores[0].steps_per_px)
+    return ShiftScores(**stacked, steps_per_px=scores[0].steps_per_px)
 
 
-def small_logarithm(
-    gray: NDArray[np.uint8], camera: Camera, step_rad: float, blur_steps: float
+def downscale_log_gray(
+    gray: Gray, camera: Camera, step_rad: float, blur_steps: float
 ) -> tuple[NDArray[np.float32], Array]:
     """Logarithm of gray, down-scaled so that a pixel is a step; its (2,) scales of u and v.
 
@@ -114,18 +115,18 @@ def small_logarithm(
     return np.ascontiguousarray(small, dtype=np.float32), scale
 
 
-def _groups(
-    seeds_camera_m: Array, cell_rad: float
+def _group_windows(
+    centres_camera_m: Array, cell_rad: float
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
-    """Group windows by direction and depth.
+    """Group windows by direction and depth; groups of too few windows are dropped.
 
     Returns:
         The kept windows (k,), the group of each (k,), and the number of groups.
     """
-    distance = np.linalg.norm(seeds_camera_m, axis=1)
+    distance = np.linalg.norm(centres_camera_m, axis=1)
     cells = np.column_stack(
         [
-            np.floor(view_angles(seeds_camera_m) / cell_rad),
+            np.floor(view_angles(centres_camera_m) / cell_rad),
             np.floor(np.log2(distance) / OCTAVES_PER_BIN),
         ]
     )
@@ -136,9 +137,25 @@ def _groups(
     return kept, group.reshape(-1).astype(np.int32), len(names)
 
 
-def _group_means(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
+def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
     sums = [np.bincount(group, column, minlength=len(counts)) for column in points.T]
     return np.stack(sums, axis=1) / counts[:, None]
+
+
+def _add_scores(
+    grids: Grids,
+    image: NDArray[np.float32],
+    places: NDArray[np.int32],
+    windows: Windows,
+    group: NDArray[np.int32],
+    *,
+    likelihood: bool,
+) -> None:
+    """Add the windows' scores to their groups' grids, and subtract each grid's mean."""
+    reach = (grids.shape[1] - 1) // 2
+    first = np.array([-reach, -reach])
+    score_windows(image, places, windows.counts, windows.basis, group, first, likelihood, grids)
+    grids -= grids.mean(axis=(1, 2), keepdims=True)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -146,11 +163,11 @@ def score_windows(image, places, counts, basis, group, origin, likelihood, grids
     """Add every window's score at all shifts to its group's grid.
 
     image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
-    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s). The
-    score is d_D^2 + d_I |d_I|: squared for depth, which has no sign in an image, and signed for
-    intensity; over the image's own variation. It is a share r of explained variance, or
-    (likelihood) the -log(1 - r) of a Gaussian window. Shifts at which a window leaves the image
-    count 0.
+    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s).
+    The score is d_D^2 + d_I |d_I|, with d the image's components along the columns of the basis,
+    over the image's own variation: squared for depth, whose sign in an image is unknown, and signed
+    for intensity. It is a share r of explained variance, or (likelihood) the -log(1 - r) of a
+    Gaussian window. Shifts at which a window leaves the image count 0.
     """
     height, width = image.shape
     rows, columns = grids.shape[1], grids.shape[2]
@@ -184,6 +201,8 @@ def score_windows(image, places, counts, basis, group, origin, likelihood, grids
                 score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
                 share = score / power
                 if likelihood:
-                    left_over = np.float32(1 + MISFIT) - abs(share)
-                    share = np.copysign(np.log(np.float32(1 + MISFIT) / left_over), share)
+                    left_over = np.float32(1 + MIN_RESIDUAL_SHARE) - abs(share)
+                    share = np.copysign(
+                        np.log(np.float32(1 + MIN_RESIDUAL_SHARE) / left_over), share
+                    )
                 grid[first - origin[0] + k] += share

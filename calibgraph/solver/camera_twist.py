@@ -1,0 +1,44 @@
+"""A camera under a twist of its extrinsic: its pose, its pixels, and their derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.model.rig import Camera
+
+Array = NDArray[np.float64]
+
+
+def apply_twist(camera: Camera, twist: Array) -> Camera:
+    """The camera at exp(twist) T_camera_lidar, to first order in the translation.
+
+    Args:
+        camera: at its estimate.
+        twist: (6,) rotation [rad] and translation [m], in the camera's axes.
+    """
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
+    step[:3, 3] = twist[3:]
+    return camera.moved_to(step @ camera.T_camera_lidar)
+
+
+def project_with_jacobian(camera: Camera, points_lidar_m: Array) -> tuple[Array, Array]:
+    """Project points, with the derivatives of the pixels by a twist of T_camera_lidar.
+
+    Args:
+        camera: lens, and the extrinsic about which is differentiated.
+        points_lidar_m: (n, 3) in the LiDAR frame.
+
+    Returns:
+        (n, 2) pixels [px]; (n, 2, 6) their derivatives by rotation [px/rad] and translation [px/m].
+    """
+    T = camera.T_camera_lidar
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    pixels, by_point = camera.lens.project_with_jacobian(points)
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    # d(exp(xi) p) / d rotation = -[p]x
+    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    return pixels, np.concatenate([by_point @ cross, by_point], axis=2)

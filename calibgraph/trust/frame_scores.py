@@ -1,0 +1,70 @@
+"""Shift scores of some frames of a dataset, from a result's poses: the input of image evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.schedule import LEVELS, Level
+from calibgraph.matching.structure.shift_scores import (
+    ShiftScores,
+    concatenate_scores,
+    score_frame,
+)
+from calibgraph.model.rig import Camera
+
+Images = Sequence[NDArray[np.uint8]]
+"""Gray images of one camera, (height, width) each, one per frame."""
+
+MAX_WINDOWS, SHARING_FRAMES = 10_000, 10  # per camera, over so many frames; of more, as many each
+WIDE, FINER = LEVELS[1], LEVELS[2]
+
+
+class FrameScorer:
+    """Scores frames in parallel; clouds are decoded once.
+
+    Args:
+        dataset: images and clouds.
+        frames: those to score.
+        pool: of threads.
+    """
+
+    def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
+        self.frames = frames
+        self._dataset = dataset
+        self._pool = pool
+        self._clouds: dict[int, PreparedCloud] = {}
+
+    def load_images(self, name: str, camera: Camera) -> list[NDArray[np.uint8]]:
+        """Gray images of a camera, one per frame."""
+        return list(self._pool.map(lambda frame: frame.load_gray(name, camera), self.frames))
+
+    def score(
+        self, images: Images, camera: Camera, level: Level, *, offset: int = 0
+    ) -> list[ShiftScores | None]:
+        """Score each image against the cloud ``offset`` frames later; None where there is none."""
+        one = partial(self._score_frame, camera=camera, level=level, offset=offset)
+        return list(self._pool.map(one, images, self.frames))
+
+    def score_together(self, images: Images, camera: Camera, level: Level) -> ShiftScores:
+        """Score all images against their own clouds."""
+        scores = self.score(images, camera, level)
+        return concatenate_scores([each for each in scores if each is not None])
+
+    def _score_frame(
+        self, gray: NDArray[np.uint8], frame: Frame, *, camera: Camera, level: Level, offset: int
+    ) -> ShiftScores | None:
+        other = self._dataset.neighbour(frame, offset) if offset else frame
+        if other is None:
+            return None
+        if other.index not in self._clouds:
+            self._clouds[other.index] = PreparedCloud.from_points(other.load_cloud())
+        most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
+        cloud = self._clouds[other.index]
+        return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)

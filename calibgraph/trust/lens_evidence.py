@@ -1,0 +1,129 @@
+"""Whether another lens fits the images better, with the pose free.
+
+A change of the lens is (3,): what is added to the logarithm of the focal length, to the first
+radial coefficient, and to the principal point along the longer side of the image (in focal
+lengths). Across that side, a principal point cannot be told from a rotation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.matching.structure.consensus import chance_sigma, maximize_score, sum_scores
+from calibgraph.matching.structure.peaks import extract_correspondences
+from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.model.rig import Camera
+from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
+from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
+
+Array = NDArray[np.float64]
+
+UNKNOWN = (math.nan,) * 3
+SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
+SEARCH_LENS = (0.08, 0.15, 0.04)  # half-widths of the change of the lens
+MAX_RADIAL = 0.3
+SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
+SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
+
+
+@dataclass(frozen=True)
+class LensEvidence:
+    """The lens that fits the images best.
+
+    Attributes:
+        change: (3,) of the lens, see above; NaN where the images do not determine it.
+        sigmas: (3,) standard deviations by the scatter of the frames, lower bounds.
+        gain: of the summed score at the best pose nearby with its own lens over that at the result,
+            in standard deviations of chance agreement.
+    """
+
+    change: tuple[float, ...] = UNKNOWN
+    sigmas: tuple[float, ...] = UNKNOWN
+    gain: float = math.nan
+
+
+def measure_lens(
+    scorer: FrameScorer, images: Images, camera: Camera, scores: ShiftScores, *, seed: int
+) -> LensEvidence:
+    """Find the lens that fits the images best, with the pose free: a search, then two fits.
+
+    Args:
+        scorer: of the frames.
+        images: of the camera.
+        camera: at the result.
+        scores: of the camera at the level ``WIDE``.
+        seed: of the search.
+    """
+    half_widths = np.array([WIDE.rotation_rad] * 3 + [SEARCH_M] * 3 + [*SEARCH_LENS])
+    smooth = replace(
+        scores,
+        grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
+        jacobian=_jacobian_with_lens(scores, camera),
+    )
+    best = maximize_score(smooth, half_widths, seed=seed, prior=SEARCH_PRIOR)
+    values = sum_scores(smooth, np.array([np.zeros(9), best]))
+    gain = float((values[1] - values[0]) / (chance_sigma(smooth) + 1e-12))
+    rough = _fit_at_peaks(camera, scores, best)
+    if rough is None:
+        return LensEvidence(gain=gain)
+    refined = change_lens(apply_twist(camera, rough.twist), rough.values)
+    fine = _fit_at_peaks(refined, scorer.score_together(images, refined, FINER), np.zeros(9))
+    if fine is None:
+        return LensEvidence(gain=gain)
+    change = tuple((rough.values + fine.values).tolist())
+    return LensEvidence(change, tuple(fine.sigmas.tolist()), gain)
+
+
+def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
+    """(n, 2, 3) derivatives of the pixels of points (n, 3) by a change of the lens [px]."""
+    T, k = camera.T_camera_lidar, camera.intrinsics_px
+    pixels, _ = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
+    focal = np.array([k.fx, k.fy])
+    off_centre = pixels - np.array([k.cx, k.cy])
+    radius = np.linalg.norm(off_centre / focal, axis=1, keepdims=True)
+    centre = np.broadcast_to(focal * _longer_side(camera), off_centre.shape)
+    return np.stack([off_centre, radius**2 * off_centre, centre], axis=2)
+
+
+def change_lens(camera: Camera, change: Array) -> Camera:
+    """The camera with its lens changed by (3,), see above."""
+    k, scale = camera.intrinsics_px, math.exp(change[0])
+    shift = change[2] * _longer_side(camera)
+    distortion = [*camera.distortion, *[0.0] * (4 - len(camera.distortion))]
+    distortion[0] += float(np.clip(change[1], -MAX_RADIAL, MAX_RADIAL))
+    values = {key: getattr(camera, key) for key in type(camera).model_fields}
+    values["intrinsics_px"] = k.model_copy(
+        update={
+            "fx": k.fx * scale,
+            "fy": k.fy * scale,
+            "cx": k.cx + shift[0] * k.fx,
+            "cy": k.cy + shift[1] * k.fy,
+        }
+    )
+    return Camera(**{**values, "distortion": tuple(distortion)})
+
+
+def _fit_at_peaks(camera: Camera, scores: ShiftScores, start: Array) -> AugmentedFit | None:
+    """Fit pose and lens to the groups' peaks next to a start (9,)."""
+    if not len(scores.counts):
+        return None
+    extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera))
+    table = extract_correspondences(extended, start, "camera")
+    return fit_augmented(camera, table, lens_jacobian_px(camera, table.points_lidar_m))
+
+
+def _jacobian_with_lens(scores: ShiftScores, camera: Camera) -> Array:
+    """(g, 2, 9) derivatives of the shifts in steps by the twist and by the lens."""
+    by_lens = lens_jacobian_px(camera, scores.points_lidar_m) * scores.steps_per_px[:, None]
+    return np.concatenate([scores.jacobian, by_lens], axis=2)
+
+
+def _longer_side(camera: Camera) -> Array:
+    """(2,) unit vector along the longer side of the image."""
+    return np.array([1.0, 0.0] if camera.width_px >= camera.height_px else [0.0, 1.0])

@@ -1,0 +1,253 @@
+"""The matcher `structure` on the sample; from its own guess, as a user calls it: test_readme.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import CorrespondenceError, Rig, StructureMatcher
+from calibgraph.matching.protocol import Start
+from calibgraph.matching.structure import global_search
+from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.progress import no_progress
+from calibgraph.rounds import match_in_rounds
+from tests.conftest import SAMPLE, Call
+from tests.matching.structure.data import (
+    far_from,
+    never,
+    with_frames_repeated,
+    with_half_images,
+    with_noise_images,
+    with_points_shuffled,
+    without_search,
+)
+
+
+def locate(data: calibgraph.Dataset, rig: Rig) -> Start:
+    return StructureMatcher().locate(data, rig, out_of_time=never, progress=no_progress)
+
+
+class TestSearch:
+    @pytest.mark.ci
+    @pytest.mark.slow
+    def test_cameras_are_found_from_far_away(self, truth: Rig) -> None:
+        far = far_from(truth, seed=1)
+        rig = Rig(cameras={name: far.cameras[name] for name in ("front_left", "left")})
+        start = locate(calibgraph.load_dataset(SAMPLE, rig), rig)
+        assert start.findings.found.keys() == rig.cameras.keys()
+        assert start.first_round == 3
+        for name, error in calibgraph.evaluate(start.rig, truth).cameras.items():
+            assert error.rotation_error_deg < 0.7, name  # the reach of the next round
+            assert error.translation_error_cm < 20, name
+
+    @pytest.mark.slow
+    def test_a_seed_determines_what_is_found(self, truth: Rig) -> None:
+        far = far_from(truth, seed=1)
+        rig = Rig(cameras={"front_left": far.cameras["front_left"]})
+        data = calibgraph.load_dataset(SAMPLE, rig).select("0:2")
+        one, two = (locate(data, data.rig) for _ in range(2))
+        for name, T in one.rig.T_camera_lidar.items():
+            np.testing.assert_array_equal(T, two.rig.T_camera_lidar[name])
+
+    def test_a_known_relative_pose_locates_a_camera(self, truth: Rig) -> None:
+        """One camera has its true guess; the guess of the other is beyond the range."""
+        names = ["front_left", "front_right"]
+        T = {n: truth.cameras[n].T_camera_lidar for n in names}
+        pair = calibgraph.RelativePose(
+            a=names[1],
+            b=names[0],
+            T_a_b=T[names[1]] @ np.linalg.inv(T[names[0]]),
+            rotation_sigma_rad=0.001,
+            translation_sigma_m=0.002,
+        )
+        turned = np.eye(4)
+        turned[:3, :3] = cv2.Rodrigues(np.radians([0.0, 60.0, 0.0]))[0]
+        cameras = {n: truth.cameras[n] for n in names}
+        cameras[names[1]] = cameras[names[1]].moved_to(turned @ T[names[1]])
+        rig = Rig(cameras=cameras, relative_poses=(pair,))
+        start = locate(calibgraph.load_dataset(SAMPLE, rig).select("0:3"), rig)
+        assert names[1] in start.findings.found
+        error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
+        assert error.rotation_error_deg < 0.7
+
+    @pytest.mark.slow
+    def test_overlap_with_another_camera_locates_a_camera(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """One camera has its true guess; the other's is far off, and no search finds it."""
+        monkeypatch.setattr(global_search, "search_box", lambda *_, **__: [])
+        far, names = far_from(truth, seed=1), ("front_left", "front_right")
+        rig = Rig(cameras={names[0]: truth.cameras[names[0]], names[1]: far.cameras[names[1]]})
+        start = locate(calibgraph.load_dataset(SAMPLE, rig).select("0:3"), rig)
+        assert names[1] in start.findings.found
+        error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
+        assert error.rotation_error_deg < 0.7
+
+    def test_a_camera_whose_images_show_noise_is_missed(
+        self, truth: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(global_search, "SEARCHES", 1)
+        rig = Rig(cameras={name: truth.cameras[name] for name in ("front_left", "left")})
+        data = calibgraph.load_dataset(SAMPLE, rig).select("0")
+        start = locate(with_noise_images(data, "left", tmp_path), rig)
+        assert start.findings.missed.keys() == {"left"}
+        np.testing.assert_allclose(
+            start.rig.T_camera_lidar["left"], truth.T_camera_lidar["left"], atol=1e-12
+        )
+        assert start.first_round == 0
+
+    @pytest.mark.slow
+    def test_missed_cameras_fail_later_solves_too(
+        self, truth: Rig, tmp_path: Path, call: Call
+    ) -> None:
+        """A search of so small a range, so far off, finds nothing."""
+        rig, table = tmp_path / "rig.yaml", tmp_path / "matches.parquet"
+        far_from(truth, seed=1).save(rig)
+        near = ("--search-deg", "0.5", "--search-m", "0.05", "--frames", "0:2")
+        code, _, err = call("match", SAMPLE, "--rig", rig, "--out", table, *near)
+        assert code == 1 and "not found: " in err, err
+        missed = set(calibgraph.load_correspondences(table).metadata["missed"])
+        assert missed and missed <= set(truth.cameras)
+        code, _, err = call("solve", rig, table, "--out", tmp_path / "out")
+        assert code == 1
+        assert "no pose within the matcher's range explains the images" in err
+
+
+class TestRounds:
+    def test_matches_are_independent_of_the_order_of_points(self, tmp_path: Path) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        given, other = (
+            match_in_rounds(d, matcher=without_search(LEVELS[:2]), progress=no_progress)
+            for d in (data, with_points_shuffled(data, tmp_path))
+        )
+        errors = calibgraph.evaluate(given.solution.solved_rig, other.solution.solved_rig)
+        for error in errors.cameras.values():
+            assert error.rotation_error_deg < 0.02
+            assert error.translation_error_cm < 0.5
+
+    def test_more_frames_do_not_give_fewer_matches(self, truth: Rig) -> None:
+        """Frames share the windows that bound the time, and a group needs some in one frame."""
+        rig = Rig(cameras={"left": truth.cameras["left"]})
+        data = calibgraph.load_dataset(SAMPLE, rig)
+        matcher = StructureMatcher()
+        few, many = (
+            len(matcher.match(repeated, rig, round_index=5, progress=no_progress))
+            for repeated in (with_frames_repeated(data, count) for count in (6, 60))
+        )
+        assert many > few
+
+    def test_images_of_320_pixels_are_matched(self, tmp_path: Path, truth: Rig) -> None:
+        """The last rounds reach few of their pixels only, by their angles."""
+        data = calibgraph.load_dataset(SAMPLE)
+        data = with_half_images(data, "left", truth.cameras["left"], tmp_path)
+        guess = calibgraph.perturb(data.rig, rotation_deg=0.5, translation_m=0.05, seed=0)
+        found = match_in_rounds(data, guess, without_search(LEVELS[3:]), progress=no_progress)
+        error = calibgraph.evaluate(found.solution.solved_rig, data.rig).cameras["left"]
+        pixel_deg = np.degrees(1 / data.rig.cameras["left"].intrinsics_px.fx)
+        assert error.rotation_error_deg < pixel_deg
+        assert error.translation_error_cm < 10
+
+    def test_a_long_drive_is_thinned_unless_all_frames_are_requested(self, truth: Rig) -> None:
+        drive = with_frames_repeated(calibgraph.load_dataset(SAMPLE, truth), 100)
+        seen = []
+
+        class Counting(StructureMatcher):
+            def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+                seen.append([frame.index for frame in dataset.frames])
+                return calibgraph.simulate_correspondences(rig, matches=100)
+
+        settings = {"search_deg": None, "search_m": None, "levels": LEVELS[:1]}
+        everything = Counting(**settings, most_frames=None)  # type: ignore[arg-type]
+        for matcher in (everything, Counting(**settings)):  # type: ignore[arg-type]
+            match_in_rounds(drive, matcher=matcher, progress=no_progress)
+        assert seen[0] == list(range(100))
+        assert len(seen[-1]) == 30 and seen[-1][0] == 0 and seen[-1][-1] == 99
+        assert set(np.diff(seen[-1])) == {3, 4}
+
+    @pytest.mark.slow
+    def test_a_seed_determines_the_result(self) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        one, two = (
+            calibgraph.calibrate(data, matcher=without_search(LEVELS[:1])) for _ in range(2)
+        )
+        for name, T in one.T_camera_lidar.items():
+            np.testing.assert_array_equal(T, two.T_camera_lidar[name])
+
+    def test_a_camera_that_sees_none_of_the_cloud_is_named(self, truth: Rig) -> None:
+        T = dict(truth.T_camera_lidar)
+        T["left"] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ T["left"]
+        data = replace(calibgraph.load_dataset(SAMPLE).select("0"), rig=truth.moved_to(T))
+        with pytest.raises(CorrespondenceError, match="camera 'left' has 0 usable"):
+            calibgraph.calibrate(data, matcher=without_search(LEVELS))
+
+
+class TestTimeLimit:
+    def test_a_result_of_fewer_rounds_is_partial(self) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        result = calibgraph.calibrate(data, matcher=without_search(LEVELS[:3]), time_limit_s=1e-3)
+        assert len(result.rounds) == 1
+        assert result.verdict.status in ("WARN", "FAIL")
+        assert any(
+            "partial: there was no time for 2 rounds of matching" in reason
+            for reason in result.verdict.reasons
+        )
+
+    def test_a_generous_limit_cuts_nothing_off(self) -> None:
+        data = calibgraph.load_dataset(SAMPLE).select("0:2")
+        run = match_in_rounds(
+            data, matcher=without_search(LEVELS[:1]), time_limit_s=600, progress=no_progress
+        )
+        assert not run.out_of_time and run.missed_rounds == 0
+
+
+class TestArguments:
+    @pytest.mark.parametrize(
+        ("ranges", "words"),
+        [
+            ({"search_deg": None}, "both ranges"),
+            ({"search_m": None}, "both ranges"),
+            ({"search_deg": 90.0}, "up to 45 deg"),
+            ({"search_m": -1.0}, "found 20 deg and -1 m"),
+            ({"search_m": float("nan")}, "found 20 deg and nan m"),
+        ],
+    )
+    def test_ranges_are_checked(self, ranges: dict[str, float | None], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            StructureMatcher(**ranges)  # type: ignore[arg-type]
+
+    def test_at_least_one_frame_is_used(self) -> None:
+        with pytest.raises(ValueError, match="at least one frame"):
+            StructureMatcher(most_frames=0)
+
+    def test_a_time_limit_is_positive(self) -> None:
+        with pytest.raises(ValueError, match="the time limit must be positive, found 0"):
+            calibgraph.calibrate(SAMPLE, time_limit_s=0)
+
+    @pytest.mark.parametrize(
+        ("arguments", "line"),
+        [
+            (("--search-deg", "far"), "--search-deg far: give a number, or none"),
+            (("--search-deg", "100"), "the search reaches up to 45 deg and 5 m per axis"),
+            (("--matcher", "m.csv", "--search-m", "1"), "--search-m is for --matcher structure"),
+            (("--time-limit-s", "-1"), "--time-limit-s"),
+        ],
+    )
+    def test_errors_are_one_line_on_the_command_line(
+        self, call: Call, tmp_path: Path, arguments: tuple[str, ...], line: str
+    ) -> None:
+        code, _, err = call("calibrate", SAMPLE, "--out", tmp_path / "out", *arguments)
+        assert code == 2
+        assert line in err and len(err.strip().splitlines()) == 1
+
+    def test_none_is_no_search(self, call: Call, tmp_path: Path) -> None:
+        out = tmp_path / "matches.parquet"
+        arguments = ("--frames", "0", "--search-deg", "none", "--time-limit-s", "0.001")
+        code, _, err = call("match", SAMPLE, "--out", out, *arguments)
+        assert code == 0, err
+        metadata = calibgraph.load_correspondences(out).metadata
+        assert metadata["range_rotation_deg"] == pytest.approx(2.5)

@@ -1,0 +1,186 @@
+"""The matcher protocol: what a matcher of your own needs, and what it may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Correspondences, Dataset, Rig
+from calibgraph.errors import CorrespondenceError
+from calibgraph.matching.protocol import Start, to_full_matcher
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.progress import Progress, no_progress
+from calibgraph.rounds import match_in_rounds
+from tests.conftest import SAMPLE
+
+
+class Minimal:
+    """The least: as the class in the README."""
+
+    rounds, stage1 = 1, "pnp"
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
+        return simulate(dataset, rig)
+
+
+@dataclass
+class Complete:
+    """Every member; its images show the truth. It records its calls."""
+
+    truth: Rig
+    rounds: int = 3
+    stage1: str = "rig"
+    most_frames: int | None = 2
+    fails_on_images: bool = True
+    tracking_rounds: tuple[int, ...] = (1,)
+    calls: list[tuple[str, int, float]] = field(default_factory=list)
+
+    def locate(
+        self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
+    ) -> Start:
+        self.calls.append(("locate", len(dataset.frames), self.error_m(rig)))
+        assert not out_of_time()
+        findings = MatcherFindings(found=dict.fromkeys(rig.cameras, 21.0), range_rotation_deg=7.0)
+        return Start(self.truth, first_round=1, findings=findings)
+
+    def match(
+        self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
+    ) -> Correspondences:
+        self.calls.append((f"match {round_index}", len(dataset.frames), self.error_m(rig)))
+        findings = MatcherFindings(z_score=dict.fromkeys(rig.cameras, 20.0))
+        return replace(simulate(dataset, self.truth), metadata=findings.to_metadata())
+
+    def error_m(self, rig: Rig) -> float:
+        errors = calibgraph.evaluate(rig, self.truth).cameras.values()
+        return max(error.translation_error_cm for error in errors) / 100
+
+
+def simulate(dataset: Dataset, rig: Rig) -> Correspondences:
+    return calibgraph.simulate_correspondences(rig, frames=len(dataset.frames), matches=100)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture(scope="module")
+def guess(truth: Rig) -> Rig:
+    return calibgraph.perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=0)
+
+
+def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
+    full = to_full_matcher(Minimal())  # type: ignore[arg-type]
+    assert (full.rounds, full.stage1) == (1, "pnp")
+    assert full.most_frames is None
+    assert full.tracking_rounds == ()
+    assert not full.fails_on_images
+    data = calibgraph.load_dataset(SAMPLE, truth)
+    start = full.locate(data, truth, out_of_time=lambda: False, progress=no_progress)
+    assert start.rig is truth and start.first_round == 0
+    assert start.findings == MatcherFindings()
+    table = full.match(data, truth, round_index=0, progress=no_progress)
+    assert len(np.unique(table.frame)) == 6
+
+
+def test_a_minimal_matcher_calibrates(truth: Rig) -> None:
+    data = calibgraph.load_dataset(SAMPLE, truth)
+    run = match_in_rounds(data, matcher=Minimal(), progress=no_progress)
+    assert len(run.rounds) == 1 and run.rematch is None
+    for error in calibgraph.evaluate(run.solution.solved_rig, truth).cameras.values():
+        assert error.rotation_error_deg < 0.1
+    assert run.solution.T_hat  # Stage 1 by PnP
+
+
+def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
+    matcher = Complete(truth)
+    data = calibgraph.load_dataset(SAMPLE, guess)
+    run = match_in_rounds(data, matcher=matcher, progress=no_progress)
+    located, first, second, near, last = matcher.calls
+    assert located[:2] == ("locate", 2) and located[2] > 0.2  # most_frames, from the guess
+    assert first == ("match 1", 2, pytest.approx(0.0, abs=1e-9))  # first_round, from the start
+    assert second[0] == "match 2"
+    assert (near[0], last[0]) == ("match 1", "match 2")  # tracking_rounds, then the last round
+    assert near[2] > 0.05 > last[2]  # from a displaced start
+    assert run.rematch is not None and run.rematch.again is not None
+    assert run.matcher.fails_on_images
+
+
+def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
+    truth: Rig, guess: Rig, tmp_path: Path
+) -> None:
+    data = calibgraph.load_dataset(SAMPLE, guess)
+    run = match_in_rounds(data, matcher=Complete(truth), progress=no_progress)
+    run.correspondences.save(tmp_path / "table.parquet")
+    table = calibgraph.load_correspondences(tmp_path / "table.parquet")
+    for found in (run.correspondences.findings, table.findings):
+        assert found.z_score == dict.fromkeys(truth.cameras, 20.0)
+        assert found.found == dict.fromkeys(truth.cameras, 21.0)
+        assert found.range_rotation_deg == 7.0
+
+
+def test_a_matcher_without_rounds_is_an_error() -> None:
+    matcher = Minimal()
+    matcher.rounds = 0
+    with pytest.raises(ValueError, match="has 0 rounds, expected at least 1"):
+        to_full_matcher(matcher)  # type: ignore[arg-type]
+
+
+FINDINGS = MatcherFindings(
+    z_score={"left": 17.5},
+    start_dependence={"left": 0.1},
+    recall={"left": 0.9},
+    failed_share={"left": 0.25},
+    found={"left": 18.0},
+    missed={"right": 3.0},
+    range_rotation_deg=20.0,
+    range_translation_m=1.5,
+    systematic_rotation_rad=0.001,
+    systematic_translation_m=0.02,
+)
+METADATA = {
+    "contrast": {"left": 17.5},
+    "start_dependence": {"left": 0.1},
+    "recall": {"left": 0.9},
+    "failed_share": {"left": 0.25},
+    "found": {"left": 18.0},
+    "missed": {"right": 3.0},
+    "range_rotation_deg": 20.0,
+    "range_translation_m": 1.5,
+    "systematic_rotation_rad": 0.001,
+    "systematic_translation_m": 0.02,
+}
+
+
+def test_findings_keep_their_keys_on_disk() -> None:
+    assert FINDINGS.to_metadata() == METADATA
+    assert MatcherFindings.from_metadata(METADATA) == FINDINGS
+
+
+def test_findings_that_are_unknown_have_no_keys() -> None:
+    assert MatcherFindings().to_metadata() == {}
+    assert MatcherFindings.from_metadata({"matcher": "mine"}) == MatcherFindings()
+
+
+def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
+    table = calibgraph.simulate_correspondences(truth, frames=1, matches=10)
+    replace(table, metadata=FINDINGS.to_metadata()).save(tmp_path / "table.parquet")
+    assert calibgraph.load_correspondences(tmp_path / "table.parquet").findings == FINDINGS
+
+
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        ({"contrast": 17.5}, "'contrast' must map camera names to numbers, found 17.5"),
+        ({"missed": {"left": "far"}}, "'missed' must map camera names to numbers"),
+        ({"range_rotation_deg": 270}, "'range_rotation_deg' must be a number from 0 to 180"),
+    ],
+)
+def test_findings_of_another_kind_are_errors(metadata: dict[str, object], words: str) -> None:
+    with pytest.raises(CorrespondenceError, match=words):
+        MatcherFindings.from_metadata(metadata)

@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import numpy as np
+
+from calibgraph import Correspondences
+from calibgraph.solver.augmented_fit import compensating_twists, fit_augmented
+from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
+from tests.conftest import make_camera, points_in_front
+
+
+def test_the_fit_is_exact_without_noise() -> None:
+    rng = np.random.default_rng(3)
+    camera, points = make_camera(), points_in_front(rng, 300)
+    column = rng.standard_normal((300, 2, 1))
+    twist = 1e-4 * rng.standard_normal(6)
+    pixels, jacobian = project_with_jacobian(camera, points)
+    table = Correspondences.from_arrays(
+        camera="front",
+        frame=np.arange(300) % 5,
+        pixels_px=pixels + jacobian @ twist + 0.7 * column[:, :, 0],
+        points_lidar_m=points,
+    )
+    fit = fit_augmented(camera, table, column)
+    assert fit is not None
+    np.testing.assert_allclose(fit.values, [0.7], rtol=1e-9)
+    np.testing.assert_allclose(fit.twist, twist, atol=1e-12)
+    seen = project_with_jacobian(apply_twist(camera, fit.twist), points)[0]
+    np.testing.assert_allclose(seen, pixels + jacobian @ twist, atol=1e-3)  # second order: 1e-7 f
+
+
+def test_an_unknown_that_the_pose_compensates_is_not_fitted() -> None:
+    points = points_in_front(np.random.default_rng(4), 100)
+    pixels, jacobian = project_with_jacobian(make_camera(), points)
+    table = Correspondences.from_arrays(
+        camera="front", frame=0, pixels_px=pixels, points_lidar_m=points
+    )
+    assert fit_augmented(make_camera(), table, jacobian[:, :, :1]) is None
+
+
+def test_compensating_twist_is_the_pose_that_imitates_an_unknown() -> None:
+    rng = np.random.default_rng(5)
+    camera, points = make_camera(), points_in_front(rng, 200)
+    pixels, jacobian = project_with_jacobian(camera, points)
+    table = Correspondences.from_arrays(
+        camera="front", frame=0, pixels_px=pixels, points_lidar_m=points
+    )
+    twist = rng.standard_normal(6)
+    found = compensating_twists(camera, table, (jacobian @ twist)[:, :, None])
+    np.testing.assert_allclose(found[:, 0], twist, rtol=1e-9)

@@ -1,0 +1,92 @@
+"""The lens that fits the images best: found where it is wrong, and left alone where it is not."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Camera, Rig
+from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
+from calibgraph.trust.frame_scores import WIDE, FrameScorer
+from calibgraph.trust.image_checks import evidence_checks
+from calibgraph.trust.image_evidence import ImageEvidence
+from calibgraph.trust.lens_evidence import (
+    LensEvidence,
+    change_lens,
+    lens_jacobian_px,
+    measure_lens,
+)
+from tests.conftest import KANNALA, RADTAN5, SAMPLE, make_camera, points_in_front
+
+NAME = "front_left"
+LENS_CHECKS = ("focal length", "radial distortion", "principal point")
+
+
+@pytest.fixture(scope="module")
+def truth() -> Camera:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml").cameras[NAME]
+
+
+def measure(camera: Camera) -> LensEvidence:
+    dataset = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
+    with ThreadPoolExecutor(2) as pool:
+        scorer = FrameScorer(dataset, dataset.frames, pool)
+        images = scorer.load_images(NAME, camera)
+        scores = scorer.score_together(images, camera, WIDE)
+        return measure_lens(scorer, images, camera, scores, seed=0)
+
+
+def statuses(lens: LensEvidence) -> dict[str, str]:
+    """Of the checks of the lens, of a calibrated pose: the true one of another lens fits less."""
+    found = ImageEvidence(
+        groups=100,
+        lens=lens.change,
+        lens_sigmas=lens.sigmas,
+        gain=lens.gain,
+        displaced_z_score=5.0,
+        frames_best=1.0,
+    )
+    return {check.name: check.status for check in evidence_checks(found)}
+
+
+@pytest.mark.parametrize(
+    ("index", "error", "name"),
+    [(0, 0.03, "focal length"), (1, -0.1, "radial distortion"), (2, 0.04, "principal point")],
+)
+def test_a_wrong_lens_is_named_and_measured(
+    truth: Camera, *, index: int, error: float, name: str
+) -> None:
+    change = np.zeros(3)
+    change[index] = error
+    # A rotation about the y axis compensates for the principal point, as in a calibration.
+    compensation = np.array([0.0, -change[2], 0.0, 0.0, 0.0, 0.0])
+    found = measure(apply_twist(change_lens(truth, change), compensation))
+    assert found.change[index] == pytest.approx(-error, abs=0.2 * abs(error) + 0.004)
+    status = statuses(found)
+    assert status[name] != "PASS"
+    assert all(status[other] == "PASS" for other in LENS_CHECKS if other != name)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        make_camera(),
+        make_camera(distortion=RADTAN5),
+        make_camera(model="fisheye", distortion=KANNALA),
+    ],
+)
+def test_the_jacobian_of_the_lens_is_its_derivative(camera: Camera) -> None:
+    points = points_in_front(np.random.default_rng(0), 200)
+    jacobian = lens_jacobian_px(camera, points)
+    step = 1e-6
+    for index in (0, 2):  # the radial column is that of an undistorted pinhole
+        change = np.zeros(3)
+        change[index] = step
+        plus, minus = change_lens(camera, change), change_lens(camera, -change)
+        difference = (
+            project_with_jacobian(plus, points)[0] - project_with_jacobian(minus, points)[0]
+        )
+        np.testing.assert_allclose(difference / (2 * step), jacobian[:, :, index], atol=1e-3)
