@@ -79,7 +79,7 @@ class CameraBlock:
 
     def scaled(self, scale: ResidualScale) -> ProjectionBlock:
         """The block with its loss, in units of the residuals' sigma."""
-        return self.block.rescaled(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
+        return self.block.rescale(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] where constrained; (n,) whether projectable."""
@@ -137,7 +137,7 @@ class CameraBlock:
         across = self._error_gradient(residuals, errors)[band]
         across *= (self._whitened_norm(residuals)[band] / errors[band])[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
-        edge = replace(self.block.select(band), sqrt_information=root).rescaled(
+        edge = replace(self.block.select(band), sqrt_information=root).rescale(
             scale=scale.loss_scale / scale.sigma, sigma=scale.sigma
         )
         added: Array = -edge.sums(pose).hessian / (2 * _GATE_BAND)

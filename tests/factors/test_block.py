@@ -130,7 +130,7 @@ def test_numbers_as_weights_equal_the_separate_factors(name: str, weights: str, 
 def test_sigma_divides_the_whitened_residuals(loss: str) -> None:
     block = with_loss(world(LENSES["pinhole"], 100), loss)
     divided = replace(block, sqrt_information=block.sqrt_information / 0.7, scale=2.0)
-    found, expected = block.rescaled(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
+    found, expected = block.rescale(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
     # Sums of 100 terms, each rounded a few times: 1e-12 of the largest is far above that.
     for a, b in zip(vars(found).values(), vars(expected).values(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
