@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.solver.factor_graph import values_of
-from factors import ProjectionBlock
+from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def cluster_robust_covariance(
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     gradients = np.zeros((len(numbers), size))
     for name, block in blocks.items():
-        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
         hessian[rows, rows] += (gate_hessian or {}).get(name, 0.0)
         own, starts = np.unique(frames[name], return_index=True)
@@ -119,11 +119,11 @@ def data_sigmas(
     cameras = list(T_camera_lidar)
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     for name, block in blocks.items():
-        rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
+        rows = pose_rows(cameras.index(name))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
         hessian[rows, rows] += sums.hessian
-    units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
     free = values < _FREE
     variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
     loose = (vectors[:, free] ** 2).sum(axis=1) > _FREE

@@ -20,7 +20,10 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.io.correspondence_tables import from_arrow
-from calibgraph.solver.preprocess import constrained_error_px, preprocess, sqrt_information
+from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.whitening import constrained_error_px, sqrt_information
+
+to_arrow = Correspondences.to_arrow
 
 to_arrow = Correspondences.to_arrow
 
