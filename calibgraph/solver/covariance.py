@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.factor_graph import values_of
+from calibgraph.solver.factor_graph import to_values
 from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]
@@ -134,7 +134,7 @@ def pose_hessian(
     graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
 ) -> Array:
     """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
-    values = values_of(cameras, T_camera_lidar)
+    values = to_values(cameras, T_camera_lidar)
     hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
     keys = list(values.keys())
     for index in range(graph.size()):

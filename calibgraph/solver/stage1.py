@@ -85,7 +85,7 @@ def _estimate_camera(
     T_camera_lidar = np.array([*by_frame.values()]).reshape(-1, 4, 4)
     kept = T_camera_lidar[are_near_median(T_camera_lidar)]
     return CameraStage1(
-        T_camera_lidar=aggregate(kept, config.aggregate) if len(by_frame) else None,
+        T_camera_lidar=aggregate(kept, config.aggregate) if by_frame else None,
         by_frame=MappingProxyType(by_frame),
         per_frame=kept,
         failed_frames=len(frames) - len(kept),

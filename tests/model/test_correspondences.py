@@ -25,8 +25,6 @@ from calibgraph.solver.whitening import constrained_error_px, sqrt_information
 
 to_arrow = Correspondences.to_arrow
 
-to_arrow = Correspondences.to_arrow
-
 
 def table(**changes: Any) -> Correspondences:
     """Four correspondences of two cameras and two frames."""
