@@ -10,7 +10,7 @@ import pytest
 
 from calibgraph import DatasetError, FileError, Rig, load_dataset, load_rig
 from calibgraph.io.clouds import load_cloud
-from calibgraph.io.dataset import load_image
+from calibgraph.io.images import load_image
 from tests.conftest import SAMPLE, make_camera
 
 CLOUD = np.random.default_rng(0).normal(size=(500, 4)).astype(np.float32)
