@@ -24,7 +24,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.factor_graph import pose_key, prior_graph, values_of
+from calibgraph.solver.factor_graph import pose_key, prior_graph, to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from factors import block_factor
 
@@ -80,7 +80,7 @@ def plain_isam2(count: int) -> dict[int, float]:
     isam = gtsam.ISAM2(parameters)
     names = list(RIG.cameras)
     isam.update(
-        prior_graph(names, RIG.T_camera_lidar, weight=1.0), values_of(names, RIG.T_camera_lidar)
+        prior_graph(names, RIG.T_camera_lidar, weight=1.0), to_values(names, RIG.T_camera_lidar)
     )
     seconds = []
     for table in frames(count):

@@ -33,7 +33,7 @@ from calibgraph import Camera, MatcherErrors, Rig, perturb, preset, simulate_cor
 from calibgraph.evaluation.baselines import minimize_trf, prior_rows
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.factor_graph import joined, objective_graph, pose_key, values_of
+from calibgraph.solver.factor_graph import join, objective_graph, pose_key, to_values
 from calibgraph.solver.objective import Objective
 from factors import projection_factor
 
@@ -181,7 +181,7 @@ def gtsam_python(world: World) -> Passes:
 
 def _start(world: World) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     known = objective_graph(world.rig, world.hat, CONFIG, "full")
-    return joined(known), values_of(world.cameras, world.hat)
+    return join(known), to_values(world.cameras, world.hat)
 
 
 def _gtsam_poses(world: World, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Passes:

@@ -91,7 +91,7 @@ def independent(solved: Solution) -> Array:
     joint = np.zeros((12, 12))
     for place, (name, matches) in enumerate(solved.inliers.blocks.items()):
         rows = slice(6 * place, 6 * place + 6)
-        block = matches.scaled(solved.scales[name])
+        block = matches.with_scale(solved.scales[name])
         sums = block.sums(to_T_lidar_camera(solved.poses[name]))
         joint[rows, rows] = np.linalg.inv(sums.hessian)
     return joint

@@ -22,7 +22,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
-from calibgraph.progress import Progress, no_progress
+from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
@@ -118,7 +118,8 @@ def to_calibration(solution: Solution, guess: Rig | None = None) -> Calibration:
         guess: the first guess, if the solve started from a better one.
     """
     guess = guess or solution.rig
-    with solution.watch("checks"):
+    watch = Stopwatch()
+    with watch("checks"):
         assessment = assess(solution, guess)
     return Calibration(
         rig=solution.solved_rig,
@@ -128,7 +129,7 @@ def to_calibration(solution: Solution, guess: Rig | None = None) -> Calibration:
         camera_verdicts=assessment.verdicts,
         residuals=assessment.residuals,
         counts={name: dict(counts) for name, counts in solution.counts.items()},
-        timings_s=solution.watch.seconds,
+        timings_s={**solution.timings_s, **watch.seconds},
         terms=solution.terms,
         config=solution.config,
         stage1_T_camera_lidar=solution.T_hat,

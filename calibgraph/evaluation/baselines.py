@@ -198,7 +198,7 @@ def oracle_solve(rig: Rig, table: Correspondences, truth: Transforms, config: Co
         config: settings; those of the preset ``auto``, say.
     """
     matches = {
-        name: m.weighted(oracle_weights(m, truth[name]))
+        name: m.with_weights(oracle_weights(m, truth[name]))
         for name, m in camera_blocks(rig, table, config).items()
     }
     alone = Rig(lidar=rig.lidar, cameras=rig.cameras)

@@ -82,7 +82,7 @@ class Bench:
         """PnP of the first frame that it gives a pose of."""
         _ = self.aggregated("median")  # there is one
         found = self.sample.stage1(self.theirs)
-        return {name: camera.solved[min(camera.solved)] for name, camera in found.items()}
+        return {name: camera.by_frame[min(camera.by_frame)] for name, camera in found.items()}
 
     def of_paper(self, terms: Terms) -> Transforms:
         """The paper's solver, from its Stage 1."""

@@ -110,7 +110,7 @@ def _errors(matches: CameraBlock, T_camera_lidar: Array, gate_px: float) -> Erro
 
 
 def _constrained(residuals: Array, information: Array | None) -> Array:
-    """(n, 2) I^(1/2) r / lambda_max^(1/2): as long as ``preprocess.constrained_error_px`` says.
+    """(n, 2) I^(1/2) r / lambda_max^(1/2): as long as ``whitening.constrained_error_px``.
 
     The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).
     """

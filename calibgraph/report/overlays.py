@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.clouds import load_cloud
-from calibgraph.io.dataset import load_image
+from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Camera
 from calibgraph.report.frame_errors import BeforeAfter, Errors, shown_frame

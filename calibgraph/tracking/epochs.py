@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, merged
+from calibgraph.solver.camera_block import MIN_MATCHES, merge
 from calibgraph.tracking.drift import drifting, told
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
@@ -107,11 +107,11 @@ def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
     if not raw:
         return nothing
     pose, scale = epoch.poses[camera], state.cameras[camera].scale
-    everything = merged(raw)
+    everything = merge(raw)
     inliers = everything.without_outliers(to_T_camera_lidar(pose), scale)
     if len(inliers.frame) < MIN_MATCHES:
         return nothing
-    block = inliers.scaled(scale)
+    block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
     gradients = block.frame_sums(pose, np.append(starts, len(inliers.frame))).gradient
     scores[np.searchsorted(numbers, own)] = gradients

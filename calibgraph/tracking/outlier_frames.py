@@ -81,6 +81,6 @@ def refined(
         inliers = matches.without_outliers(T, wide)
         if len(inliers.frame) < MIN_MATCHES:
             return start
-        graph = projection_graph(["camera"], {"camera": inliers.scaled(wide)})
+        graph = projection_graph(["camera"], {"camera": inliers.with_scale(wide)})
         T = optimize(graph, ["camera"], {"camera": T}).T_camera_lidar["camera"]
     return to_T_lidar_camera(T)

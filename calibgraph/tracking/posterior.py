@@ -39,7 +39,7 @@ def quadratic(
     Returns:
         (6, 6) true Hessian of half the cost near the pose; (6,) gradient at the reference.
     """
-    block = used.scaled(scale)
+    block = used.with_scale(scale)
     hessian = true_hessian(raw, block, scale, pose)
     gradient = block.sums(pose).gradient + hessian @ step_between(pose, reference)
     return hessian, gradient

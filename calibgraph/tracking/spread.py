@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import ResidualScale, scale_from, settled_spread
+from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Spread:
 
     def scale(self, config: Config) -> ResidualScale:
         """The scale of all the residuals, as ``Matches.scale`` would find it."""
-        sigma_px, spread = (settled_spread(_Quantiles(counts)) for counts in self.counts)
+        sigma_px, spread = (iterate_spread(_Quantiles(counts)) for counts in self.counts)
         return scale_from(sigma_px, max(spread, self.least), config)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merged
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.tracking.drift import drifting
 from calibgraph.tracking.epoch_summary import Memory, step_between
 from calibgraph.tracking.events import (
@@ -182,7 +182,7 @@ def _after(state: State, found: Found) -> Posterior:
             continue
         near = found.suspects.get(camera, ())
         start = near[-1].pose if near else state.poses[camera]
-        raw = merged(parts)
+        raw = merge(parts)
         pose = refined(raw, start, known.scale, state.config)
         used = raw.without_outliers(to_T_camera_lidar(pose), known.scale)
         if len(used.frame) >= MIN_MATCHES:
@@ -300,7 +300,7 @@ def _fits_better(
         return None
     gain = 0.0
     for camera, raw in seen.items():
-        block = raw.scaled(state.cameras[camera].scale)
+        block = raw.with_scale(state.cameras[camera].scale)
         before, after = (float(block.sums(pose).cost) for pose in poses[camera])
         gain += before - after
     return gain > 0

@@ -298,13 +298,13 @@ class IncrementalCalibrator:
         if not agreeing:
             return {}
         scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
-        places = self._window.add({c: m.scaled(scales[c]) for c, m in agreeing.items()})
+        places = self._window.add({c: m.with_scale(scales[c]) for c, m in agreeing.items()})
         gated = {
             c: m.without_outliers(to_T_camera_lidar(self._window.pose(c)), scales[c])
             for c, m in agreeing.items()
         }
         used = {c: m for c, m in gated.items() if len(m.frame) >= MIN_MATCHES}
-        self._window.replace(places, {c: m.scaled(scales[c]) for c, m in used.items()})
+        self._window.replace(places, {c: m.with_scale(scales[c]) for c, m in used.items()})
         self._take_poses()
         open_frame = self._state.epochs[-1].frames[-1]
         for camera, inliers in used.items():

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import CameraBlock, merged
-from calibgraph.solver.factor_graph import joined, objective_graph, pose_key
+from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
@@ -50,10 +50,10 @@ class Window:
             for camera, pose in enumerate(epoch.poses):
                 if self._walks[camera] or epoch is state.epochs[-1]:
                     values.insert(self._key(place, camera), pose)
-        graph = joined(self._memory_graph(state), self._walk_graph(state), known_of_poses(state))
+        graph = join(self._memory_graph(state), self._walk_graph(state), known_of_poses(state))
         for camera, known in enumerate(state.cameras):
             for key, seen in self._by_key(state, camera).items():
-                graph.add(block_factor(key, merged(seen).scaled(known.scale)))
+                graph.add(block_factor(key, merge(seen).with_scale(known.scale)))
         self._isam.update(graph, values)
 
     def add(self, blocks: Mapping[int, ProjectionBlock]) -> list[int]:

@@ -85,7 +85,7 @@ def assess(fit: Solution, guess: Rig) -> Assessment:
         guess: the rig as it was guessed.
     """
     matches, poses = fit.objective.blocks, fit.T_camera_lidar
-    residuals = {name: m.summary(poses[name], fit.scales[name]) for name, m in matches.items()}
+    residuals = {name: m.at(poses[name]).summary(fit.scales[name]) for name, m in matches.items()}
     scatter = scatter_covariance(fit.inliers, poses, fit.scales)
     joint = (
         None
@@ -140,7 +140,7 @@ def scatter_covariance(inliers: Objective, poses: Transforms, scales: Scales) ->
     if not inliers.uses_correspondences:
         return None
     return cluster_robust_covariance(
-        {name: m.scaled(scales[name]) for name, m in inliers.blocks.items()},
+        {name: m.with_scale(scales[name]) for name, m in inliers.blocks.items()},
         {name: m.frame for name, m in inliers.blocks.items()},
         inliers.pose_graph,
         poses,
@@ -178,7 +178,7 @@ def _data_sigmas(fit: Solution) -> Array | None:
     """(N, 6) what correspondences and measured relative poses could tell at best."""
     if not fit.inliers.uses_correspondences:
         return None
-    blocks = {name: m.scaled(fit.scales[name]) for name, m in fit.inliers.blocks.items()}
+    blocks = {name: m.with_scale(fit.scales[name]) for name, m in fit.inliers.blocks.items()}
     known = relative_pose_graph(fit.inliers.cameras, fit.rig.relative_poses)
     return data_sigmas(blocks, known, fit.T_camera_lidar)
 

@@ -45,7 +45,10 @@ def weaknesses(fit: Solution, camera: str, covariance: Array | None) -> tuple[st
 
 def _at_best(matches: CameraBlock, fit: Solution, camera: str) -> Array | None:
     """(6, 6) inverse of the information of the matches; None where it has none."""
-    block, pose = matches.scaled(fit.scales[camera]), to_T_lidar_camera(fit.T_camera_lidar[camera])
+    block, pose = (
+        matches.with_scale(fit.scales[camera]),
+        to_T_lidar_camera(fit.T_camera_lidar[camera]),
+    )
     hessian = block.sums(pose).hessian
     units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
@@ -111,7 +114,7 @@ def prior_shares(fit: Solution) -> dict[str, float]:
     for name, matches in fit.inliers.blocks.items():
         if fit.objective.uses_correspondences:
             rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
-            block = matches.scaled(fit.scales[name])
+            block = matches.with_scale(fit.scales[name])
             hessian[rows, rows] += robust_hessian(
                 block, to_T_lidar_camera(fit.T_camera_lidar[name])
             )

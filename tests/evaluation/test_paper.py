@@ -59,7 +59,7 @@ def cost_left_by_trf(seed: int) -> list[float]:
     for name, matches in ours.inliers.blocks.items():
         pose, other = to_T_lidar_camera(ours.T_camera_lidar[name]), to_T_lidar_camera(theirs[name])
         away = pose.localCoordinates(other)
-        hessian = matches.scaled(ours.scales[name]).sums(pose).hessian
+        hessian = matches.with_scale(ours.scales[name]).sums(pose).hessian
         left.append(float(away @ hessian @ away) / ours.optimum.cost)
     return left
 

@@ -23,7 +23,7 @@ from calibgraph.report import with_files_of, write_report
 from calibgraph.report.frame_errors import _constrained, errors_of
 from calibgraph.report.plots import _arrow_factor, _cell_means
 from calibgraph.report.worked_point import worked_point
-from calibgraph.solver.preprocess import constrained_error_px
+from calibgraph.solver.whitening import constrained_error_px
 from tests.conftest import ROOT, SAMPLE, Call, make_camera, stereo_relative_pose
 
 MOST_BYTES = 6_000_000

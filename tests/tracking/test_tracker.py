@@ -390,7 +390,7 @@ def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> Non
         step[axis] = 4e-4  # 0.3 px, as wide as the band
         pulls = [
             matches.without_outliers(pose.retract(way * step).inverse().matrix(), scale)
-            .scaled(scale)
+            .with_scale(scale)
             .sums(pose)
             .gradient
             for way in (1, -1)

@@ -1,4 +1,4 @@
-"""A table that is read in parts gives exactly what the whole table gives, in bounded memory."""
+"""The filters keep the right rows; a table in parts gives what the whole table gives."""
 
 from __future__ import annotations
 
@@ -26,13 +26,17 @@ from calibgraph import (
 from calibgraph.io import correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
+from tests.model.test_correspondences import table
 
 to_arrow = Correspondences.to_arrow
+
 
 COLUMNS = (
     "frame", "pixels_px", "points_lidar_m", "confidence", "information_px", "stamp_ns",
     "point_index",
 )  # fmt: skip
+
+
 SMALL_PART, FEW_MERGED = 257, 300
 
 
@@ -228,3 +232,42 @@ def test_one_row_group_of_a_file_is_in_memory(pair: Rig, tmp_path: Path) -> None
     held = [pa.total_allocated_bytes() - before for _ in correspondence_tables.parts_of_file(path)]
     assert len(held) == 24
     assert max(held) < path.stat().st_size / 4
+
+
+def test_preprocessing_keeps_the_best_of_each_cell(pair: Rig) -> None:
+    kept = preprocess.preprocess(pair, table(), Config())
+    # Rows 1 and 3 share a camera, frame and cell: the more confident one stays.
+    assert kept.table.confidence.tolist() == pytest.approx([0.9, 0.8, 1.0])
+    assert kept.counts["left"] == {
+        "given": 3, "projectable": 3, "confident": 3, "best_in_cell": 2, "capped": 2,
+    }  # fmt: skip
+
+
+def test_preprocessing_counts_at_every_filter(pair: Rig) -> None:
+    given = simulate_correspondences(pair, frames=3, matches=400)
+    points = given.points_lidar_m.copy()
+    points[:50] *= -1  # behind the camera
+    behind = Correspondences.from_arrays(
+        camera=np.array(given.cameras)[given.camera_index],
+        frame=given.frame,
+        pixels_px=given.pixels_px,
+        points_lidar_m=points,
+        confidence=given.confidence,
+    )
+    config = Config(confidence_min=0.5, matches_max=100)
+    kept = preprocess.preprocess(pair, behind, config)
+    counts = kept.counts["left"]
+    assert counts["given"] == 1200
+    assert counts["projectable"] == 1150
+    assert counts["confident"] == np.count_nonzero(behind.of_camera("left").confidence[50:] >= 0.5)
+    assert counts["best_in_cell"] < counts["confident"]
+    assert counts["capped"] == 300
+    per_frame = np.bincount(kept.table.of_camera("left").frame)
+    assert per_frame.tolist() == [100, 100, 100]
+    # The cap keeps the most confident.
+    assert kept.table.confidence.min() > config.confidence_min + 0.1
+
+
+def test_preprocessing_names_an_unknown_camera(pair: Rig) -> None:
+    with pytest.raises(CorrespondenceError, match="camera 'rear' of the correspondences"):
+        preprocess.preprocess(pair, table(camera="rear"), Config())
