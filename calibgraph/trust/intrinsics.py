@@ -154,7 +154,9 @@ def _check_sensitivity(camera: Camera, table: Correspondences, focal_px: Array) 
         focal_px: (n, 2, 1) displacement of their pixels per relative change of the focal length.
     """
     twist = 0.01 * compensating_twists(camera, table, focal_px)[:, 0]
-    _, centimetres = pose_difference(apply_twist(camera, twist).T_camera_lidar, camera.T_camera_lidar)
+    _, centimetres = pose_difference(
+        apply_twist(camera, twist).T_camera_lidar, camera.T_camera_lidar
+    )
     return threshold("focal_sensitivity").check(centimetres)
 
 

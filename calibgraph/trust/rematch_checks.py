@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Mapping
 
+from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import Check
 from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.thresholds import threshold
-
-Array = NDArray[np.float64]
 
 REMATCH_DEG, REMATCH_M = 0.5, 0.08
 """How far the start of matching again is displaced from the result."""
@@ -33,18 +31,28 @@ def last_round_checks(evidence: RunEvidence) -> Checks:
 
 def repeated_cloud_checks(evidence: RunEvidence) -> Checks:
     """Whether two frames have the same cloud: they are not independent."""
-    seen: dict[str, str] = {}
-    for frame in evidence.run.dataset.frames:
-        digest = evidence.hashes[str(frame.cloud_path)]
-        if digest in seen:
+    checks = check_repeated_clouds(evidence.run.dataset, evidence.hashes)
+    return {name: checks for name in evidence.solution.cameras}
+
+
+def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
+    """The first two frames with the same cloud, if any.
+
+    Args:
+        dataset: its frames.
+        hashes: of the files, by path.
+    """
+    names: dict[str, str] = {}
+    for frame in dataset.frames:
+        digest = hashes[str(frame.cloud_path)]
+        if digest in names:
             text = (
-                f"frames {seen[digest]} and {frame.name} have the same cloud, and count as if "
+                f"frames {names[digest]} and {frame.name} have the same cloud, and count as if "
                 "independent; remove one"
             )
-            check = Check("repeated frames", "WARN", text)
-            return {name: [check] for name in evidence.solution.cameras}
-        seen[digest] = frame.name
-    return {}
+            return [Check("repeated frames", "WARN", text)]
+        names[digest] = frame.name
+    return []
 
 
 def rematch_checks(evidence: RunEvidence) -> Checks:

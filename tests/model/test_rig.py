@@ -208,3 +208,11 @@ def test_perturb_uniform_stays_in_its_box(pair: Rig) -> None:
 
 def test_errors_are_one_line() -> None:
     assert str(CalibrationError("a\n  b")) == "a b"
+
+
+def test_a_changed_lens_is_not_the_old_one(pair: Rig) -> None:
+    camera = pair.cameras["left"]
+    other = camera.model_copy(update={"distortion": (-0.3, 0.1, 0.0, 0.0)})
+    point = np.array([[1.0, 0.5, 4.0]])
+    assert np.abs(other.lens.project(point)[0] - camera.lens.project(point)[0]).max() > 1
+    assert camera.moved_to(np.eye(4)).lens is camera.lens
