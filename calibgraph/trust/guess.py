@@ -85,7 +85,7 @@ def compare_with_other_guesses(
     if not ratios:
         return []
     other = min(ratios, key=lambda name: ratios[name])
-    name = f"distance of it and {other} to each other's guess over that to their own"
+    name = f"distance of this camera and {other} to each other's guess over that to their own"
     return [threshold("swapped_cameras").check(ratios[other], name=name)]
 
 

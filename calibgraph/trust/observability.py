@@ -96,7 +96,7 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
     if far < _FAR_M:
         words.append(f"nothing farther than {far:.2g} m")
     if far < _SHALLOW * near:
-        words.append("all at about one distance: turn and shift are hard to tell apart")
+        words.append("all at about one distance: turn and shift are hard to distinguish")
     return words
 
 

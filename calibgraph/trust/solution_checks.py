@@ -25,7 +25,9 @@ def estimate_checks(evidence: Evidence) -> Checks:
 def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
     if estimate.residuals is None:
-        text = f"{estimate.used} usable correspondences, too few: known only by relative_poses"
+        text = (
+            f"{estimate.used} usable correspondences, too few: determined by relative_poses alone"
+        )
         return [Check("correspondences", "WARN", text, estimate.used)]
     return [check for function in ESTIMATE_CHECKS for check in function(estimate)]
 
