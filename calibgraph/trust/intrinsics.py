@@ -146,7 +146,7 @@ def _check_freed(freed: FreedParameter) -> Check:
 
 
 def _check_sensitivity(camera: Camera, table: Correspondences, focal_px: Array) -> Check:
-    """How far a focal length that is wrong by one percent, which is easily overlooked, moves the camera.
+    """How far a focal length wrong by one percent, easily overlooked, moves the camera.
 
     Args:
         camera: at the solution.
