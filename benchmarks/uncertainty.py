@@ -20,9 +20,9 @@ from scipy.stats import chi2
 
 from calibgraph import Camera, Config, Intrinsics, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.geometry import relative_covariance, to_T_lidar_camera, twist_between
-from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
+from calibgraph.trust.evidence import Evidence
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
     rig = stereo()
     table = simulate_correspondences(rig, frames=frames, matches=matches, errors=ERRORS, seed=seed)
     solved = solve_joint(rig, table, Config())
-    ours = to_calibration(solved).joint_covariance
+    ours = Evidence(solved, guess=rig).joint_covariance
     assert ours is not None
     errors = np.concatenate(
         [twist_between(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]

@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.model.verdict import Check, Verdict, above
+from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 from calibgraph.tracking.window import known_of_poses
-from calibgraph.trust.assess import relative_pose_conflict
-from calibgraph.trust.solution_checks import Conflict, Evidence, camera_verdict
+from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
+from calibgraph.trust.solution_checks import check_estimate
+from calibgraph.trust.thresholds import threshold
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
 _PRIOR_FRAMES = 10.0  # that the usual scatter counts for, while a camera has few frames
-_LEFT_OUT_WARN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,8 @@ def _verdict(
         return _not_started(state, one)
     rows = slice(6 * camera, 6 * camera + 6)
     own = covariance[rows, rows]
-    evidence = Evidence(
+    estimate = Estimate(
+        camera=state.rig.cameras[name],
         residuals=residuals_of(one),
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
@@ -98,12 +99,11 @@ def _verdict(
         data_sigmas=_data_sigmas(sums.hessian[camera]),
         halves=_halves(state, camera),
         conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
-        pulled=None,
+        pull=None,
         converged=True,
         terms="full",
     )
-    verdict = camera_verdict(state.rig.cameras[name], evidence)
-    return verdict.and_also(_now(state, one))
+    return Verdict((*check_estimate(estimate), *_now(state, one)))
 
 
 def _not_started(state: State, one: CameraState) -> Verdict:
@@ -130,7 +130,7 @@ def _now(state: State, one: CameraState) -> list[Check]:
     if agreed:
         share = 1 - float(np.mean(agreed))
         name = f"share of the last {len(agreed)} frames that disagree with the estimate"
-        checks.append(above(name, share, _LEFT_OUT_WARN, 1.0, "share"))
+        checks.append(threshold("disagreeing_frames").check(share, name=name))
     return checks
 
 

@@ -126,3 +126,11 @@ def test_rounded_digits_are_made_a_rotation_again() -> None:
     T[0, 0] += 4e-5
     R = rigid_transform(T)[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
+
+
+def test_a_changed_lens_is_not_the_old_one(pair: Rig) -> None:
+    camera = pair.cameras["left"]
+    other = camera.model_copy(update={"distortion": (-0.3, 0.1, 0.0, 0.0)})
+    point = np.array([[1.0, 0.5, 4.0]])
+    assert np.abs(other.lens.project(point)[0] - camera.lens.project(point)[0]).max() > 1
+    assert camera.moved_to(np.eye(4)).lens is camera.lens

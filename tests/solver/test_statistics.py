@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.assess import scatter_covariance
+from calibgraph.trust.evidence import scatter_covariance
 
 pytestmark = pytest.mark.statistics
 

@@ -21,7 +21,7 @@ TABLES = (
 
 
 def cameras_of(tmp_path: Path, *options: object) -> list[dict[str, Any]]:
-    """Run the benchmark; what each camera's result says and how far off it is, with its kind."""
+    """Run the benchmark: the verdict and the error of each camera's result, with its kind."""
     out = tmp_path / "cases.jsonl"
     command = [sys.executable, ROOT / "benchmarks" / "verdicts.py", "--set", "count", "--out", out]
     subprocess.run([*map(str, command), *map(str, options)], check=True, capture_output=True)

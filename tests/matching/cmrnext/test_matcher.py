@@ -36,7 +36,8 @@ from calibgraph.matching.cmrnext.inputs import (
     rgb_tensor,
 )
 from calibgraph.matching.cmrnext.network import CmrNext, Flow
-from calibgraph.trust.solution_checks import Matching, with_matching
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.trust.matcher_checks import check_findings
 from tests.conftest import KANNALA, RADTAN5, SAMPLE, Call, make_camera
 from tests.matching.cmrnext.test_checkpoint import good_content, saved
 
@@ -395,23 +396,27 @@ def test_the_probe_tells_measuring_from_following() -> None:
     assert np.isnan(probe.remaining_share(camera, camera.T_camera_lidar, T_two, few))
 
 
+def findings_of_left(**values: float) -> MatcherFindings:
+    return MatcherFindings(**{name: {"left": value} for name, value in values.items()})
+
+
 @pytest.mark.parametrize(
-    ("matching", "status"),
+    ("findings", "status"),
     [
-        (Matching(), "PASS"),
-        (Matching(start_dependence=0.1, recall=0.1, failed_share=0.1), "PASS"),
-        (Matching(start_dependence=0.3), "WARN"),
-        (Matching(start_dependence=0.9), "FAIL"),
-        (Matching(start_dependence=float("nan")), "FAIL"),
-        (Matching(recall=0.4), "WARN"),
-        (Matching(recall=1.0), "FAIL"),
-        (Matching(recall=-0.5), "PASS"),
-        (Matching(failed_share=0.5), "WARN"),
-        (Matching(failed_share=1.0), "FAIL"),
+        (MatcherFindings(), "PASS"),
+        (findings_of_left(start_dependence=0.1, recall=0.1, failed_share=0.1), "PASS"),
+        (findings_of_left(start_dependence=0.3), "WARN"),
+        (findings_of_left(start_dependence=0.9), "FAIL"),
+        (findings_of_left(start_dependence=float("nan")), "FAIL"),
+        (findings_of_left(recall=0.4), "WARN"),
+        (findings_of_left(recall=1.0), "FAIL"),
+        (findings_of_left(recall=-0.5), "PASS"),
+        (findings_of_left(failed_share=0.5), "WARN"),
+        (findings_of_left(failed_share=1.0), "FAIL"),
     ],
 )
-def test_the_verdict_heeds_the_matcher(matching: Matching, status: str) -> None:
-    verdict = with_matching(Verdict(), matching)
+def test_the_findings_of_the_matcher_are_checked(findings: MatcherFindings, status: str) -> None:
+    verdict = Verdict(tuple(check_findings(findings, "left")))
     assert verdict.status == status
     assert len(verdict.reasons) == (status != "PASS")
 
@@ -459,7 +464,8 @@ def test_a_table_carries_what_its_matcher_said(pair: calibgraph.Rig) -> None:
 
 def test_a_matchers_own_error_is_judged_once(pair: calibgraph.Rig) -> None:
     """It is part of the error bar; with too few frames for one it stands alone."""
-    for frames, reason in ((8, "sigma: rotation"), (3, "the matcher's own error: rotation")):
+    shared = "error that the matcher's frames share: rotation"
+    for frames, reason in ((8, "sigma: rotation"), (3, shared)):
         table = calibgraph.simulate_correspondences(pair, frames=frames, matches=200)
         said = replace(table, metadata={"systematic_rotation_rad": 0.02})
         verdict = calibgraph.solve(pair, said).camera_verdicts["left"]
