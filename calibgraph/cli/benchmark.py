@@ -78,17 +78,17 @@ def paper(
     a known relative pose, and ours with weights computed from the simulation's truth.
     """
     from calibgraph.evaluation.output import write_report
-    from calibgraph.evaluation.paper import bench_paper
-    from calibgraph.evaluation.sources import Displacement, source_of
+    from calibgraph.evaluation.paper import run_experiment
+    from calibgraph.evaluation.sources import Displacement, source_from
     from calibgraph.files import require_place_for_folder
 
     require_place_for_folder(out)
     with checked_arguments(), progress_bar() as progress:
-        source = source_of(data, Displacement(rotation_deg, translation_m))
-        report = bench_paper(
+        source = source_from(data, Displacement(rotation_deg, translation_m))
+        report = run_experiment(
             source,
             frames=_parse_counts("--frames", frames),
-            draws=draws or source.usual_draws,
+            draws=draws or source.default_draws,
             config=_paper_settings(preset or source.preset, seed),
             seed=seed,
             jobs=jobs,
@@ -179,7 +179,7 @@ def tune(
     The score is E_R / 1 deg + E_t / 10 cm, the mean over cameras and draws. Tuning and test draws
     share no frame. FILE.yaml is read by --config.
     """
-    from calibgraph.evaluation.sources import Displacement, source_of
+    from calibgraph.evaluation.sources import Displacement, source_from
     from calibgraph.evaluation.tune import Candidates, tune
     from calibgraph.files import require_place_for_file
 
@@ -191,13 +191,13 @@ def tune(
             _parse_numbers("--delta", loss_scale_px),
             _parse_numbers("--tau", gate_px),
         )
-        source = source_of(data, Displacement(rotation_deg, translation_m))
+        source = source_from(data, Displacement(rotation_deg, translation_m))
         tuned = tune(
             source,
             base=_paper_settings(preset or source.preset, seed),
             frames=frames,
             samples=samples,
-            draws=draws or min(5, source.usual_draws),
+            draws=draws or min(5, source.default_draws),
             candidates=candidates,
             seed=seed,
             progress=progress,

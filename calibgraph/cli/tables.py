@@ -22,7 +22,7 @@ from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 
 if TYPE_CHECKING:
     from calibgraph.evaluation.paper import Report, Row
-    from calibgraph.evaluation.tune import Tuned
+    from calibgraph.evaluation.tune import TuningResult
     from calibgraph.matching.cmrnext.training.validation import Validation
 
 MAX_REASONS = 16  # the worst come first
@@ -198,7 +198,7 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
     return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
 
 
-def print_tuned(console: Console, tuned: Tuned) -> None:
+def print_tuned(console: Console, tuned: TuningResult) -> None:
     """Print the scores of the best settings, the paper's and ``auto``."""
     table = _table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
     _add_number_columns(table, "lambda", "mu", "delta", "tau", "tuning", "test")

@@ -37,14 +37,14 @@ def check_row(check: Check) -> CheckRow:
     found = _quantity(check.value, check.unit)
     if check.warn is None or check.fail is None:
         return CheckRow(check, found, "", "")
-    side = "below" if check.warn > check.fail else "above"
-    unreachable = side == "below" and check.fail <= 0
-    warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
+    sign = "<" if check.warn > check.fail else ">"
+    unreachable = sign == "<" and check.fail <= 0
+    warn, fail = (_threshold(sign, limit, check.unit) for limit in (check.warn, check.fail))
     return CheckRow(check, found, warn, "" if unreachable else fail)
 
 
-def _threshold(side: str, limit: float, unit: str) -> str:
-    return f"{side} {_quantity(limit, unit)}" if math.isfinite(limit) else ""
+def _threshold(sign: str, limit: float, unit: str) -> str:
+    return f"{sign} {_quantity(limit, unit)}" if math.isfinite(limit) else ""
 
 
 def _quantity(value: float, unit: str) -> str:
