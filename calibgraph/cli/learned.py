@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.support import checked_arguments, progress_bar, terminal
+from calibgraph.cli.terminal import progress_bar, terminal
 
 
 def weights(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import SeedOption
-from calibgraph.cli.support import checked_arguments, progress_bar, terminal
+from calibgraph.cli.terminal import progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig

@@ -1,4 +1,4 @@
-"""Overlays for the page: points on images before and after, by distance and by residual."""
+"""The page's overlays: points on images before and after, coloured by distance and residual."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ from calibgraph.io.clouds import load_cloud
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Camera
-from calibgraph.report.frame_errors import BeforeAfter, Errors, shown_frame
-from calibgraph.report.overlay import DEPTH_RANGE_M, depth_colours, overlay
+from calibgraph.report.frames import middle_frame
+from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points
+from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_BYTES = 3_000_000  # of all pictures together; base64 makes a third more of it
+_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _PICTURES = 4  # per camera
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
 _DARKENED = 0.45
-_GATES = 2.0  # residuals of so many gates have the last colour
+_MAX_GATES = 2.0  # larger residuals have the last colour
 _LEVELS = 24
 _STOPS = 17  # of a scale's gradient
-_SHIFT = 4  # bits of a pixel's fraction that OpenCV draws with
+_SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
 
 
 @dataclass(frozen=True)
 class Overlays:
-    """One camera's pictures of one frame, as data URIs; residuals are None without matches.
+    """One camera's pictures of one frame, as data URIs; by residual is None without matches.
 
     Attributes:
         frame: the frame's name.
         by_depth: before, after.
         by_residual: before, after.
-        depth_scale: of the colours by depth.
-        residual_scale: of the colours by residual.
+        depth_scale: colours by depth.
+        residual_scale: colours by residual.
     """
 
     frame: str
@@ -54,7 +55,7 @@ class Overlays:
 
 @dataclass(frozen=True)
 class Scale:
-    """What the colours of a picture mean.
+    """The colour scale of a picture.
 
     Attributes:
         gradient: colours from left to right, for CSS.
@@ -65,26 +66,30 @@ class Scale:
     ticks: tuple[tuple[float, str], ...]
 
 
-def overlays_of(
+def draw_overlays(
     result: Calibration, errors: Mapping[str, BeforeAfter]
 ) -> tuple[dict[str, Overlays], str | None]:
     """Draw all cameras' overlays.
 
+    Args:
+        result: names the files of the images and the cloud.
+        errors: per camera, for the colours by residual.
+
     Returns:
-        Per camera its pictures, and a sentence that says which are left out and why, if any.
+        Per camera its pictures; the reason why the others are missing, None if none are.
     """
-    shown = shown_frame(result)
+    shown = middle_frame(result)
     if shown is None:
         return {}, "the result was made from a table, which names no images"
-    found: dict[str, Overlays] = {}
+    drawn: dict[str, Overlays] = {}
     try:
         cloud = load_cloud(shown["cloud"])[:, :3].astype(np.float64)
         for name in result.rig.cameras:
             if name in shown["images"]:
-                found[name] = _overlays(result, name, shown, cloud, errors.get(name))
+                drawn[name] = _overlays(result, name, shown, cloud, errors.get(name))
     except (CalibrationError, OSError) as error:
-        return found, str(error)
-    return found, None
+        return drawn, str(error)
+    return drawn, None
 
 
 def _overlays(
@@ -109,13 +114,13 @@ def _overlays(
 
 
 def _by_depth(image: Image, cloud: Array, camera: Camera, budget: int) -> str:
-    drawn = _scaled(overlay(image, cloud, camera), _SIZES[0][0])
+    drawn = _shrink(draw_points(image, cloud, camera), _SIZES[0][0])
     return _jpeg(drawn, budget)
 
 
-def _by_residual(image: Image, errors: Errors, budget: int) -> str:
-    """Matched points on the darkened image, a line from each to where it was matched."""
-    small = _scaled(image, _SIZES[0][0])
+def _by_residual(image: Image, errors: ReprojectionErrors, budget: int) -> str:
+    """Projected points on the darkened image, each with a line to its matched pixel."""
+    small = _shrink(image, _SIZES[0][0])
     factor = small.shape[1] / image.shape[1]
     drawn = np.asarray(small * _DARKENED, dtype=np.uint8)
     ends = np.stack([errors.projected_px, errors.projected_px - errors.vectors_px], axis=1)
@@ -133,13 +138,13 @@ def _by_residual(image: Image, errors: Errors, budget: int) -> str:
 
 
 def _level(gates: Array) -> NDArray[np.int64]:
-    """(n,) which colour a residual of so many gates has."""
-    share = np.clip(gates / _GATES, 0.0, 1.0)
+    """(n,) the colour number of residuals in units of the gate."""
+    share = np.clip(gates / _MAX_GATES, 0.0, 1.0)
     return np.asarray(np.rint(share * (_LEVELS - 1)), dtype=np.int64)
 
 
 def _level_colours() -> list[tuple[int, int, int]]:
-    """Blue is a small residual, yellow the gate, red beyond it: BGR."""
+    """BGR: blue is a small residual, yellow the gate, red beyond it."""
     ramp = np.rint(np.linspace(40, 235, _LEVELS)).astype(np.uint8)
     bgr = cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_TURBO)[:, 0]
     return [(int(b), int(g), int(r)) for b, g, r in bgr]
@@ -149,7 +154,7 @@ _LEVEL_COLOURS = _level_colours()
 
 
 def depth_scale() -> Scale:
-    """The colours of the distances, even in their logarithm."""
+    """The colours of the distances, linear in their logarithm."""
     low, high = np.log(DEPTH_RANGE_M)
     ticks = np.array([2, 5, 10, 20, 50])
     at = 100 * (np.log(ticks) - low) / (high - low)
@@ -159,9 +164,9 @@ def depth_scale() -> Scale:
 
 
 def residual_scale(gate_px: float) -> Scale:
-    """The colours of the residuals, from nothing to two gates."""
+    """The colours of the residuals, from zero to twice the gate."""
     colours = np.array(_LEVEL_COLOURS, dtype=np.uint8)
-    stops = colours[_level(np.linspace(0.0, _GATES, _STOPS))]
+    stops = colours[_level(np.linspace(0.0, _MAX_GATES, _STOPS))]
     ticks = ((0.0, "0 px"), (25.0, f"{gate_px / 2:.2g}"), (50.0, f"gate {gate_px:.2g} px"),
              (75.0, f"{1.5 * gate_px:.2g}"))  # fmt: skip
     return Scale(_gradient(stops), ticks)
@@ -171,20 +176,20 @@ def _gradient(stops: Image) -> str:
     return ", ".join(f"#{r:02x}{g:02x}{b:02x}" for b, g, r in stops.tolist())
 
 
-def _scaled(image: Image, most: int) -> Image:
+def _shrink(image: Image, max_width: int) -> Image:
     """The image, at most so many pixels wide."""
-    factor = most / image.shape[1]
+    factor = max_width / image.shape[1]
     if factor >= 1:
         return image
-    size = (most, max(1, round(image.shape[0] * factor)))
+    size = (max_width, max(1, round(image.shape[0] * factor)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _jpeg(image: Image, budget: int) -> str:
-    """A data URI of the largest and best JPEG that fits into so many bytes."""
+    """A data URI of the largest and best JPEG of at most ``budget`` bytes."""
     data = b""
     for width, quality in _SIZES:
-        small = _scaled(image, width)
+        small = _shrink(image, width)
         encoded, buffer = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
         if not encoded:
             raise CalibrationError(f"an image of shape {small.shape} cannot be encoded as JPEG")

@@ -1,4 +1,4 @@
-"""Overlay pictures: the cloud's points on the image, coloured by depth, before and after."""
+"""The cloud projected into an image, coloured by depth; and before-and-after PNG files of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 DEPTH_RANGE_M = (2.0, 60.0)
 _MAX_WIDTH_PX = 1280
 _BAR_PX = 34
-_COVERED_SHARE = 0.2  # of the image, by points
+_COVERED_SHARE = 0.2  # of the image, covered by points
 _MAX_DOT_PX = 7
 
 
@@ -30,10 +30,16 @@ def write_overlays(
 
     Args:
         frame: the cloud and images to show.
-        initial: the poses before.
-        final: the poses after.
-        folder: where to write.
-        mark: what to write over the picture of the result, such as that it failed.
+        initial: the rig before.
+        final: the rig after.
+        folder: to write to.
+        mark: prefix of the title of the second picture, such as that the result is FAIL.
+
+    Returns:
+        The paths.
+
+    Raises:
+        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
     paths = []
@@ -41,22 +47,22 @@ def write_overlays(
         image = frame.load_image(name, camera)
         after = final.cameras[name]
         panels = [
-            _titled(overlay(image, cloud, camera), f"{name}, frame {frame.name}: before"),
-            _titled(overlay(image, cloud, after), f"{mark}{name}, frame {frame.name}: after"),
+            _titled(draw_points(image, cloud, camera), f"{name}, frame {frame.name}: before"),
+            _titled(draw_points(image, cloud, after), f"{mark}{name}, frame {frame.name}: after"),
             _depth_bar(image.shape[1]),
         ]
         paths.append(folder / f"overlay_{name}.png")
-        write_image(paths[-1], _shrunk(np.vstack(panels)))
+        write_image(paths[-1], _shrink(np.vstack(panels)))
     return paths
 
 
-def overlay(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
-    """Draw a cloud on an image, near points over far ones, coloured by the distance.
+def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
+    """Draw a cloud on an image, near points over far ones, coloured by their distance.
 
     Args:
         image: (height, width, 3) BGR.
         points_lidar_m: (n, 3) in the LiDAR frame.
-        camera: lens and pose.
+        camera: lens and extrinsic.
     """
     T = camera.T_camera_lidar
     points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
@@ -75,7 +81,7 @@ def overlay(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
 
 
 def _dot_side(pixels: int, points: int) -> int:
-    """Side of a point's square: large where points are few, so small that the image shows."""
+    """Side of a point's square [px]: larger for few points, so that all cover a fixed share."""
     side = np.sqrt(_COVERED_SHARE * pixels / max(points, 1))
     return int(np.clip(round(side), 1, _MAX_DOT_PX))
 
@@ -89,16 +95,16 @@ def write_image(path: Path, image: Image) -> None:
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-    write_atomically(path, lambda part: _write_bytes(part, data.tobytes()))
 
+    def write(part: Path) -> None:
+        part.write_bytes(data.tobytes())
 
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
+    write_atomically(path, write)
 
 
 def depth_colours(distance_m: Array) -> Image:
-    """(n, 3) BGR: red is near, blue is far, even in the logarithm of the distance."""
-    if not len(distance_m):  # OpenCV has no colours for nothing
+    """(n, 3) BGR: red is near, blue is far, linear in the logarithm of the distance."""
+    if not len(distance_m):  # OpenCV refuses empty arrays
         return np.empty((0, 3), np.uint8)
     low, high = np.log(DEPTH_RANGE_M)
     share = np.clip((np.log(distance_m) - low) / (high - low), 0.0, 1.0)
@@ -118,7 +124,7 @@ def _titled(image: Image, title: str) -> Image:
 
 
 def _depth_bar(width: int) -> Image:
-    """A strip with the colours of the distances, and a tick every factor of two or so."""
+    """A strip with the colours of the distances, with labels."""
     scale = max(0.5, width / 1600)
     low, high = np.log(DEPTH_RANGE_M)
     distances = np.exp(np.linspace(low, high, width))
@@ -133,8 +139,8 @@ def _depth_bar(width: int) -> Image:
     return bar
 
 
-def _shrunk(image: Image) -> Image:
-    """At most _MAX_WIDTH_PX wide, so that a report of many cameras stays small."""
+def _shrink(image: Image) -> Image:
+    """The image, at most _MAX_WIDTH_PX wide, so that the files of many cameras stay small."""
     factor = _MAX_WIDTH_PX / image.shape[1]
     if factor >= 1:
         return image
