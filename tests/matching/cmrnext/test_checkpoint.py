@@ -19,7 +19,7 @@ import torch
 
 from calibgraph import FileError
 from calibgraph.matching.cmrnext import load_checkpoint
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.network import CmrNext
 from calibgraph.matching.cmrnext.pickle_reader import read_checkpoint
 from tests.conftest import Call
@@ -37,9 +37,9 @@ CONFIG = {
 }
 
 
-def good_content(variant: Variant | None = None) -> dict[str, Any]:
+def good_content(architecture: Architecture | None = None) -> dict[str, Any]:
     torch.manual_seed(0)
-    state = CmrNext(variant or Variant(width=8)).state_dict()
+    state = CmrNext(architecture or Architecture(width=8)).state_dict()
     return {"config": dict(CONFIG), "epoch": 150, "state_dict": state, "train_loss": 0.5}
 
 
@@ -51,7 +51,7 @@ def saved(path: Path, content: Any) -> Path:
 def test_weights_are_read_exactly(tmp_path: Path) -> None:
     content = good_content()
     checkpoint = load_checkpoint(saved(tmp_path / "iter1.tar", content))
-    assert checkpoint.variant == Variant(width=8)
+    assert checkpoint.architecture == Architecture(width=8)
     assert checkpoint.config == CONFIG
     assert checkpoint.range_deg_m == (1.0, 0.1)
     assert len(checkpoint.sha256) == 64
@@ -66,7 +66,7 @@ def test_weights_survive_conversion_to_safetensors(tmp_path: Path) -> None:
     original.save_safetensors(tmp_path / "iter1.safetensors")
     converted = load_checkpoint(tmp_path / "iter1.safetensors")
     assert converted.config == original.config
-    assert converted.variant == original.variant
+    assert converted.architecture == original.architecture
     for name, tensor in original.state.items():
         assert torch.equal(converted.state[name], tensor), name
 

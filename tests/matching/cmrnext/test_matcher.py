@@ -25,12 +25,12 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.matching.cmrnext import CmrNextMatcher, confidence, probe
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
-    encoded,
-    halved_lidar,
+    encode_depth,
+    halve_lidar,
     lidar_channels,
     network_size,
     rgb_tensor,
@@ -61,7 +61,7 @@ def test_the_nearest_point_of_a_pixel_is_shown() -> None:
     ray = np.array([100.25 - 607, 50.75 - 185]) / [718, 710]
     in_camera = np.array([[*(ray * z), z, 1.0] for z in (30.0, 10.0, 20.0)])
     cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
-    seen = LidarImage.of(cloud, camera.T_camera_lidar, View(camera))
+    seen = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
     assert seen.point_index.tolist() == [1]
     assert seen.cells.tolist() == [[50, 100]]
     np.testing.assert_allclose(seen.pixels_px, [[100.25, 50.75]], atol=1e-4)
@@ -73,7 +73,7 @@ def test_points_behind_and_beside_are_not_shown() -> None:
     camera = make_camera()
     in_camera = np.array([[0, 0, -5, 1], [50, 0, 5, 1], [0, 0, 2000, 1], [0, 0, 5, 1.0]])
     cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
-    assert LidarImage.of(cloud, camera.T_camera_lidar, View(camera)).point_index.tolist() == [3]
+    assert LidarImage.render(cloud, camera.T_camera_lidar, View(camera)).point_index.tolist() == [3]
 
 
 def test_points_seen_through_something_nearer_are_left_out() -> None:
@@ -89,7 +89,7 @@ def test_points_seen_through_something_nearer_are_left_out() -> None:
     plane = (image[:, :2] + 0.5 - [k.cx, k.cy]) / [k.fx, k.fy]
     in_camera = np.column_stack([plane * image[:, 2:], image[:, 2], np.ones(len(image))])
     cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
-    kept = LidarImage.of(cloud, camera.T_camera_lidar, view).without_occluded()
+    kept = LidarImage.render(cloud, camera.T_camera_lidar, view).without_occluded()
     is_wall = kept.point_index >= len(screen)
     assert np.count_nonzero(~is_wall) == len(screen)
     behind = (image[:, 0] > 310) & (image[:, 0] < 480) & (image[:, 1] > 110) & (image[:, 1] < 185)
@@ -102,7 +102,7 @@ def test_the_ground_does_not_occlude_itself() -> None:
     camera = make_camera()
     x, y = np.meshgrid(np.geomspace(4, 60, 400), np.linspace(-15, 15, 400))
     cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.7), x.ravel()])
-    seen = LidarImage.of(cloud.astype(np.float32), camera.T_camera_lidar, View(camera))
+    seen = LidarImage.render(cloud.astype(np.float32), camera.T_camera_lidar, View(camera))
     assert len(seen.without_occluded().depth_m) > 0.99 * len(seen.depth_m)
 
 
@@ -111,18 +111,18 @@ def test_halving_takes_the_mean_of_what_is_there() -> None:
     channels[0, 0, 0], channels[0, 1, 1], channels[0, 2, 3] = 0.2, 0.4, 0.5
     channels[1, 0, 0], channels[1, 1, 1], channels[1, 2, 3] = 1.0, 0.0, 0.7
     expected = [[[0.3, 0], [0, 0.5]], [[0.5, 0], [0, 0.7]]]
-    np.testing.assert_allclose(halved_lidar(channels), expected, rtol=1e-6)
+    np.testing.assert_allclose(halve_lidar(channels), expected, rtol=1e-6)
 
 
 def test_depth_is_encoded_as_published() -> None:
     """sin, cos per level, slow first, then the depth; all zero where there is no point."""
     depth = torch.tensor([[[[0.0, 0.3]]]])
-    found = encoded(depth, Variant(fourier_levels=3))[0, :, 0]
+    found = encode_depth(depth, Architecture(fourier_levels=3))[0, :, 0]
     assert not found[:, 0].any()
     waves = [f(np.pi * 0.3 * 2**level) for level in range(3) for f in (np.sin, np.cos)]
     np.testing.assert_allclose(found[:, 1], [*waves, 0.3], atol=1e-6)
-    assert encoded(depth, Variant(fourier_levels=-1)).shape[1] == 1
-    with_intensity = encoded(torch.cat([depth, depth], 1), Variant(reflectance=True))
+    assert encode_depth(depth, Architecture(fourier_levels=-1)).shape[1] == 1
+    with_intensity = encode_depth(torch.cat([depth, depth], 1), Architecture(reflectance=True))
     assert with_intensity.shape[1] == 26
     assert network_size(376, 1241) == (384, 1280)
     assert network_size(370, 1226) == (384, 1280)
@@ -132,7 +132,7 @@ def test_depth_is_encoded_as_published() -> None:
 def test_published_inputs_are_reproduced(reference_folder: Path) -> None:
     vectors = np.load(reference_folder / "cmrnext_golden.npz", allow_pickle=False)
     depth = torch.tensor(vectors["depth_norm"])[None, None]
-    found = encoded(depth, Variant())
+    found = encode_depth(depth, Architecture())
     # sine and cosine of up to 6434 rad in float32: the argument alone is rounded by 5e-4.
     np.testing.assert_allclose(found, vectors["lidar_input"], atol=1e-3, rtol=0)
 
@@ -154,10 +154,10 @@ def test_distortion_is_taken_out_and_put_back(model: str, distortion: tuple[floa
     recorded = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
     dot = np.array([420.0, 250.0])
     cv2.circle(recorded, (420, 250), 6, (255, 255, 255), -1)
-    weights = view.image(recorded)[:, :, 0].astype(np.float64)
+    weights = view.undistort(recorded)[:, :, 0].astype(np.float64)
     rows, columns = np.indices(weights.shape)
     centre = np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
-    back, on_image = view.recorded(centre[None])
+    back, on_image = view.distort(centre[None])
     assert on_image.all()
     assert np.linalg.norm(centre - dot) > 1  # it was distorted
     np.testing.assert_allclose(back[0], dot, atol=0.1)  # a disc's centre moves by curvature
@@ -196,7 +196,7 @@ def with_flow(
 
         tables = []
         for job in jobs:
-            lidar = LidarImage.of(job.cloud, job.T_camera_lidar, job.view)
+            lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
             sees = by_heart or job.image.std(axis=(0, 1)).any()
             T = truth[job.name] if sees else job.T_camera_lidar
             points = job.cloud[lidar.point_index, :3].astype(np.float64)
@@ -316,18 +316,18 @@ def test_clouds_without_intensity_are_refused_where_it_is_needed() -> None:
     camera = make_camera()
     cloud = cloud_before(camera, 100)
     cloud[:, 3] = np.nan
-    seen = LidarImage.of(cloud, camera.T_camera_lidar, View(camera))
+    seen = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
     with pytest.raises(DatasetError, match="intensity"):
-        lidar_channels(seen, Variant(reflectance=True), 160.0)
-    assert lidar_channels(seen, Variant(), 160.0).shape[0] == 1
+        lidar_channels(seen, Architecture(reflectance=True), 160.0)
+    assert lidar_channels(seen, Architecture(), 160.0).shape[0] == 1
 
 
 def test_intensities_of_bytes_become_unit() -> None:
     camera = make_camera()
     cloud = cloud_before(camera, 100)
-    unit = LidarImage.of(cloud, camera.T_camera_lidar, View(camera))
+    unit = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
     cloud[:, 3] *= 255
-    same = LidarImage.of(cloud, camera.T_camera_lidar, View(camera))
+    same = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
     np.testing.assert_allclose(same.intensity, unit.intensity, rtol=1e-5)
 
 
@@ -344,7 +344,7 @@ def test_a_batch_gives_what_single_images_give(sample: Dataset, weights: Path) -
 
 
 def test_predicted_sigmas_become_information(sample: Dataset, tmp_path: Path) -> None:
-    content = good_content(Variant(width=8, uncertainty="nll"))
+    content = good_content(Architecture(width=8, uncertainty="nll"))
     content["config"]["uncertainty"] = True
     matcher = CmrNextMatcher([saved(tmp_path / "nll.tar", content)], iterations=1)
     table = matcher.match(sample.select("0:1"), sample.rig, round_index=0, progress=lambda *_: None)
@@ -355,19 +355,19 @@ def test_predicted_sigmas_become_information(sample: Dataset, tmp_path: Path) ->
 
 
 def test_confidence_falls_with_every_doubt() -> None:
-    sure = confidence.from_signs(np.zeros(1), np.ones(1))
+    sure = confidence.from_flow(np.zeros(1), np.ones(1))
     assert 0.9 < sure[0] <= 1
-    assert confidence.from_signs(np.full(1, 2.0), np.ones(1)) < 0.5 * sure
-    assert confidence.from_signs(np.zeros(1), np.full(1, 1 / 81)) < 0.6 * sure
-    assert confidence.with_consistency(sure, np.full(1, 4.0)) == pytest.approx(sure / 2)
-    assert confidence.from_signs(np.array([np.nan]), np.ones(1)) > 0  # and no NaN
+    assert confidence.from_flow(np.full(1, 2.0), np.ones(1)) < 0.5 * sure
+    assert confidence.from_flow(np.zeros(1), np.full(1, 1 / 81)) < 0.6 * sure
+    assert confidence.lower_by_residuals(sure, np.full(1, 4.0)) == pytest.approx(sure / 2)
+    assert confidence.from_flow(np.array([np.nan]), np.ones(1)) > 0  # and no NaN
 
 
 def test_the_probe_tells_measuring_from_following() -> None:
     camera = make_camera()
     rig = calibgraph.Rig(cameras={"camera": camera})
     cloud = cloud_before(camera, 2000)
-    T_two = probe.displaced(camera.T_camera_lidar, (1.0, 0.1), np.random.default_rng(0))
+    T_two = probe.displace(camera.T_camera_lidar, (1.0, 0.1), np.random.default_rng(0))
     moved = T_two @ np.linalg.inv(camera.T_camera_lidar)
     assert np.degrees(Rotation.from_matrix(moved[:3, :3]).magnitude()) == pytest.approx(
         0.7 * np.sqrt(3), rel=1e-6

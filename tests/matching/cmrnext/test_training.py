@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from calibgraph import CalibrationError, DatasetError, FileError, load_rig
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.cmrnext import TrainSettings, load_checkpoint, train
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import View
-from calibgraph.matching.cmrnext.samples import Scene, _mirrored, _turned, make_sample, perturbation
-from calibgraph.matching.cmrnext.training.scenes import split, trusted_dataset
+from calibgraph.matching.cmrnext.training.samples import Scene, _mirror, _turn, make_sample, draw_perturbation
+from calibgraph.matching.cmrnext.training.scenes import split, load_trusted_dataset
 from calibgraph.matching.cmrnext.training.settings import parsed_crop
 from calibgraph.matching.cmrnext.training.train import one_cycle
 from calibgraph.matching.cmrnext.training.validation import MAX_SCENES
@@ -39,7 +39,7 @@ TINY = TrainSettings(
 
 @pytest.fixture(scope="module")
 def trusted() -> Dataset:
-    return trusted_dataset(SAMPLE)
+    return load_trusted_dataset(SAMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -59,14 +59,14 @@ def test_the_reference_is_trusted_and_not_the_guess(trusted: Dataset, tmp_path: 
     shutil.copytree(SAMPLE, folder)
     (folder / "reference.yaml").unlink()
     with pytest.raises(DatasetError, match="rig.yaml is a guess"):
-        trusted_dataset(folder)
-    assert trusted_dataset(folder, trusted.rig).rig == trusted.rig
+        load_trusted_dataset(folder)
+    assert load_trusted_dataset(folder, trusted.rig).rig == trusted.rig
 
 
 def test_perturbations_are_those_of_the_published_protocol() -> None:
     """Median angle about 19.6 deg and length 1.42 to 1.45 m, as the original's logs say."""
     rng = np.random.default_rng(0)
-    draws = np.array([perturbation(rng, 20.0, 1.5) for _ in range(4000)])
+    draws = np.array([draw_perturbation(rng, 20.0, 1.5) for _ in range(4000)])
     angles = np.degrees(Rotation.from_matrix(draws[:, :3, :3]).magnitude())
     lengths = np.linalg.norm(draws[:, :3, 3], axis=1)
     # Medians of 4000: sigma about 1.25 spread / sqrt(4000), so 0.13 deg and 0.008 m.
@@ -75,12 +75,12 @@ def test_perturbations_are_those_of_the_published_protocol() -> None:
     assert draws[:, 1, 3].max() <= 1.0 and draws[:, 0, 3].max() > 1.4
 
 
-@pytest.mark.parametrize("change", [_mirrored, _turned])
+@pytest.mark.parametrize("change", [_mirror, _turn])
 def test_augmented_clouds_still_fit_their_images(trusted: Dataset, change: object) -> None:
     """Points keep the colour of the pixel that they lie on."""
     some = scene(trusted)
     view = View(some.camera)
-    image = view.image(some.frame.load_image(some.name, some.camera))
+    image = view.undistort(some.frame.load_image(some.name, some.camera))
     cloud = some.frame.load_cloud().astype(np.float64)
     T = some.camera.T_camera_lidar
     cloud[:, :3] = cloud[:, :3] @ T[:3, :3].T + T[:3, 3]
@@ -110,7 +110,7 @@ def test_the_flow_of_a_sample_leads_to_the_true_pixel(trusted: Dataset) -> None:
     some = scene(trusted)
     settings = replace(TINY.samples(augment=False), half_resolution=True)
     sample = make_sample(
-        some, settings=settings, variant=TINY.variant, rng=np.random.default_rng(0)
+        some, settings=settings, architecture=TINY.architecture, rng=np.random.default_rng(0)
     )
     assert sample is not None
     view = View(some.camera)
@@ -152,7 +152,7 @@ def test_the_checkpoint_says_what_it_was_trained_for(
     (validation,) = train([parts[0]], [parts[1]], out, settings)
     checkpoint = load_checkpoint(out)
     assert checkpoint.range_deg_m == (1.0, 0.1)
-    assert checkpoint.variant == settings.variant
+    assert checkpoint.architecture == settings.architecture
     assert checkpoint.config["half_resolution"] is True
     assert checkpoint.config["systematic_rotation_rad"] == validation.systematic_rotation_rad
     assert 0.3 < validation.start_deg < np.sqrt(3)
@@ -168,7 +168,7 @@ def test_fine_tuning_starts_from_given_weights(
     gentle = TINY.changed(steps=1, learning_rate=1e-12)
     train([parts[0]], [parts[1]], second, gentle, start=first)
     before, after = load_checkpoint(first), load_checkpoint(second)
-    assert after.variant == before.variant
+    assert after.architecture == before.architecture
     weights = [name for name in before.state if name.endswith("weight")]
     for name in weights:  # with no learning rate to speak of, they are the same
         torch.testing.assert_close(after.state[name], before.state[name], atol=1e-6, rtol=0)
@@ -178,7 +178,7 @@ def test_fine_tuning_starts_from_given_weights(
 
 
 def nll_content() -> dict[str, object]:
-    content = good_content(Variant(width=8, uncertainty="nll"))
+    content = good_content(Architecture(width=8, uncertainty="nll"))
     content["config"]["uncertainty"] = True
     return content
 
