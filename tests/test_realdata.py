@@ -14,7 +14,7 @@ from calibgraph import Rig
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
-from tests.matching.cmrnext.test_checkpoint import good_content, saved
+from tests.matching.cmrnext.builders import good_content, saved
 
 pytestmark = pytest.mark.realdata
 

@@ -122,8 +122,8 @@ def commented_defaults() -> str:
     for name, field in TrainSettings.model_fields.items():
         description = " ".join((field.description or "").split())
         lines += textwrap.wrap(description, 98, initial_indent="# ", subsequent_indent="# ")
-        default = list(field.default) if isinstance(field.default, tuple) else field.default
-        lines += [yaml.safe_dump({name: default}, default_flow_style=None).strip(), ""]
+        default = yaml.safe_dump(field.default, default_flow_style=True).splitlines()[0]
+        lines += [f"{name}: {default}", ""]
     return "\n".join(lines)
 
 
