@@ -37,9 +37,9 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-def _print_settings(wanted: bool) -> None:
+def _print_settings(requested: bool) -> None:
     """Print a settings file with all defaults."""
-    if wanted:
+    if requested:
         from calibgraph.matching.cmrnext.training.settings import commented_defaults
 
         print(commented_defaults())
@@ -79,7 +79,7 @@ def train(
         list[Path] | None,
         typer.Option(
             metavar="DATASET",
-            help="Folder to validate on (up to 100 images), may come again. "
+            help="Folder to validate on (up to 100 images); may be repeated. "
             "(default: the last fifth of each DATASET)",
         ),
     ] = None,
@@ -93,15 +93,15 @@ def train(
         ),
     ] = None,
     validate_every: Annotated[
-        int, typer.Option(min=1, help="Steps; the weights are written then.")
+        int, typer.Option(min=1, help="Steps between validations; each writes the weights.")
     ] = 500,
-    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.")] = "auto",
+    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.")] = "auto",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Instead of the one in the settings.")
+        int | None, typer.Option(min=0, help="Seed, instead of that of the settings.")
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on where FILE stopped, with the settings in it."),
+        typer.Option("--resume", help="Continue the training that wrote FILE, with its settings."),
     ] = False,
 ) -> None:
     """Train a CMRNext network by perturbing trusted extrinsics."""

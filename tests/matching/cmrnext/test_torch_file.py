@@ -195,7 +195,7 @@ def program(body: bytes) -> Callable[[Path], None]:
 
 
 def flagged(path: Path) -> None:
-    """A good checkpoint that says it is encrypted."""
+    """A good checkpoint, marked as encrypted."""
     torch.save(good_content(), path)
     data = bytearray(path.read_bytes())
     data[data.index(b"PK\x01\x02") + 8] |= 1

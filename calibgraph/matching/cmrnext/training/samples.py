@@ -105,10 +105,7 @@ def make_sample(
 ) -> Sample | None:
     """Perturb a scene's extrinsic; None if too few points are in the image."""
     view = View(scene.camera, crop_even=True)
-    image = view.undistort(scene.frame.load_image(scene.name, scene.camera))
-    cloud = scene.frame.load_cloud().astype(np.float64)
-    T_camera_lidar = scene.camera.T_camera_lidar
-    cloud[:, :3] = cloud[:, :3] @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]  # camera frame
+    image, cloud = _load(scene, view)
     if settings.augment:
         image, cloud = _mirror(_recolour(image, rng), cloud, view, rng)
         image, cloud = _turn(image, cloud, view, rng)
@@ -140,6 +137,15 @@ def make_sample(
         points_camera_m=truth[inside],
         E=E,
     )
+
+
+def _load(scene: Scene, view: View) -> tuple[NDArray[np.uint8], Array]:
+    """(h, w, 3) RGB without distortion, and (n, 4) x y z [m] in the true camera frame, intensity."""
+    image = view.undistort(scene.frame.load_image(scene.name, scene.camera))
+    cloud = scene.frame.load_cloud().astype(np.float64)
+    T_camera_lidar = scene.camera.T_camera_lidar
+    cloud[:, :3] = cloud[:, :3] @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    return image, cloud
 
 
 def _to_tensors(
