@@ -140,7 +140,7 @@ def make_sample(
 
 
 def _load(scene: Scene, view: View) -> tuple[NDArray[np.uint8], Array]:
-    """(h, w, 3) RGB without distortion, and (n, 4) x y z [m] in the true camera frame, intensity."""
+    """(h, w, 3) RGB without distortion; (n, 4) x y z [m] in the true camera frame, intensity."""
     image = view.undistort(scene.frame.load_image(scene.name, scene.camera))
     cloud = scene.frame.load_cloud().astype(np.float64)
     T_camera_lidar = scene.camera.T_camera_lidar
