@@ -26,10 +26,10 @@ def one_pass(way: str, height: int, width: int) -> tuple[float, float]:
     from tests.cmrnext_reference import flow_and_sigma
 
     from calibgraph.matching.cmrnext import network
-    from calibgraph.matching.cmrnext.architecture import Variant
+    from calibgraph.matching.cmrnext.architecture import Architecture
 
     torch.manual_seed(0)
-    model = network.CmrNext(Variant()).eval()
+    model = network.CmrNext(Architecture()).eval()
     if way == "on the fly":
         network.VOLUME_BYTES_MAX = 0
     rgb, lidar = torch.randn(1, 3, height, width), torch.randn(1, 25, height, width)

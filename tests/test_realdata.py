@@ -11,10 +11,10 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
-from tests.matching.cmrnext.test_checkpoint import good_content, saved
+from tests.matching.cmrnext.builders import good_content, saved
 
 pytestmark = pytest.mark.realdata
 
@@ -62,7 +62,7 @@ def test_other_rigs_and_sensors_improve_in_rotation(realdata: Path, name: str) -
 
 def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, call: Call) -> None:
     """Their matches agree with each other and with the guess; the verdict is FAIL all the same."""
-    weights = saved(tmp_path / "random.tar", good_content(Variant(width=16)))
+    weights = saved(tmp_path / "random.tar", good_content(Architecture(width=16)))
     (folder,) = sequences(realdata, "07")
     for estimate in ("frame", "joint"):
         code, _, text = call(

@@ -1,7 +1,7 @@
-"""Training samples: a frame with a trusted extrinsic, seen from a perturbed one.
+"""Training samples: a scene's cloud rendered with a perturbed extrinsic, and the true flow.
 
-The image is also turned at random together with its true extrinsic, so that the truth is another in
-every sample: the network cannot learn it by heart, it has to compare image and cloud.
+Image and true extrinsic are also rotated together at random: the truth differs in every sample, so
+that the network cannot memorise it and has to compare image and cloud.
 """
 
 from __future__ import annotations
@@ -14,34 +14,33 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from torch.nn import functional as F
 
-from calibgraph.io.dataset import Frame
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
-    encoded,
-    halved_lidar,
+    encode_depth,
+    halve_lidar,
     lidar_channels,
     lidar_tensor,
     rgb_tensor,
 )
+from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
 MIN_POINTS = 50
 _ROLL_DEG, _TURN_DEG = 5.0, 3.0
 _JITTER = 0.2
-_BORDER = cv2.BORDER_REFLECT_101  # a black one would show how the picture was turned
+_BORDER = cv2.BORDER_REFLECT_101  # a black border would reveal the rotation
 _MAX_DOWN_M = 1.0  # the virtual camera stays above the ground
+_MAX_FLOW_PX = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One pair of network inputs and the flow that it should find.
+    """One pair of network inputs and its true flow.
 
     Attributes:
         rgb: (3, h, w) normalised image of the network's size.
@@ -64,7 +63,7 @@ class Sample:
     E: Array
 
 
-def perturbation(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+def draw_perturbation(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
     """(4, 4) E = trans(t) R of the published protocol, uniform per axis of the camera.
 
     Never more than 1 m downwards. The perturbed extrinsic is E^-1 T_camera_lidar.
@@ -79,14 +78,14 @@ def perturbation(rng: np.random.Generator, rotation_deg: float, translation_m: f
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """How samples are made.
+    """Settings of samples.
 
     Attributes:
         rotation_deg, translation_m: largest perturbation per axis.
-        max_depth_m: what depths are divided by.
-        half_resolution: whether the network sees half the image's size.
+        max_depth_m: divisor of depths.
+        half_resolution: whether the network's images have half the size.
         crop_px: height and width of a random crop, at full resolution; None: the whole image.
-        augment: mirror, turn and recolour at random.
+        augment: mirror, rotate and recolour at random.
     """
 
     rotation_deg: float
@@ -97,78 +96,77 @@ class SampleSettings:
     augment: bool
 
 
-@dataclass(frozen=True)
-class Scene:
-    """One camera's image and the cloud of one frame; the camera's pose is trusted."""
-
-    frame: Frame
-    name: str
-    camera: Camera
-
-
 def make_sample(
     scene: Scene,
     *,
     settings: SampleSettings,
-    variant: Variant,
+    architecture: Architecture,
     rng: np.random.Generator,
 ) -> Sample | None:
-    """A sample of a scene; None if too few points are in the picture."""
+    """Perturb a scene's extrinsic; None if too few points are in the image."""
     view = View(scene.camera, crop_even=True)
-    image = view.image(scene.frame.load_image(scene.name, scene.camera))
-    cloud = scene.frame.load_cloud().astype(np.float64)
-    T = scene.camera.T_camera_lidar
-    cloud[:, :3] = cloud[:, :3] @ T[:3, :3].T + T[:3, 3]  # from here on, in the true camera frame
+    image, cloud = _load(scene, view)
     if settings.augment:
-        image, cloud = _mirrored(_recoloured(image, rng), cloud, view, rng)
-        image, cloud = _turned(image, cloud, view, rng)
-    E: Array = perturbation(rng, settings.rotation_deg, settings.translation_m)
-    seen = LidarImage.of(cloud.astype(np.float32), invert(E), view)
-    truth = cloud[seen.point_index, :3]
+        image, cloud = _mirror(_recolour(image, rng), cloud, view, rng)
+        image, cloud = _turn(image, cloud, view, rng)
+    E = draw_perturbation(rng, settings.rotation_deg, settings.translation_m)
+    lidar = LidarImage.render(cloud.astype(np.float32), invert(E), view)
+    truth = cloud[lidar.point_index, :3]
     ahead = truth[:, 2] > 0
-    seen, truth = seen.select(ahead), truth[ahead]
-    flow = view.project(truth) - seen.pixels_px
-    corner, size = _crop(seen.shape, settings.crop_px, rng)
-    cells = seen.cells - corner
-    inside = ((cells >= 0) & (cells < size)).all(axis=1) & (np.abs(flow) < 1000).all(axis=1)  # noqa: PLR2004
+    lidar, truth = lidar.select(ahead), truth[ahead]
+    flow = view.project(truth) - lidar.pixels_px
+    corner, (height, width) = _draw_crop(lidar.shape, settings.crop_px, rng)
+    cells = lidar.cells - corner
+    inside = ((cells >= 0) & (cells < (height, width))).all(axis=1)
+    inside &= (np.abs(flow) < _MAX_FLOW_PX).all(axis=1)
     if np.count_nonzero(inside) < MIN_POINTS:
         return None
-    (top, left), (height, width) = corner, size
-    image = image[top : top + height, left : left + width]
-    channels = lidar_channels(seen, variant, settings.max_depth_m)
-    channels = channels[:, top : top + height, left : left + width]
-    if settings.half_resolution:
-        image, channels = image[::2, ::2], halved_lidar(channels)
+    rows, columns = (slice(a, a + n) for a, n in zip(corner, (height, width), strict=True))
+    rgb, depth = _to_tensors(
+        image[rows, columns],
+        lidar_channels(lidar, architecture, settings.max_depth_m)[:, rows, columns],
+        halved=settings.half_resolution,
+    )
     return Sample(
-        rgb=rgb_tensor(image, normalize=True),
-        lidar=lidar_tensor(channels),
+        rgb=rgb,
+        lidar=depth,
         cells=torch.from_numpy(cells[inside]),
         flow_px=torch.from_numpy(flow[inside].astype(np.float32)),
         size=(height, width),
-        pixels_px=seen.pixels_px[inside],
+        pixels_px=lidar.pixels_px[inside],
         points_camera_m=truth[inside],
         E=E,
     )
 
 
-def network_inputs(samples: list[Sample], variant: Variant) -> tuple[Tensor, Tensor]:
-    """(B, 3, H, W) and (B, C, H, W): a batch for the network."""
+def _load(scene: Scene, view: View) -> tuple[NDArray[np.uint8], Array]:
+    """(h, w, 3) RGB without distortion; (n, 4) x y z [m] in the true camera frame, intensity."""
+    image = view.undistort(scene.frame.load_image(scene.name, scene.camera))
+    cloud = scene.frame.load_cloud().astype(np.float64)
+    T_camera_lidar = scene.camera.T_camera_lidar
+    cloud[:, :3] = cloud[:, :3] @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    return image, cloud
+
+
+def _to_tensors(
+    image: NDArray[np.uint8], channels: NDArray[np.float32], *, halved: bool
+) -> tuple[Tensor, Tensor]:
+    """(3, h, w) and (1 or 2, h, w) inputs of the network."""
+    if halved:
+        image, channels = image[::2, ::2], halve_lidar(channels)
+    return rgb_tensor(image, normalize=True), lidar_tensor(channels)
+
+
+def stack_inputs(samples: list[Sample], architecture: Architecture) -> tuple[Tensor, Tensor]:
+    """(B, 3, H, W) and (B, C, H, W) inputs of the network for a batch."""
     return (
         torch.stack([sample.rgb for sample in samples]),
-        encoded(torch.stack([sample.lidar for sample in samples]), variant),
+        encode_depth(torch.stack([sample.lidar for sample in samples]), architecture),
     )
 
 
-def at_full_resolution(maps: Tensor, *, halved: bool, is_flow: bool = True) -> Tensor:
-    """(B, C, H, W) network output at the image's own resolution; flows grow with it."""
-    if not halved:
-        return maps
-    larger = F.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
-    return 2 * larger if is_flow else larger
-
-
-def _recoloured(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Brightness, contrast and saturation changed at random."""
+def _recolour(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Change brightness, contrast and saturation at random."""
     brightness, contrast, saturation = rng.uniform(1 - _JITTER, 1 + _JITTER, 3)
     values = image.astype(np.float32) * np.float32(brightness)
     mean = values.mean()
@@ -178,10 +176,10 @@ def _recoloured(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[n
     return np.asarray(values.clip(0, 255), dtype=np.uint8)
 
 
-def _mirrored(
+def _mirror(
     image: NDArray[np.uint8], cloud: Array, view: View, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], Array]:
-    """Left and right exchanged, half of the time; the principal point stays where it was."""
+    """Exchange left and right, half of the time; the principal point stays in place."""
     if rng.random() < 0.5:  # noqa: PLR2004 - half of the time
         return image, cloud
     shift = 2 * view.centre_px[0] - (view.width - 1)  # the mirror image's centre back to cx
@@ -192,10 +190,10 @@ def _mirrored(
     return image, cloud * np.array([-1.0, 1.0, 1.0, 1.0])
 
 
-def _turned(
+def _turn(
     image: NDArray[np.uint8], cloud: Array, view: View, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], Array]:
-    """The camera turned about its own centre, the picture warped accordingly."""
+    """Rotate the camera about its centre, and warp the image accordingly."""
     angles = rng.uniform(-1, 1, 3) * [_TURN_DEG, _TURN_DEG, _ROLL_DEG]
     R = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     K = np.diag([*view.focal_px, 1.0])
@@ -207,7 +205,7 @@ def _turned(
     return np.asarray(warped, dtype=np.uint8), cloud
 
 
-def _crop(
+def _draw_crop(
     shape: tuple[int, int], crop_px: tuple[int, int] | None, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], tuple[int, int]]:
     """Corner and size of a random crop; even, so that halving fits."""
