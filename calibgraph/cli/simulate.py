@@ -34,8 +34,8 @@ def simulate(
         str | None,
         typer.Option(
             metavar="NAME|RIG",
-            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
-            f"file of your own; its poses are the truth. (default: {RIG})",
+            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), sample "
+            f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
             rich_help_panel=_STREET,
         ),
     ] = None,
@@ -50,8 +50,8 @@ def simulate(
     beams: Annotated[
         int | None,
         typer.Option(
-            metavar="16|64|128",
-            help=f"Of the LiDAR. (default: {BEAMS})",
+            metavar="16|32|64|128",
+            help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
             rich_help_panel=_STREET,
         ),
     ] = None,

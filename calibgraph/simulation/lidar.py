@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ class Lidar:
     Attributes:
         elevations_deg: of the beams, evenly spaced.
         azimuth_step_deg: between two shots of a beam.
+        azimuths_deg: first and last azimuth of the shots, from the x axis to the left.
         min_range_m: nearer returns are not given.
         max_range_m: farther returns are not given.
         range_noise_m: standard deviation.
@@ -33,6 +35,7 @@ class Lidar:
 
     elevations_deg: tuple[float, ...]
     azimuth_step_deg: float = 0.2
+    azimuths_deg: tuple[float, float] = (-180.0, 180.0)
     min_range_m: float = 1.0
     max_range_m: float = 100.0
     range_noise_m: float = 0.02
@@ -42,19 +45,27 @@ class Lidar:
     weakest: float = 0.06
 
 
-_FIELD_DEG = {16: (15.0, -15.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
+_ELEVATIONS_DEG = {16: (15.0, -15.0), 32: (10.0, -25.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
+_SECTOR_BEAMS = 32
+_SECTOR = {"azimuths_deg": (-46.0, 114.0), "azimuth_step_deg": 0.4}  # small clouds: data/sample
 
 
 def lidar_of(beams: int) -> Lidar:
-    """A LiDAR by its number of beams: 16 (15 to -15 deg), 64 (2 to -24.8), 128 (15 to -25).
+    """A LiDAR by its number of beams.
+
+    Args:
+        beams: 16 (15 to -15 deg), 64 (2 to -24.8) or 128 (15 to -25), every 0.2 deg all round; or
+            32 (10 to -25), every 0.4 deg from 46 deg to the right to 114 deg to the left.
 
     Raises:
-        ValueError: if there is none of so many.
+        ValueError: for another number of beams.
     """
-    if beams not in _FIELD_DEG:
-        known = ", ".join(map(str, _FIELD_DEG))
+    if beams not in _ELEVATIONS_DEG:
+        known = ", ".join(map(str, _ELEVATIONS_DEG))
         raise ValueError(f"{beams} beams: a LiDAR has one of {known}")
-    return Lidar(elevations_deg=tuple(np.linspace(*_FIELD_DEG[beams], beams).tolist()))
+    elevations_deg = tuple(np.linspace(*_ELEVATIONS_DEG[beams], beams).tolist())
+    sector: dict[str, Any] = _SECTOR if beams == _SECTOR_BEAMS else {}
+    return Lidar(elevations_deg=elevations_deg, **sector)
 
 
 def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
@@ -96,7 +107,7 @@ def scan(
 
 def shot_directions(lidar: Lidar) -> Array:
     """(beams * steps, 3) unit vectors in the LiDAR's frame, beam by beam."""
-    azimuth_deg = np.arange(-180, 180, lidar.azimuth_step_deg)
+    azimuth_deg = np.arange(*lidar.azimuths_deg, lidar.azimuth_step_deg)
     azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(lidar.elevations_deg))
     flat = np.cos(elevation)
     shots = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]

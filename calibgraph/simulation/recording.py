@@ -73,7 +73,7 @@ def simulate_street(
         out: folder to write: ``rig.yaml`` (the guess), ``reference.yaml`` (the truth), ``lidar``
             and ``cameras``.
         rig: its poses are the truth. The LiDAR is 1.8 m above a road; its x is ahead, z up.
-        beams: of the LiDAR: 16, 64 or 128.
+        beams: of the LiDAR: 16, 32 (a sector ahead and to the left), 64 or 128.
         frames: stops of the drive.
         step_m: distance between stops, on average; all steps are at most 2 km.
         seed: of the street, the drive, the noise and the guess.

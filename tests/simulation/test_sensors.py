@@ -274,7 +274,7 @@ def test_the_same_seed_gives_the_same_files(recording: Path, rig: Rig, tmp_path:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"beams": 32}, "32 beams"),
+        ({"beams": 33}, "33 beams"),
         ({"frames": 0}, "0 frames"),
         ({"step_m": -1.0}, "-1.0 m apart"),
         ({"step_m": float("nan")}, "nan m apart"),
@@ -331,7 +331,7 @@ def test_images_too_large_to_write_are_refused(rig: Rig, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("street", "--rig", "nosuch"), "known are kitti, walkley, surround, fisheye"),
+        (("street", "--rig", "nosuch"), "known are kitti, walkley, surround, fisheye, sample"),
         (("nowhere",), "unknown scenario 'nowhere'; known are street"),
         (("street", "--beams", 3), "3 beams"),
     ],
