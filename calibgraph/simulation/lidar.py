@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.simulation.world import World, albedos, cast
+from calibgraph.simulation.world import World, cast, find_albedos
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -24,13 +24,13 @@ class Lidar:
         elevations_deg: of the beams, evenly spaced.
         azimuth_step_deg: between two shots of a beam.
         azimuths_deg: first and last azimuth of the shots, from the x axis to the left.
-        min_range_m: nearer returns are not given.
-        max_range_m: farther returns are not given.
+        min_range_m: nearer returns are dropped.
+        max_range_m: farther returns are dropped.
         range_noise_m: standard deviation.
         intensity_noise: standard deviation.
         ring_spread: standard deviation of the beams' gains, about 1.
-        dropout: share of shots that are lost by chance.
-        weakest: albedo, head on at 100 m, of which 1 - 1/e of the shots return.
+        dropout: share of shots that are lost at random.
+        weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
     """
 
     elevations_deg: tuple[float, ...]
@@ -69,31 +69,31 @@ def lidar_of(beams: int) -> Lidar:
 
 
 def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
-    """(beams,) the gain of each beam's intensity, which a LiDAR keeps."""
+    """(beams,) intensity gains, constant over a recording."""
     return 1 + lidar.ring_spread * rng.standard_normal(len(lidar.elevations_deg))
 
 
 def scan(
     world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, rng: np.random.Generator
 ) -> Points:
-    """Scan the world, all of one instant: the points of a moving sensor, motion taken out.
+    """Scan the world in one instant, as a moving sensor after motion compensation.
 
-    A shot has no width: points lie on one surface or another, never between.
+    A shot has no width: every point lies on a surface.
 
     Args:
-        world: what is scanned.
+        world: surfaces.
         lidar: the sensor.
         gains: (beams,) of the intensities.
-        T_world_lidar: (4, 4) pose of the LiDAR, whose x is ahead, y left, z up.
+        T_world_lidar: (4, 4); LiDAR x is forward, y left, z up.
         rng: draws noise, dropouts and the order.
 
     Returns:
-        (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in no order.
+        (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in random order.
     """
     shots = shot_directions(lidar)
     directions = (shots @ T_world_lidar[:3, :3].T).astype(np.float32)
     hits = cast(world, T_world_lidar[:3, 3], directions)
-    albedo, incidence = albedos(world, directions, hits)
+    albedo, incidence = find_albedos(world, directions, hits)
     gain = np.repeat(gains, len(shots) // len(gains))
     intensity = albedo[:, 3] * (0.55 + 0.45 * incidence) * gain
     intensity += rng.normal(0, lidar.intensity_noise, len(shots))
@@ -115,7 +115,7 @@ def shot_directions(lidar: Lidar) -> Array:
 
 
 def return_chance(lidar: Lidar, brightness: Array, distance_m: Array) -> Array:
-    """(n,) chance that a shot comes back: of weak light, from dark, far or slanted surfaces, less.
+    """(n,) probability that a shot returns: lower from dark, far and slanted surfaces.
 
     Args:
         lidar: the sensor.

@@ -1,4 +1,4 @@
-"""Rigs to simulate with, by name; their poses are the truth."""
+"""Rigs to simulate with, by name; their extrinsics are the truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rig_of(name: str) -> Rig:
     Args:
         name: ``kitti``: a stereo pair 54 cm apart, 1241 x 376, as in KITTI's odometry sequences;
             ``walkley``: a pair 60 cm apart, 1920 x 1200, wider and distorted; ``surround``: six
-            cameras all round, 1280 x 800, distorted, their images hardly overlap; ``fisheye``: four
+            cameras all round, 1280 x 800, distorted, with little overlap; ``fisheye``: four
             fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle; ``sample``: two
             cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
 
@@ -68,7 +68,7 @@ def _sample() -> dict[str, Camera]:
 
 
 def _walkley() -> dict[str, Camera]:
-    """The paper gives the images' size; lenses and places are ours."""
+    """The image size is the paper's; lenses and placement are ours."""
     lens = (-0.11, 0.07, 0.0004, -0.0003)
     views = {"primary": (0.3, (1.2, 2.1, 0.3)), "secondary": (-0.3, (-0.8, 1.6, -0.5))}
     return {
@@ -127,11 +127,11 @@ RIG_NAMES = tuple(_RIGS)
 
 
 def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, ...]) -> Array:
-    """(4, 4) T_camera_lidar of a camera by its place and turns in the LiDAR's frame.
+    """(4, 4) T_camera_lidar of a camera, from its placement in the LiDAR's frame.
 
     Args:
-        xyz_m: (3,) place; x is forward, y left, z up.
-        yaw_pitch_roll_deg: turns about z, then y (down is positive), then x.
+        xyz_m: (3,) position; x is forward, y left, z up.
+        yaw_pitch_roll_deg: rotations about z, then y (down is positive), then x.
     """
     T = np.eye(4)
     turned = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix()
