@@ -32,7 +32,7 @@ def start_and_reference(folders: list[Path], seed: int) -> tuple[Rig, Rig]:
 
 @pytest.mark.parametrize("names", ["00", "06+07+08"])
 def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) -> None:
-    """One start each; benchmarks/search.py has more, and from farther."""
+    """One start each; benchmarks.accuracy.search has more, and from farther."""
     folders = sequences(realdata, names)
     start, reference = start_and_reference(folders, seed=0)
     matched = match_in_rounds(folders, start, progress=lambda *_: None)

@@ -1,4 +1,4 @@
-"""Recorded and rendered data that are good, or wrong in one of many ways; see ``verdicts.py``."""
+"""Recorded and simulated data that are good, or wrong in one of many ways: see ``verdicts``."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from table_cases import (
-    Problem,
+
+from benchmarks.accuracy.rig_changes import (
     Rng,
+    compose_extrinsics,
     derangement,
-    displacement,
-    inverted,
-    sign,
+    invert_extrinsics,
+    random_sign,
+    to_transform,
     with_focal,
     with_stereo,
 )
-
+from benchmarks.accuracy.worlds import Problem
 from calibgraph import Dataset, Frame, Rig, calibrate, load_dataset, load_rig, perturb
 
 Array = np.ndarray
@@ -33,7 +34,7 @@ SEQUENCES = {
     "count": ("05", "06", "07", "08", "06+07+08", "05+06+07+08"),
 }
 OTHER = {"00": "01", "01": "00", "05": "06", "06": "07", "07": "08", "08": "05", "06+07+08": "05"}
-"""Whose images are taken for a sequence's, of the same rig; where there is none, its own half."""
+"""Which sequence's images replace a sequence's own, of the same rig; else its own other half."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Folders:
 
     Attributes:
         realdata: of the recordings, or None.
-        scenes: of rendered streets ``scene_0``, ``scene_1``, ..., or None.
+        scenes: of simulated streets ``scene_0``, ``scene_1``, ..., or None.
     """
 
     realdata: Path | None
@@ -68,7 +69,7 @@ class Folders:
         return data, data.rig
 
     def images_for(self, name: str) -> Dataset:
-        """Data of the same rig, whose images are not this one's."""
+        """Data of the same rig whose images show another place."""
         if not name.startswith("scene_"):
             return self.load(OTHER.get(name, name))[0]
         own = int(name.split("_")[1])
@@ -90,7 +91,7 @@ class Scene:
     Attributes:
         name: of the data.
         data: the frames.
-        truth: the rig with its true poses.
+        truth: the true rig.
         folders: where other data are.
         scratch: an empty folder, removed after the case.
         seed: of the guess.
@@ -153,12 +154,11 @@ def far(scene: Scene, rng: Rng) -> Case:
 
 
 def far_turned(scene: Scene, rng: Rng) -> Case:
-    """The guess is beyond the matcher's range, and all cameras' alike: the LiDAR is elsewhere."""
+    """All guesses are beyond the matcher's range by one displacement, that of the LiDAR."""
     deg, m = rng.uniform(6, 20), rng.uniform(0.5, 1.5)
     axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    step = displacement(deg * axis, m * way)
-    poses = {name: T @ step for name, T in scene.guess().T_camera_lidar.items()}
-    return scene.data, scene.truth.moved_to(poses), {"guess_deg": deg, "guess_m": m}
+    step = to_transform(deg * axis, m * way)
+    return scene.data, compose_extrinsics(scene.guess(), step), {"guess_deg": deg, "guess_m": m}
 
 
 def swapped(scene: Scene, rng: Rng, known: bool) -> Case:
@@ -198,7 +198,7 @@ def shifted(scene: Scene, rng: Rng) -> Case:
 
 def focal(scene: Scene, rng: Rng, share: float) -> Case:
     """The rig's focal lengths are wrong."""
-    factor = 1 + sign(rng) * share
+    factor = 1 + random_sign(rng) * share
     return scene.data, with_focal(scene.guess(), factor), {"factor": factor}
 
 
@@ -215,7 +215,7 @@ def wrong_units(scene: Scene, rng: Rng) -> Case:
 def other(scene: Scene, rng: Rng) -> Case:
     """The images are of another place."""
     images = scene.folders.images_for(scene.name).frames
-    start = len(images) // 2  # of its own images too, if there is no other place
+    start = len(images) // 2  # also of its own images, if there is no other place
 
     def paths(index: int, frame: Frame) -> dict[str, Path]:
         return images[(index + start) % len(images)].image_paths
@@ -239,7 +239,7 @@ def covered(scene: Scene, rng: Rng, blurred: bool) -> Case:
 
 def inverted_guess(scene: Scene, rng: Rng) -> Case:
     """The guess is T_lidar_camera."""
-    return scene.data, inverted(scene.guess()), {}
+    return scene.data, invert_extrinsics(scene.guess()), {}
 
 
 KINDS: dict[str, Callable[[Scene, Rng], Case]] = {

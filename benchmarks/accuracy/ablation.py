@@ -1,9 +1,9 @@
-"""What each part of the matcher `structure` buys: the same runs, with one part taken out.
+"""What each part of the matcher `structure` contributes: the same runs without one part.
 
-    python benchmarks/ablation.py
+    python -m benchmarks.accuracy.ablation [--rounds 00 --search "" --parts "all of it"]
 
 Rounds: from within 0.3 deg and 6 cm, errors against the reference. Search: cameras found from
-within 20 deg and 1.5 m (success: within 1.5 deg and 25 cm, what the rounds reach), and its time.
+within 20 deg and 1.5 m (success: within 1.5 deg and 25 cm, what the rounds correct), and its time.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import ledger
 import numpy as np
-from data_cases import Folders
 from scipy.stats import qmc
 
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.data_cases import Folders
+from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
 from calibgraph.matching.structure import (
     box_search,
@@ -39,29 +40,49 @@ REACHED_DEG, REACHED_CM = 1.5, 25.0
 Part = Callable[[], AbstractContextManager[Any]]
 
 
+ROUNDS_COLUMNS = (
+    "part", "data", "cameras [deg]", "[cm]", "pairs [deg]", "[cm]", "z-score", "time [s]"
+)  # fmt: skip
+SEARCH_COLUMNS = ("part", "data", "cameras", "found", "wrongly accepted", "time [s]")
+
+
 def main() -> None:
     """Run both tables."""
+    options = parse_options()
+    folders = Folders(options.realdata, None)
+    tables = []
+    for title, names, parts, measure, columns in (
+        ("Rounds", options.rounds, ROUNDS, _measure_rounds, ROUNDS_COLUMNS),
+        ("Search", options.search, SEARCH, _measure_search, SEARCH_COLUMNS),
+    ):
+        rows = []
+        for data in names:
+            for part, without in parts.items():
+                if options.parts is None or part in options.parts:
+                    with without():
+                        cells = measure(folders.load(data), options.starts)
+                    rows.append((part, data, *cells))
+                    print(", ".join(rows[-1]), flush=True)
+        tables += [Table(f"{title}, {options.starts} starts", columns, tuple(rows))] if rows else []
+    publish("accuracy.ablation", tables, record=options.record)
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     words: Callable[[str], list[str]] = lambda text: [n for n in text.split(",") if n]  # noqa: E731
     parser.add_argument("--rounds", type=words, default=["00", "05+06+07+08"], help="data, or ''")
     parser.add_argument("--search", type=words, default=["05"], help="data, or ''")
+    parser.add_argument("--parts", type=words, help="some of the parts; all by default")
     parser.add_argument("--starts", type=int, default=4)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    arguments = parser.parse_args()
-    folders = Folders(arguments.realdata, None)
-    for names, parts, measure in (
-        (arguments.rounds, ROUNDS, _rounds),
-        (arguments.search, SEARCH, _search),
-    ):
-        for data in map(folders.load, names):
-            for name, without in parts.items():
-                with without():
-                    print(f"{name:34} {measure(data, arguments.starts)}", flush=True)
+    add_record_option(parser)
+    return parser.parse_args()
 
 
-def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
+def _measure_rounds(data: tuple[Dataset, Rig], starts: int) -> tuple[str, ...]:
     """Errors after the last rounds."""
     frames, truth = data
     found, z_scores, begun = [], [], time.perf_counter()
@@ -74,14 +95,14 @@ def _rounds(data: tuple[Dataset, Rig], starts: int) -> str:
     cameras = [_error(camera) for one in found for camera in one.cameras.values()]
     pairs = [_error(pair) for one in found for pair in one.pairs.values()]
     seconds = (time.perf_counter() - begun) / starts
+    (camera_deg, camera_cm), (pair_deg, pair_cm) = np.mean(cameras, axis=0), np.mean(pairs, axis=0)
     return (
-        "{:.3f} deg {:.2f} cm, ".format(*np.mean(cameras, axis=0))
-        + "between {:.3f} deg {:.2f} cm, ".format(*np.mean(pairs, axis=0))
-        + f"z-score {np.mean(z_scores):.1f}, {seconds:.1f} s"
-    )
+        f"{camera_deg:.3f}", f"{camera_cm:.2f}", f"{pair_deg:.3f}", f"{pair_cm:.2f}",
+        f"{np.mean(z_scores):.1f}", f"{seconds:.1f}",
+    )  # fmt: skip
 
 
-def _search(data: tuple[Dataset, Rig], starts: int) -> str:
+def _measure_search(data: tuple[Dataset, Rig], starts: int) -> tuple[str, ...]:
     """Cameras found, and wrongly accepted."""
     frames, truth = data
     right, wrong, begun = 0, 0, time.perf_counter()
@@ -95,8 +116,7 @@ def _search(data: tuple[Dataset, Rig], starts: int) -> str:
             reached = degrees < REACHED_DEG and centimetres < REACHED_CM
             right, wrong = right + reached, wrong + (not reached)
     seconds = (time.perf_counter() - begun) / starts
-    of = starts * len(truth.cameras)
-    return f"{right} of {of} cameras found, {wrong} wrongly accepted, {seconds:.1f} s"
+    return str(starts * len(truth.cameras)), str(right), str(wrong), f"{seconds:.1f}"
 
 
 def _error(error: Any) -> tuple[float, float]:
@@ -146,7 +166,7 @@ ROUNDS: Mapping[str, Part] = {
     "windows with hidden points": lambda: patch.object(
         windows, "find_visible", lambda angles, *_: np.ones(len(angles), np.bool_)
     ),
-    "linear parts taken out": _changed(windows, "cut_windows", keep_linear=False),
+    "linear parts removed": _changed(windows, "cut_windows", keep_linear=False),
     "shares, not likelihoods": lambda: patch.object(shift_scores, "score_windows", _shares),
     "without round 4": _levels(LEVELS[4:]),
     "without round 6": _levels(LEVELS[3:5]),

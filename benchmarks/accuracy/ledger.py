@@ -1,6 +1,7 @@
-"""Cases that run in processes, a line of JSON each in a file: a stopped run goes on from there.
+"""Cases that run in processes, a line of JSON each in a file: a stopped run continues from there.
 
-A line says by which code it was made (``code``). Lines of other code are kept, and counted aloud.
+A line holds a hash of the code that made it (``code``). Lines of other code are kept and counted,
+but their tables cannot be recorded as results.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -23,17 +24,17 @@ import numpy as np
 
 import calibgraph
 import factors
+from benchmarks.tables import ROOT, Table, publish
 from calibgraph import Calibration, CalibrationError, Rig, evaluate
 from calibgraph.model.geometry import twist_between
 
-ROOT = Path(__file__).parents[1]
 REALDATA = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))
-"""The real sensor data, unless it is said where they are."""
+"""The real sensor data: $CALIBGRAPH_REALDATA, or a folder beside the checkout."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """Which case a line is of."""
+    """What identifies a case."""
 
     level: str
     kind: str
@@ -60,7 +61,7 @@ def read(path: Path) -> list[Record]:
 
 
 def key_of(record: Record) -> Key:
-    """Which case a line is of."""
+    """The case of a line."""
     return Key(*(record[name] for name in Key.__dataclass_fields__))
 
 
@@ -73,6 +74,20 @@ def records_of(
     return run(cases, work, out=arguments.out, jobs=arguments.jobs)
 
 
+def publish_cases(
+    benchmark: str, tables: Sequence[Table], records: Sequence[Record], *, record: bool
+) -> None:
+    """Print tables of cases, and record them if all cases were run by the present code.
+
+    Raises:
+        SystemExit: if tables that are to be recorded have cases of other code.
+    """
+    others = sum(one.get("code") != code() for one in records)
+    publish(benchmark, tables, record=record and not others)
+    if record and others:
+        raise SystemExit(f"not recorded: {others} of {len(records)} cases were run by other code")
+
+
 def run(
     cases: Iterable[Key], work: Callable[[Key], Record], *, out: Path, jobs: int
 ) -> list[Record]:
@@ -80,8 +95,8 @@ def run(
 
     Args:
         cases: what to run.
-        work: runs one case in a process of its own pool; see :func:`guarded`.
-        out: the file, to which a line is added as soon as its case is done.
+        work: runs one case in a process of the pool; see :func:`run_case`.
+        out: the file, to which a line is appended as soon as its case is done.
         jobs: processes.
     """
     kept = [record for record in read(out) if "crash" not in record]
@@ -91,10 +106,10 @@ def run(
     of_others = f", {others} of them by other code" if others else ""
     print(f"{len(left)} cases to run, {len(done)} in {out}{of_others}", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    _end_line(out)
+    _drop_incomplete_line(out)
     start, pool = time.perf_counter(), ProcessPoolExecutor(jobs)
     try:
-        tasks = [pool.submit(guarded, work, case) for case in left]
+        tasks = [pool.submit(run_case, work, case) for case in left]
         for count, task in enumerate(as_completed(tasks), start=1):
             with out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(task.result()) + "\n")
@@ -102,19 +117,19 @@ def run(
                 seconds = time.perf_counter() - start
                 print(f"{count} of {len(left)} done, {seconds:.0f} s", flush=True)
     finally:
-        pool.shutdown(cancel_futures=True)  # Ctrl-C ends the cases at hand and no more
+        pool.shutdown(cancel_futures=True)  # Ctrl-C waits only for the running cases
     return read(out)
 
 
-def _end_line(out: Path) -> None:
-    """Take away what a stopped run left of its last line."""
+def _drop_incomplete_line(out: Path) -> None:
+    """Remove an incomplete last line, which a stopped run leaves."""
     if out.is_file():
         data = out.read_bytes()
         out.write_bytes(data[: data.rfind(b"\n") + 1])
 
 
-def guarded(work: Callable[[Key], Record], case: Key) -> Record:
-    """The line of a case: what ``work`` says, or why there is no result."""
+def run_case(work: Callable[[Key], Record], case: Key) -> Record:
+    """The line of a case: the result of ``work``, or why there is none."""
     cv2.setNumThreads(1)
     start = time.perf_counter()
     try:
@@ -127,8 +142,8 @@ def guarded(work: Callable[[Key], Record], case: Key) -> Record:
     return {**asdict(case), "code": code(), "seconds": seconds, **found}
 
 
-def judged(result: Calibration, truth: Rig) -> Record:
-    """What a result says of itself, and how far off it is, per camera."""
+def to_record(result: Calibration, truth: Rig) -> Record:
+    """Per camera: verdict, error bar, and the errors against the truth."""
     errors = evaluate(result.rig, truth).cameras
     return {"cameras": {name: _camera(result, name, truth, errors[name]) for name in errors}}
 

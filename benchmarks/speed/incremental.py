@@ -1,9 +1,9 @@
 """Time and memory of an update, against plain iSAM2 and against solving the batch again.
 
-    python benchmarks/incremental.py [--frames 20000]
+    python -m benchmarks.speed.incremental [--frames 20000]
 
 2 cameras, 500 correspondences each, 10 % outliers, all in one run. Plain iSAM2 has a block factor
-per camera and frame and never lets one go; it does one pass per frame, ours does two.
+per camera and frame and keeps them all; it does one pass per frame, ours does two.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from events import camera
 
+from benchmarks.accuracy.drives import camera
+from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
@@ -34,12 +35,12 @@ RIG = Rig(
 GUESS = perturb(RIG, rotation_deg=1.0, translation_m=0.1, seed=0)
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 POOL = 400
-EARLY, SAMPLE = 100, 100  # updates around frame 100, and at the end, whose median is taken
+EARLY, SAMPLE = 100, 100  # medians are of so many updates, around this frame and at the end
 PLAIN_AT = (100, 500, 2000)
 
 
 def frames(count: int) -> Iterator[Correspondences]:
-    """A drive whose frames come from a pool of different ones, over and over."""
+    """A drive that repeats a pool of different frames."""
     pool = list(simulate_drive(lambda frame: RIG, frames=POOL, matches=500, errors=ERRORS))
     for number in range(count):
         table = pool[number % POOL]
@@ -52,8 +53,8 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def ours(count: int) -> dict[int, float]:
-    """Seconds of the updates around some frames, by their number; prints as it goes."""
+def measure_ours(count: int) -> tuple[dict[int, float], Table]:
+    """Median seconds of the updates around some frames, by their number; and over the run."""
     tracker = IncrementalCalibrator(GUESS)
     seconds, memory = [], {}
     for number, table in enumerate(frames(count)):
@@ -64,16 +65,21 @@ def ours(count: int) -> dict[int, float]:
             memory[number + 1] = resident_mb()
     early = float(np.median(seconds[EARLY - SAMPLE // 2 : EARLY + SAMPLE // 2]))
     late = float(np.median(seconds[-SAMPLE:]))
-    print(f"ours: {1e3 * early:.2f} ms an update at frame {EARLY}, {1e3 * late:.2f} ms at {count}:")
-    print(f"  ratio {late / early:.2f}; {1 / np.mean(seconds):.0f} updates a second over the run;")
-    worst = f"99 % {1e3 * np.quantile(seconds, 0.99):.1f} ms, worst {1e3 * max(seconds):.0f} ms"
-    print(f"  {worst}; resident MB at frame: { ({k: round(v, 1) for k, v in memory.items()}) }")
+    rows = [
+        (f"median at frame {EARLY} [ms]", f"{1e3 * early:.2f}"),
+        (f"median at frame {count} [ms]", f"{1e3 * late:.2f}"),
+        ("ratio of the medians", f"{late / early:.2f}"),
+        ("mean rate [1/s]", f"{1 / np.mean(seconds):.0f}"),
+        ("99 % quantile [ms]", f"{1e3 * np.quantile(seconds, 0.99):.1f}"),
+        ("longest [ms]", f"{1e3 * max(seconds):.0f}"),
+        *((f"resident memory at frame {at} [MB]", f"{mb:.1f}") for at, mb in memory.items()),
+    ]
     at = {n: float(np.median(seconds[n - 50 : n + 50])) for n in PLAIN_AT if n + 50 <= count}
-    return at
+    return at, Table("Updates", ("", "value"), tuple(rows))
 
 
-def plain_isam2(count: int) -> dict[int, float]:
-    """Median seconds of an update around some frames, with no frame ever let go."""
+def measure_plain_isam2(count: int) -> dict[int, float]:
+    """Median seconds of an update before some frames, with every frame kept."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(1e-7)
     parameters.relinearizeSkip = 1
@@ -88,17 +94,16 @@ def plain_isam2(count: int) -> dict[int, float]:
         start = time.perf_counter()
         graph = gtsam.NonlinearFactorGraph()
         for name, m in matches.items():
-            graph.add(block_factor(pose_key(names, name), replace(m.block, scale=_SCALE)))
+            graph.add(
+                block_factor(pose_key(names, name), replace(m.block, scale=CAUCHY_SCALE_SIGMAS))
+            )
         isam.update(graph, gtsam.Values())
         isam.calculateBestEstimate()
         seconds.append(time.perf_counter() - start)
     return {n: float(np.median(seconds[n - 10 : n])) for n in PLAIN_AT if n <= count}
 
 
-_SCALE = CAUCHY_SCALE_SIGMAS
-
-
-def batch(count: int) -> float:
+def measure_batch(count: int) -> float:
     """Seconds of a batch solve over so many frames."""
     table = concatenate(list(frames(count)))
     solve(GUESS, table)
@@ -109,18 +114,23 @@ def batch(count: int) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=20_000)
-    count = parser.parse_args().frames
-    mine = ours(count)
-    plain = plain_isam2(min(count, PLAIN_AT[-1]))
-    print("frame   ours ms   plain iSAM2 ms (ratio)   batch again ms (ratio)")
-    for number, seconds in mine.items():
-        again = batch(number) if number < PLAIN_AT[-1] else np.nan
-        print(
-            f"{number:5d} {1e3 * seconds:9.2f} {1e3 * plain[number]:12.1f} "
-            f"({plain[number] / seconds:.1f})      {1e3 * again:12.0f} ({again / seconds:.0f})"
-        )
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=20_000, help="at least 150")
+    add_record_option(parser)
+    options = parser.parse_args()
+    ours, updates = measure_ours(options.frames)
+    plain = measure_plain_isam2(min(options.frames, PLAIN_AT[-1]))
+    rows = []
+    for number, seconds in ours.items():
+        again = measure_batch(number) if number < PLAIN_AT[-1] else np.nan
+        numbers = [1e3 * seconds, 1e3 * plain[number], plain[number] / seconds]
+        batch = ["", ""] if np.isnan(again) else [f"{1e3 * again:.0f}", f"{again / seconds:.0f}"]
+        rows.append((str(number), *(f"{value:.2f}" for value in numbers), *batch))
+    columns = ("frame", "ours [ms]", "plain iSAM2 [ms]", "ratio", "batch again [ms]", "ratio")
+    comparison = Table("An update, beside other ways", columns, tuple(rows))
+    publish("speed.incremental", [updates, comparison], record=options.record)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Is sigma real? Actual errors on recorded data beside the error bars that were reported.
+"""Errors on recorded data beside the reported error bars.
 
-    python benchmarks/sigma.py --starts 5 --out out/sigma.jsonl --picture out/sigma.png
-    python benchmarks/sigma.py --summary out/sigma.jsonl --picture out/sigma.png
+    python -m benchmarks.accuracy.sigma --starts 5 --picture out/sigma.png
+    python -m benchmarks.accuracy.sigma --summary out/sigma.jsonl --picture out/sigma.png
 
 Every sequence (and several places in one problem) is calibrated from several starts, 2 deg and
 0.2 m off, against KITTI's calibration. Errors are the components of xi in T_estimate = exp(xi)
 T_reference, about and along the camera's axes. The starts of one sequence share its frames, so
-their errors are alike: it is the number of places that counts, not that of starts.
+their errors are alike: the number of independent samples is that of the places.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import ledger
 import numpy as np
-from data_cases import GUESS_DEG, GUESS_M, Folders
-from ledger import Key, Record
 
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.data_cases import GUESS_DEG, GUESS_M, Folders
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import calibrate, perturb
 
 NAMES = ("00", "05", "06", "07", "08", "06+07+08", "05+06+07+08")
@@ -45,7 +46,7 @@ class Component:
 
 def main() -> None:
     """Run cases, print the tables, draw the picture."""
-    arguments = parsed()
+    arguments = parse_options()
     cases = [
         Key("data", "sigma", name, seed)
         for seed in range(arguments.first, arguments.first + arguments.starts)
@@ -53,12 +54,12 @@ def main() -> None:
     ]
     work = partial(run_case, folders=Folders(arguments.realdata, None))
     records = ledger.records_of(arguments, cases, work)
-    print(report(records))
+    ledger.publish_cases("accuracy.sigma", report(records), records, record=arguments.record)
     if arguments.picture is not None:
         draw(list(components_of(records)), arguments.picture)
 
 
-def parsed() -> argparse.Namespace:
+def parse_options() -> argparse.Namespace:
     """The options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -68,9 +69,10 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--sequences", type=lambda text: text.split(","), default=NAMES)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ledger.ROOT / "out" / "sigma.jsonl")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "sigma.jsonl")
     parser.add_argument("--summary", type=Path, help="print the tables of a file, run nothing")
     parser.add_argument("--picture", type=Path, help="draw errors against sigmas")
+    add_record_option(parser)
     return parser.parse_args()
 
 
@@ -78,7 +80,7 @@ def run_case(case: Key, folders: Folders) -> Record:
     """Calibrate one sequence from one start."""
     data, truth = folders.load(case.data)
     guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
-    return ledger.judged(calibrate(data, guess), truth)
+    return ledger.to_record(calibrate(data, guess), truth)
 
 
 def components_of(records: list[Record]) -> Iterator[Component]:
@@ -93,56 +95,61 @@ def components_of(records: list[Record]) -> Iterator[Component]:
                     yield Component(record["data"], name, part, axis, error, sigma)
 
 
-def report(records: list[Record]) -> str:
+COLUMNS = (
+    "n", "rms error", "rms sigma", "ratio", "within 1 sigma", "within 2 sigma", "within 3 sigma"
+)  # fmt: skip
+
+
+def report(records: list[Record]) -> list[Table]:
     """Three tables: per sequence, camera and axis; per sequence; over all."""
     found = list(components_of(records))
     present = [name for name in NAMES if any(r["data"] == name for r in records)]
-    lines = [f"{'':12} {'':10} {'':14}{_HEAD}"]
-    for sequence in present:
-        own = [c for c in found if c.sequence == sequence]
-        for camera in sorted({c.camera for c in own}):
-            for part in PARTS:
-                for axis in AXES:
-                    chosen = [c for c in own if (c.camera, c.part, c.axis) == (camera, part, axis)]
-                    lines.append(f"{sequence:12} {camera:10} {part:11} {axis} {_row(chosen)}")
-    lines += ["", f"{'':12} {'':11}{_HEAD}"]
-    for sequence in (*present, "all"):
-        for part in PARTS:
-            chosen = [c for c in found if c.part == part and sequence in (c.sequence, "all")]
-            if chosen:
-                lines.append(f"{sequence:12} {part:11}{_row(chosen)}")
-    lines += ["", "squared error in its covariance, over 6: 1 is expected; its median 0.89"]
-    lines += [
-        f"{name:12} {_normalised([r for r in records if name in (r['data'], 'all')])}"
+    axes: dict[tuple[str, ...], list[Component]] = {}
+    for c in sorted(found, key=lambda c: (present.index(c.sequence), c.camera)):
+        axes.setdefault((c.sequence, c.camera, f"{c.part} {c.axis} [{PARTS[c.part]}]"), []).append(
+            c
+        )
+    sequences = {
+        (name, f"{part} [{unit}]"): [
+            c for c in found if c.part == part and name in (c.sequence, "all")
+        ]
+        for name in (*present, "all")
+        for part, unit in PARTS.items()
+    }
+    normalised = [
+        (name, *_normalised([r for r in records if name in (r["data"], "all")]))
         for name in (*present, "all")
     ]
-    return "\n".join(lines)
+    return [
+        Table("Errors and sigmas per axis", ("data", "camera", "component", *COLUMNS),
+              tuple((*name, *_row(chosen)) for name, chosen in axes.items())),
+        Table("Errors and sigmas", ("data", "part", *COLUMNS),
+              tuple((*name, *_row(chosen)) for name, chosen in sequences.items() if chosen)),
+        Table("Squared error in its covariance, over 6 (1 is expected; its median 0.89)",
+              ("data", "median", "largest", "with error bar", "without", "refused"),
+              tuple(normalised)),
+    ]  # fmt: skip
 
 
-_HEAD = f"{'n':>5} {'rms error':>12} {'rms sigma':>12} {'ratio':>6}  within 1, 2, 3 sigma"
-
-
-def _row(chosen: list[Component]) -> str:
+def _row(chosen: list[Component]) -> tuple[str, ...]:
     error, sigma = (np.array([getattr(c, key) for c in chosen]) for key in ("error", "sigma"))
-    unit = PARTS[chosen[0].part]
     inside = [np.mean(np.abs(error) <= k * sigma) for k in (1, 2, 3)]
     return (
-        f"{len(chosen):5} {_rms(error):8.3f} {unit:3} {_rms(sigma):8.3f} {unit:3} "
-        f"{_rms(error) / _rms(sigma):6.2f}  " + " ".join(f"{share:6.0%}" for share in inside)
-    )
+        str(len(chosen)), f"{_rms(error):.3f}", f"{_rms(sigma):.3f}",
+        f"{_rms(error) / _rms(sigma):.2f}", *(f"{share:.0%}" for share in inside),
+    )  # fmt: skip
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _normalised(records: list[Record]) -> str:
+def _normalised(records: list[Record]) -> tuple[str, ...]:
     cameras = [camera for r in records for camera in r.get("cameras", {}).values()]
     values = [c["normalised_squared"] for c in cameras if c["normalised_squared"] is not None]
-    bare = len(cameras) - len(values)
-    refused = sum("cameras" not in r for r in records)
-    median = f"median {np.median(values):.2f}, largest {max(values):.2f}" if values else "none"
-    return f"{median}; {len(values)} results with an error bar, {bare} without, {refused} refused"
+    counts = len(values), len(cameras) - len(values), sum("cameras" not in r for r in records)
+    both = (f"{np.median(values):.2f}", f"{max(values):.2f}") if values else ("", "")
+    return *both, *map(str, counts)
 
 
 def draw(found: list[Component], path: Path) -> None:
@@ -172,7 +179,7 @@ def _draw_part(panel: Any, found: list[Component], names: list[str]) -> None:
     colours = colormaps["tab10"]
     sigmas = np.array([c.sigma for c in found])
     low, high = sigmas.min() / 2, sigmas.max() * 2
-    floor = low / 10  # an error of nearly nothing is drawn there
+    floor = low / 10  # smaller errors are drawn there
     for number, name in enumerate(names):
         own = [c for c in found if c.sequence == name]
         errors = [max(abs(c.error), floor) for c in own]

@@ -1,19 +1,16 @@
-"""Simulated correspondences: errors as asked for, named scenarios, the command."""
+"""Simulated correspondences: errors as configured."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.simulation.correspondences import PoseSpread, simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
+from calibgraph.simulation.matcher_errors import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
 from calibgraph.solver.joint import solve_joint
-from tests.conftest import Call
 
 
 def residuals(rig: Rig, table: Correspondences, name: str) -> np.ndarray:
@@ -27,8 +24,8 @@ def residuals(rig: Rig, table: Correspondences, name: str) -> np.ndarray:
 @pytest.mark.parametrize("name", RIG_NAMES)
 def test_points_of_a_street_lie_in_the_image_and_before_walls(name: str) -> None:
     rig = rig_of(name)
-    still = MatcherErrors(noise_px=0.0)
-    table = simulate_correspondences(rig, frames=2, matches=300, errors=still, depth_m=None)
+    exact = MatcherErrors(noise_px=0.0)
+    table = simulate_correspondences(rig, frames=2, matches=300, errors=exact, depth_m=None)
     for camera in rig.cameras:
         assert len(table.of_camera(camera)) == 600
         assert np.abs(residuals(rig, table, camera)).max() < 1e-6
@@ -69,7 +66,7 @@ def test_stuck_frames_have_the_matches_of_a_displaced_pose() -> None:
     assert 0.36 < moved.mean() < 0.64  # 4 sigma of 200 frames
 
 
-def test_confidences_fall_with_the_noise_unless_they_say_nothing() -> None:
+def test_confidences_fall_with_the_noise_if_informative() -> None:
     rig = rig_of("kitti")
     for informative in (True, False):
         errors = MatcherErrors(noise_spread=1.0, informative_confidence=informative)
@@ -80,46 +77,7 @@ def test_confidences_fall_with_the_noise_unless_they_say_nothing() -> None:
         assert correlation < -0.2 if informative else abs(correlation) < 0.06  # 4 sigma of 5000
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_the_command_writes_a_table_and_a_guess_that_is_off(
-    name: str, tmp_path: Path, call: Call
-) -> None:
-    folder = tmp_path / "sim"
-    code, _, text = call("simulate", name, "--frames", 3, "--out", folder)
-    assert code == 0, text
-    table = calibgraph.load_correspondences(folder / "correspondences.parquet")
-    truth = calibgraph.load_rig(folder / "reference.yaml")
-    assert set(table.cameras) == set(truth.cameras) == set(scenario_of(name).rig.cameras)
-    for name_, error in calibgraph.evaluate(
-        calibgraph.load_rig(folder / "rig.yaml"), truth
-    ).cameras.items():
-        assert error.rotation_error_deg == pytest.approx(5, abs=1e-6), name_
-    code, _, text = call("simulate", name, "--frames", 3, "--out", folder)
-    assert code == 2 and "is there already" in text
-    again = scenario_of(name).draw(3, 0)
-    np.testing.assert_array_equal(again.pixels_px, table.pixels_px)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("nowhere",), "unknown scenario 'nowhere'; known are street, kitti"),
-        (("kitti", "--frames", 0), "0 frames: expected 1 to"),
-        (("walkley", "--rotation-deg", 200), "expected an angle within"),
-        (("kitti", "--beams", 16, "--rig", "fisheye"), "--rig and --beams would change nothing"),
-        (("walkley", "--step-m", 0), "--step-m would change nothing"),
-        (("nowhere", "--beams", 16), "unknown scenario 'nowhere'"),
-    ],
-)
-def test_wrong_arguments_are_one_line(
-    arguments: tuple[object, ...], words: str, tmp_path: Path, call: Call
-) -> None:
-    code, _, text = call("simulate", *arguments, "--out", tmp_path / "out")
-    assert code == 2 and words in text and len(text.strip().splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_guess_of_the_same_seed_has_nothing_of_the_matchers_errors(pair: Rig) -> None:
+def test_a_guess_of_the_same_seed_is_independent_of_the_matchers_errors(pair: Rig) -> None:
     """One number seeds both, and generators of [seed, 0] and of seed are the same."""
     pose = PoseSpread((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
     errors = MatcherErrors(noise_px=0.0, bias_pose=pose)

@@ -1,11 +1,11 @@
-"""Is the error bar right? Many draws of a simulation: errors against reported covariances.
+"""Errors of many simulated draws against the reported covariances.
 
-    python benchmarks/uncertainty.py [--draws 200] [--frames 30] [--matches 100]
+    python -m benchmarks.accuracy.uncertainty [--draws 200] [--frames 30] [--matches 100]
 
 Errors of the simulated matcher: 1 px independent, 1 px shared by a camera's frame, 15 % outliers.
-NEES is the error squared in the metric of its covariance; its mean over 6 should be 1. The region
-that should hold 95 % of the errors is that of a chi-squared law with 6 degrees of freedom. Beside
-ours: the inverse of the information, (J^T J)^-1, which takes all correspondences for independent.
+NEES is the squared error in the metric of its covariance; its mean over 6 should be 1. The region
+that should hold 95 % of the errors is that of a chi-squared law with 6 degrees of freedom. For
+comparison: (J^T J)^-1, the inverse of the information of independent correspondences.
 """
 
 from __future__ import annotations
@@ -18,8 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Camera, Config, Intrinsics, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.model.geometry import relative_covariance, to_T_lidar_camera, twist_between
+from calibgraph.model.geometry import (
+    relative_covariance,
+    relative_transform,
+    to_T_lidar_camera,
+    twist_between,
+)
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
@@ -30,23 +36,36 @@ ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
+COLUMNS = ("error of", "covariance", "mean NEES / 6", "in the 95 % region")
+
+
 def main() -> None:
     """Draw, solve, and print one table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    options = parse_options()
+    found: dict[tuple[str, str], list[float]] = {}
+    for seed in range(options.draws):
+        for of, covariance, nees in draw(options.frames, options.matches, seed):
+            found.setdefault((of, covariance), []).append(nees)
+    limit = chi2.ppf(0.95, 6)
+    rows = [
+        (*name, f"{np.mean(values) / 6:.2f}", f"{np.mean(np.array(values) < limit):.1%}")
+        for name, values in found.items()
+    ]
+    title = f"{options.draws} draws, {options.frames} frames, {options.matches} matches each"
+    table = Table(title, COLUMNS, tuple(rows))
+    publish("accuracy.uncertainty", [table], record=options.record)
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--matches", type=int, default=100)
-    options = parser.parse_args()
-    found: dict[tuple[str, str], list[float]] = {}
-    for seed in range(options.draws):
-        for what, which, nees in draw(options.frames, options.matches, seed):
-            found.setdefault((what, which), []).append(nees)
-    limit = chi2.ppf(0.95, 6)
-    print(f"{options.draws} draws, {options.frames} frames, {options.matches} matches each")
-    print(f"{'of':16}{'covariance':20}{'mean NEES / 6':>14}{'in the 95 % region':>20}")
-    for (what, which), values in found.items():
-        inside = np.mean(np.array(values) < limit)
-        print(f"{what:16}{which:20}{np.mean(values) / 6:14.2f}{inside:20.1%}")
+    add_record_option(parser)
+    return parser.parse_args()
 
 
 def stereo() -> Rig:
@@ -61,14 +80,17 @@ def stereo() -> Rig:
 
 
 def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float]]:
-    """One draw: of what, by which covariance, the normalised error squared."""
+    """One draw: error of what, by which covariance, its NEES."""
     rig = stereo()
     table = simulate_correspondences(rig, frames=frames, matches=matches, errors=ERRORS, seed=seed)
     solved = solve_joint(rig, table, Config())
     ours = Evidence(solved, guess=rig).joint_covariance
     assert ours is not None
     errors = np.concatenate(
-        [twist_between(T, rig.cameras[name].T_camera_lidar) for name, T in solved.poses.items()]
+        [
+            twist_between(T, rig.cameras[name].T_camera_lidar)
+            for name, T in solved.T_camera_lidar.items()
+        ]
     )
     for which, joint in (("by frames (ours)", ours), ("(J^T J)^-1", independent(solved))):
         for what, error, covariance in parts(solved, errors, joint):
@@ -77,22 +99,22 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
 
 def parts(solved: Solution, errors: Array, joint: Array) -> Iterator[tuple[str, Array, Array]]:
     """Each camera and the pair: its error and covariance."""
-    for place, name in enumerate(solved.poses):
+    for place, name in enumerate(solved.T_camera_lidar):
         rows = slice(6 * place, 6 * place + 6)
         yield name, errors[rows], joint[rows, rows]
-    left, right = solved.poses.values()
-    T_right_left = right @ np.linalg.inv(left)
+    left, right = solved.T_camera_lidar.values()
+    T_right_left = relative_transform(right, left)
     of_pair = errors[6:] - gtsam.Pose3(T_right_left).AdjointMap() @ errors[:6]
     yield "left->right", of_pair, relative_covariance(joint, 0, 1, T_right_left)
 
 
 def independent(solved: Solution) -> Array:
-    """(12, 12) inverse of the information of all inliers, as if they were independent."""
+    """(12, 12) inverse of the information of all inliers, taken for independent."""
     joint = np.zeros((12, 12))
     for place, (name, matches) in enumerate(solved.inliers.blocks.items()):
         rows = slice(6 * place, 6 * place + 6)
         block = matches.with_scale(solved.scales[name])
-        sums = block.sums(to_T_lidar_camera(solved.poses[name]))
+        sums = block.sums(to_T_lidar_camera(solved.T_camera_lidar[name]))
         joint[rows, rows] = np.linalg.inv(sums.hessian)
     return joint
 

@@ -1,12 +1,12 @@
 """The matcher `structure` from far guesses: success, errors, verdicts and time.
 
-    python benchmarks/search.py --data 00,00+01 --within 20/1.5,2/0.2 --out out/search.jsonl
-    python benchmarks/search.py --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
-    python benchmarks/search.py --summary out/search.jsonl
+    python -m benchmarks.accuracy.search --data 00,00+01 --within 20/1.5,2/0.2
+    python -m benchmarks.accuracy.search --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
+    python -m benchmarks.accuracy.search --summary out/search.jsonl
 
-Guesses are drawn uniformly per axis, an independent draw per camera. A run is a success if every
-camera ends within 0.5 deg and 15 cm of the reference. A wrong PASS is a camera farther off than
-that which is called PASS, a wrong WARN likewise.
+Guesses are drawn uniformly per axis, independently per camera. A run is a success if every camera
+ends within 0.5 deg and 15 cm of the reference. A wrong PASS or WARN is a camera farther off than
+that with this verdict.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import ledger
 import numpy as np
-from data_cases import Folders, Scene, with_clouds, with_images
-from ledger import Key, Record
 
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.data_cases import Folders, Scene, with_clouds, with_images
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
 
 SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
@@ -32,7 +33,7 @@ BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
 
 def main() -> None:
     """Run cases, print the table."""
-    arguments = parsed()
+    arguments = parse_options()
     cases = [
         Key(within, kind, data, seed)
         for seed in range(arguments.first, arguments.first + arguments.starts)
@@ -42,10 +43,12 @@ def main() -> None:
     ]
     work = partial(run_case, folders=Folders(arguments.realdata, None))
     records = ledger.records_of(arguments, cases, work)
-    print(report(records))
+    ledger.publish_cases("accuracy.search", [report(records)], records, record=arguments.record)
+    for record in records:
+        print(record.get("crash", ""), end="")
 
 
-def parsed() -> argparse.Namespace:
+def parse_options() -> argparse.Namespace:
     """The options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -58,8 +61,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--jobs", type=int, default=1, help="1 to measure time")
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ledger.ROOT / "out" / "search.jsonl")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "search.jsonl")
     parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
+    add_record_option(parser)
     return parser.parse_args()
 
 
@@ -74,7 +78,7 @@ def run_case(case: Key, folders: Folders) -> Record:
         result = calibrate(KINDS[case.kind](scene), guess)
     pairs = evaluate(result.rig, truth).pairs
     return {
-        **ledger.judged(result, truth),
+        **ledger.to_record(result, truth),
         "rig": result.verdict.status,
         "pairs": {
             name: [pair.rotation_error_deg, pair.translation_error_cm]
@@ -141,55 +145,57 @@ KINDS: dict[str, Callable[[Scene], Dataset]] = {
 }
 
 
-def report(records: list[Record]) -> str:
+COLUMNS = (
+    "within [deg/m]", "kind", "data", "runs", "successes", "median [deg]", "[cm]",
+    "of each camera [deg, cm]", "pairs [deg]", "[cm]", "wrong PASS", "wrong WARN", "PASS", "WARN",
+    "FAIL", "refused", "time, median [s]", "longest [s]",
+)  # fmt: skip
+
+
+def report(records: list[Record]) -> Table:
     """A row per range, kind and data."""
-    rows = sorted({(r["level"], r["kind"], r["data"]) for r in records}, key=_order)
-    lines = [_HEAD, *(_row([r for r in records if _name(r) == row], row) for row in rows)]
-    crashes = [r["crash"] for r in records if "crash" in r]
-    return "\n".join([*lines, *crashes])
-
-
-def _name(record: Record) -> tuple[str, str, str]:
-    return record["level"], record["kind"], record["data"]
+    groups: dict[tuple[str, str, str], list[Record]] = {}
+    for record in records:
+        groups.setdefault((record["level"], record["kind"], record["data"]), []).append(record)
+    rows = [cells(name, groups[name]) for name in sorted(groups, key=_order)]
+    return Table("Recorded KITTI frames, guesses of any size", COLUMNS, tuple(rows))
 
 
 def _order(row: tuple[str, str, str]) -> tuple[float, str, str]:
     return -float(row[0].split("/")[0]), row[1], row[2]
 
 
-_HEAD = (
-    "deg/m    kind         data         runs success  median deg, cm  per camera"
-    "            pairs        wrong PASS, WARN  PASS WARN FAIL refused  s: median, longest"
-)
-
-
-def _row(records: list[Record], row: tuple[str, str, str]) -> str:
+def cells(name: tuple[str, str, str], records: list[Record]) -> tuple[str, ...]:
+    """The row of a range, kind and data."""
     done = [r for r in records if "cameras" in r]
     cameras = [camera for r in done for camera in r["cameras"].values()]
-    wrong = [c["status"] for c in cameras if not _right(c)]
-    success = sum(all(_right(c) for c in r["cameras"].values()) for r in done)
-    names = list(done[0]["cameras"]) if done else []
-    each = "; ".join(_median([r["cameras"][name] for r in done]) for name in names)
+    wrong = [c["status"] for c in cameras if not _is_right(c)]
+    successes = sum(all(_is_right(c) for c in r["cameras"].values()) for r in done)
     pairs = np.median([p for r in done for p in r["pairs"].values()] or [[np.nan] * 2], axis=0)
     statuses = [r["rig"] for r in done]
     seconds = [r["seconds"] for r in records]
+    degrees, centimetres = _median_errors(cameras)
+    names = list(done[0]["cameras"]) if done else []
+    each = (_median_errors([r["cameras"][one] for r in done]) for one in names)
     return (
-        f"{row[0]:8} {row[1]:12} {row[2]:12} {len(records):4} {success:4}    "
-        f"{_median(cameras):14}  {each:30}  {pairs[0]:.3f}, {pairs[1]:.2f}  "
-        f"{wrong.count('PASS'):6} {wrong.count('WARN'):6}     "
-        f"{statuses.count('PASS'):6} {statuses.count('WARN'):4} {statuses.count('FAIL'):4} "
-        f"{len(records) - len(done):4}  {np.median(seconds):8.1f} {max(seconds):6.1f}"
-    )
+        *name, str(len(records)), str(successes), f"{degrees:.3f}", f"{centimetres:.2f}",
+        "; ".join(f"{deg:.3f}, {cm:.2f}" for deg, cm in each), f"{pairs[0]:.3f}",
+        f"{pairs[1]:.2f}", *(str(wrong.count(status)) for status in ("PASS", "WARN")),
+        *(str(statuses.count(status)) for status in ("PASS", "WARN", "FAIL")),
+        str(len(records) - len(done)), f"{np.median(seconds):.1f}", f"{max(seconds):.1f}",
+    )  # fmt: skip
 
 
-def _right(camera: Record) -> bool:
+def _is_right(camera: Record) -> bool:
     return camera["error_deg"] < SUCCESS_DEG and camera["error_cm"] < SUCCESS_CM
 
 
-def _median(cameras: list[Record]) -> str:
-    values = [[c["error_deg"], c["error_cm"]] for c in cameras]
-    degrees, centimetres = np.median(values, axis=0) if values else (np.nan, np.nan)
-    return f"{degrees:.3f}, {centimetres:.2f}"
+def _median_errors(cameras: list[Record]) -> tuple[float, float]:
+    """Rotation [deg] and translation [cm]; NaN of no cameras."""
+    if not cameras:
+        return np.nan, np.nan
+    degrees, centimetres = np.median([[c["error_deg"], c["error_cm"]] for c in cameras], axis=0)
+    return float(degrees), float(centimetres)
 
 
 if __name__ == "__main__":

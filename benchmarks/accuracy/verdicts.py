@@ -1,16 +1,17 @@
-"""False PASS and false FAIL: cases that are wrong in many ways, and good ones.
+r"""False PASS and false FAIL: cases that are wrong in many ways, and good ones.
 
-    python benchmarks/verdicts.py --set tune --tables 20 --data 8 --out out/tune.jsonl
-    python benchmarks/verdicts.py --summary out/tune.jsonl
+    python -m benchmarks.accuracy.verdicts --set tune --tables 20 --data 8 --out out/tune.jsonl
+    python -m benchmarks.accuracy.verdicts --summary out/tune.jsonl
 
 Thresholds are chosen on the set ``tune``; what is published is counted on ``count``, which shares
 neither recordings (but for the motorway), scenes nor seeds with it. ``--tables`` and ``--data`` are
 the cases per kind, of simulated correspondences and of images and clouds: from there on
 (``--first``) they go through the rigs, and through the set's sequences and scenes, in turn. A
-stopped run goes on with the same command. Scenes are rendered beforehand, a minute each:
+stopped run continues with the same command. Scenes are simulated beforehand, 20 s each:
 
     for i in 0 1 2 3 4 5; do
-        python data/generate.py --out out/scenes/scene_$i --seed $((100 + i)) --frames 8; done
+        calibgraph simulate street --rig sample --beams 32 --frames 8 --step-m 5 \
+            --seed $((100 + i)) --out out/scenes/scene_$i; done
 
 A result is off beyond 0.5 deg or 10 cm, and right within 0.15 deg and 4 cm, of ``evaluate``'s E_R
 and E_t of that camera. Refusals (too few correspondences, say) have no error: they are a column of
@@ -23,18 +24,17 @@ import argparse
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
-import data_cases
-import ledger
-import table_cases
-from data_cases import Folders, data_for, data_problem
-from ledger import Key, Record
-from table_cases import UNDETECTABLE, rig_for, table_problem
+from benchmarks.accuracy import data_cases, ledger, table_cases
+from benchmarks.accuracy.data_cases import Folders, data_for, data_problem
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.table_cases import UNDETECTABLE, rig_for, table_problem
+from benchmarks.tables import ROOT, Table, add_record_option
 
-SCENES = ledger.ROOT / "out" / "scenes"
+SCENES = ROOT / "out" / "scenes"
 OFF_DEG, OFF_CM = 0.5, 10.0
 RIGHT_DEG, RIGHT_CM = 0.15, 4.0
 FIRST_SEED = {"tune": 0, "count": 1000}
@@ -45,26 +45,28 @@ GOOD_KINDS = ("good",)
 
 def main() -> None:
     """Run cases, print the summary."""
-    arguments = parsed()
-    if arguments.summary is not None:
-        records = [record for path in arguments.summary for record in ledger.read(path)]
-        print(summary(records, arguments.uncounted))
-        return
-    folders = Folders(
-        arguments.realdata if arguments.realdata.is_dir() else None,
-        arguments.scenes if arguments.scenes.is_dir() else None,
-    )
-    work = partial(run_case, folders=folders)
-    cases = [
-        case
-        for case in cases_of(arguments, folders)
-        if arguments.kinds is None or case.kind in arguments.kinds
-    ]
-    records = ledger.run(cases, work, out=arguments.out, jobs=arguments.jobs)
-    print(summary(records, arguments.uncounted))
+    options = parse_options()
+    if options.summary is not None:
+        records = [record for path in options.summary for record in ledger.read(path)]
+    else:
+        folders = Folders(
+            options.realdata if options.realdata.is_dir() else None,
+            options.scenes if options.scenes.is_dir() else None,
+        )
+        cases = [
+            case
+            for case in cases_of(options, folders)
+            if options.kinds is None or case.kind in options.kinds
+        ]
+        work = partial(run_case, folders=folders)
+        records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
+    counted = [record for record in records if record["kind"] not in options.uncounted]
+    tables = [summary(records, counted), figures(counted)]
+    ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
+    print("\n".join(remarks(records, counted)))
 
 
-def parsed() -> argparse.Namespace:
+def parse_options() -> argparse.Namespace:
     """The options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -81,8 +83,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
-    parser.add_argument("--out", type=Path, default=ledger.ROOT / "out" / "verdicts.jsonl")
-    parser.add_argument("--summary", type=Path, nargs="+", help="print that of files, and no more")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "verdicts.jsonl")
+    parser.add_argument("--summary", type=Path, nargs="+", help="summarise files, run nothing")
+    add_record_option(parser)
     arguments = parser.parse_args()
     unknown = {*(arguments.kinds or ())} - {*known}
     if unknown:
@@ -117,7 +120,7 @@ def run_case(case: Key, folders: Folders) -> Record:
             problem = table_problem(case.kind, case.data, case.seed)
         else:
             problem = data_problem(case.kind, case.data, case.seed, folders, Path(scratch))
-        return {"drawn": problem.drawn, **ledger.judged(problem.calibrate(), problem.truth)}
+        return {"drawn": problem.drawn, **ledger.to_record(problem.calibrate(), problem.truth)}
 
 
 def class_of(camera: Record) -> str:
@@ -136,34 +139,29 @@ def cameras_of(records: Iterable[Record]) -> Iterator[tuple[str, str]]:
             yield class_of(camera), camera["status"]
 
 
-def summary(records: list[Record], uncounted: Sequence[str]) -> str:
-    """A row per kind, the sums, and the two figures that matter.
+COLUMNS = (
+    "", "cases", "refused", "results",
+    *(f"{which}: {status}" for which in CLASSES for status in STATUSES),
+)  # fmt: skip
 
-    Args:
-        records: the cases.
-        uncounted: kinds that have a row, but are not in the sums.
-    """
+
+def summary(records: list[Record], counted: list[Record]) -> Table:
+    """A row per kind, and the sums of those that count."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in sorted(records, key=_order):
         groups.setdefault((record["level"], record["kind"]), []).append(record)
-    head = f"{'':24} {'':>5} {'':>7} {'':>7}" + "".join(f" | {name:^14}" for name in CLASSES)
-    names = f"{'':24} {'cases':>5} {'refused':>7} {'results':>7}" + " | PASS WARN FAIL" * 3
-    lines = [head, names]
-    lines += [row(f"{level} {kind}", group) for (level, kind), group in groups.items()]
-    counted = [record for record in records if record["kind"] not in uncounted]
-    lines += [row("all", counted) + f"  (without {', '.join(uncounted)})", "", *figures(counted)]
-    refusals = Counter(
-        (r["level"], r["kind"], _masked(r["refusal"])) for r in records if "refusal" in r
-    )
-    crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
-    lines += [f"    refused, {n}: {' '.join(what)}" for what, n in refusals.items()]
-    lines += [f"    CRASHED, {n}: {what}" for what, n in crashes.items()]
-    return "\n".join(lines)
+    rows = [cells(f"{level} {kind}", group) for (level, kind), group in groups.items()]
+    left_out = sorted({r["kind"] for r in records} - {r["kind"] for r in counted})
+    total = "all" + (f", without {', '.join(left_out)}" if left_out else "")
+    return Table("Verdicts of results by their error", COLUMNS, (*rows, cells(total, counted)))
 
 
-def _masked(text: str) -> str:
-    """A message without its numbers, so that equal ones can be counted, and not too long."""
-    return re.sub(r"[0-9.]+", "#", text)[:120]
+def cells(name: str, group: list[Record]) -> tuple[str, ...]:
+    """The row of one kind."""
+    found = Counter(cameras_of(group))
+    refused = sum("refusal" in record for record in group)
+    counts = (found[which, status] for which in CLASSES for status in STATUSES)
+    return name, *map(str, (len(group), refused, found.total(), *counts))
 
 
 def _order(record: Record) -> tuple[str, int]:
@@ -171,32 +169,48 @@ def _order(record: Record) -> tuple[str, int]:
     return record["level"], kinds.index(record["kind"])
 
 
-def row(name: str, group: list[Record]) -> str:
-    """Counts of one kind."""
-    found = Counter(cameras_of(group))
-    refused = sum("refusal" in record for record in group)
-    line = f"{name:24} {len(group):5} {refused:7} {sum(found.values()):7}"
-    for which in CLASSES:
-        line += " | " + " ".join(f"{found[which, status]:4}" for status in STATUSES)
-    return line
-
-
-def figures(counted: list[Record]) -> list[str]:
+def figures(counted: list[Record]) -> Table:
     """The share of PASS among results that are off, and of FAIL among those that are right."""
     found = Counter(cameras_of(counted))
     off, right = (sum(found[which, s] for s in STATUSES) for which in ("off", "right"))
     wrong_cases = [r for r in counted if any(which == "off" for which, _ in cameras_of([r]))]
-    passed = [r for r in wrong_cases if ("off", "PASS") in {*cameras_of([r])}]
-    refused = sum("refusal" in r for r in counted)
     refused_good = sum("refusal" in r for r in counted if r["kind"] in GOOD_KINDS)
     calm = found["right", "PASS"] + found["right", "WARN"]
+    off_by = f"off by more than {OFF_DEG} deg or {OFF_CM:g} cm"
+    return Table(
+        "Wrong verdicts",
+        ("", "share"),
+        (
+            (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
+            (f"PASS, of cases with a result {off_by}",
+             share(len(_passed(counted)), len(wrong_cases))),
+            (f"PASS or WARN, of results within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases "
+             "that were refused", share(calm, right + refused_good)),
+        ),
+    )  # fmt: skip
+
+
+def remarks(records: list[Record], counted: list[Record]) -> list[str]:
+    """Cases that PASS although off, reasons of refusals, and crashes."""
+    refusals = Counter(
+        (r["level"], r["kind"], _masked(r["refusal"])) for r in records if "refusal" in r
+    )
+    crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
     return [
-        f"off by more than {OFF_DEG} deg or {OFF_CM:g} cm: PASS {share(found['off', 'PASS'], off)} "
-        f"of results, in {share(len(passed), len(wrong_cases))} of cases; {refused} more refused",
-        f"within {RIGHT_DEG} deg and {RIGHT_CM:g} cm: PASS or WARN "
-        f"{share(calm, right + refused_good)} of results, {refused_good} of them refused",
-        *(f"    PASS but off: {_line(r)}" for r in passed),
+        *(f"PASS but off: {_line(record)}" for record in _passed(counted)),
+        *(f"refused, {n}: {' '.join(what)}" for what, n in refusals.items()),
+        *(f"CRASHED, {n}: {what}" for what, n in crashes.items()),
     ]
+
+
+def _passed(counted: list[Record]) -> list[Record]:
+    """Cases with a camera that PASSes although off."""
+    return [r for r in counted if ("off", "PASS") in {*cameras_of([r])}]
+
+
+def _masked(text: str) -> str:
+    """A message without its numbers, so that equal ones can be counted, and not too long."""
+    return re.sub(r"[0-9.]+", "#", text)[:120]
 
 
 def _line(record: Record) -> str:
