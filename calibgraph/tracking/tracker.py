@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file, write_bytes
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -24,16 +22,21 @@ from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.epochs import closed
 from calibgraph.tracking.events import Event, squared_sigmas
 from calibgraph.tracking.outlier_frames import agrees, suspect
-from calibgraph.tracking.packing import packed, unpacked
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.start import noted, started
 from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state_bytes import (
+    StateError,
+    decode,
+    encode,
+    load_state_file,
+    save_state_file,
+)
 from calibgraph.tracking.step_detection import found_shift, found_step, moved, shifted
 from calibgraph.tracking.window import Window
 
 Array = NDArray[np.float64]
 
-_FORMAT = b"calibgraph-tracker/1\n"
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 _REMARKS = ("systematic_rotation_rad", "systematic_translation_m")  # that count frame by frame
 _SUSPECTS = 20  # frames that are remembered as disagreeing, or as agreeing
@@ -167,16 +170,16 @@ class IncrementalCalibrator:
 
     def to_bytes(self) -> bytes:
         """Everything that :meth:`from_bytes` needs to go on with the same numbers."""
-        return packed((self._kept, tuple(self._since)), self._kept.rig)
+        return encode((self._kept, tuple(self._since)), self._kept.rig)
 
     @staticmethod
     def from_bytes(data: bytes) -> IncrementalCalibrator:
         """The tracker that :meth:`to_bytes` has written: its next updates are the same.
 
         Raises:
-            CalibrationError: if the bytes are not whole.
+            CalibrationError: if the bytes are damaged or of another format.
         """
-        state, since = unpacked(data)
+        state, since = decode(data)
         tracker = IncrementalCalibrator(state.rig, state.config)
         tracker._resume(state)
         for number, table in since:
@@ -184,26 +187,20 @@ class IncrementalCalibrator:
         return tracker
 
     def save(self, path: Path | str) -> None:
-        """Write the tracker to a file, atomically; :meth:`load` goes on from there."""
-        data = self.to_bytes()
-        head = _FORMAT + hashlib.sha256(data).digest()
-        write_bytes(Path(path), head + data)
+        """Write the tracker to a file, atomically; :meth:`load` continues from there."""
+        save_state_file(Path(path), self.to_bytes())
 
     @staticmethod
     def load(path: Path | str) -> IncrementalCalibrator:
         """Read a tracker that :meth:`save` has written.
 
         Raises:
-            FileError: if the file is missing, damaged or of another version.
+            FileError: if the file is missing, damaged, or not of this format.
         """
-        data = require_file(Path(path)).read_bytes()
-        start = len(_FORMAT) + hashlib.sha256().digest_size
-        if not data.startswith(_FORMAT):
-            known = _FORMAT.decode().strip()
-            raise FileError(path, f"is not a {known} file; track anew from a rig")
-        if hashlib.sha256(data[start:]).digest() != data[len(_FORMAT) : start]:
-            raise FileError(path, "is damaged: its checksum is wrong; go on from another copy")
-        return IncrementalCalibrator.from_bytes(data[start:])
+        try:
+            return IncrementalCalibrator.from_bytes(load_state_file(Path(path)))
+        except StateError as error:
+            raise FileError(path, f"{error}; track anew from a rig") from error
 
     def _resume(self, state: State) -> None:
         """Go on from a state: at the start, at each new epoch, and after a restart."""
