@@ -1,9 +1,12 @@
 """A tracker's state on disk: an SQLite database of snapshots and of the inputs since.
 
-``state.sqlite`` has two tables. ``journal`` holds the inputs in order, each with its number.
-``snapshot`` holds the state after a number of inputs. A row has a checksum, since SQLite checks
-its log but not its pages. Write-ahead log and ``synchronous=FULL``: a row is on disk when the
-insertion returns, and a crash leaves all of a row or none.
+``state.sqlite`` has three tables. ``journal`` holds the inputs in order, each with its number.
+``snapshot`` holds the state after a number of inputs. Their rows have checksums, since SQLite
+checks its log but not its pages. ``status`` holds the number of the last input, by which missing
+rows are noticed, and whether a log is in use, by which a missing log is noticed.
+
+With a write-ahead log and ``synchronous=FULL``, a row is on disk when its transaction returns, and
+a crash leaves all of a transaction or none.
 
 The newest two snapshots are kept, with the inputs since the older one: if the newest is damaged,
 the older one and the journal lead to the same state.
@@ -18,8 +21,9 @@ import os
 import sqlite3
 import struct
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 from calibgraph.errors import FileError
@@ -39,8 +43,8 @@ _TABLES = f"""
     PRAGMA user_version={LAYOUT};
     CREATE TABLE snapshot (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
     CREATE TABLE journal (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
-    CREATE TABLE use (is_open INTEGER NOT NULL);
-    INSERT INTO use VALUES (0);
+    CREATE TABLE status (number INTEGER NOT NULL, is_open INTEGER NOT NULL);
+    INSERT INTO status VALUES (0, 0);
 """
 
 
@@ -102,7 +106,8 @@ class StateDatabase:
         with self._writing() as connection:
             row = number, content, _digest(number, content)
             connection.execute("INSERT INTO journal VALUES (?, ?, ?)", row)
-            self._number = number
+            connection.execute("UPDATE status SET number = ?", (number,))
+        self._number = number
 
     def snapshot(self, state: bytes) -> None:
         """Keep ``state``, which all inputs so far led to; it is durable when this returns.
@@ -114,44 +119,35 @@ class StateDatabase:
         """
         row = self._number, state, _digest(self._number, state)
         with self._writing() as connection:
-            connection.execute("BEGIN")
             connection.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", row)
             (kept,) = connection.execute(
                 "SELECT min(number) FROM (SELECT number FROM snapshot ORDER BY number DESC LIMIT 2)"
             ).fetchone()
             connection.execute("DELETE FROM snapshot WHERE number < ?", (kept,))
             connection.execute("DELETE FROM journal WHERE number <= ?", (kept,))
-            connection.execute("COMMIT")
 
     def close(self) -> None:
         """Release the folder; nothing is left to write."""
-        try:
-            if self._connection is not None and not self._failed:
-                self._mark(is_open=False)
-        finally:
-            connection, self._connection = self._connection, None
-            lock, self._lock = self._lock, None
-            if connection is not None:
-                connection.close()
-            if lock is not None:
-                os.close(lock)
-
-    def _mark(self, *, is_open: bool) -> None:
-        """Note in the database file itself whether its log is in use."""
-        with self._writing() as connection:
-            connection.execute("UPDATE use SET is_open = ?", (is_open,))
-            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+        connection, self._connection = self._connection, None
+        lock, self._lock = self._lock, None
+        if connection is not None:
+            with suppress(sqlite3.Error):  # of a full disk: then the next one warns in vain
+                connection.rollback()
+                connection.execute("UPDATE status SET is_open = 0")
+            connection.close()  # copies the log into the database and removes it
+        if lock is not None:
+            os.close(lock)
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        """Any error in the body ends all writing: whether its row is on disk is unknown."""
+        """A transaction. An error ends all writing: whether it is on disk is unknown then."""
         if self._lock is None or self._failed:
             raise ValueError(f"{self._path}: is closed; open its folder anew")
         try:
-            if self._connection is None:
-                self._connection = _connect(self._path)
-                self._mark(is_open=True)
+            self._connection = self._connection or _connect(self._path)
+            self._connection.execute("BEGIN")
             yield self._connection
+            self._connection.execute("COMMIT")
         except BaseException as error:
             self._failed = True
             if isinstance(error, sqlite3.Error):
@@ -230,6 +226,8 @@ def _connect(path: Path) -> sqlite3.Connection:
     connection.execute("PRAGMA locking_mode=EXCLUSIVE")
     connection.execute("PRAGMA journal_mode=WAL")
     connection.execute("PRAGMA synchronous=FULL")
+    connection.execute("UPDATE status SET is_open = 1")
+    connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()  # into the database itself
     return connection
 
 
@@ -243,12 +241,12 @@ def _read(path: Path) -> tuple[Recovered, int]:
     had_log = log.exists() and log.stat().st_size > 0
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
-            (state,) = database.execute("PRAGMA quick_check(1)").fetchone()
+            (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if state != "ok":
                 raise _damaged(path, state)
-            recovered, number = _recover(database, path)
-            (is_open,) = database.execute("SELECT is_open FROM use").fetchone()
-    except (sqlite3.Error, TypeError) as error:  # TypeError: a row that must be there is not
+            number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
+            recovered = _recover(database, path, number)
+    except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
         raise _damaged(path, error) from error
     finally:
         _remove_index(path, had_log=had_log)
@@ -265,8 +263,8 @@ def _remove_index(path: Path, *, had_log: bool) -> None:
         _log_of(path).unlink(missing_ok=True)
 
 
-def _recover(database: sqlite3.Connection, path: Path) -> tuple[Recovered, int]:
-    """The newest undamaged snapshot, and all inputs after it."""
+def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered:
+    """The newest undamaged snapshot, and all inputs after it up to the newest."""
     damages: list[str] = []
     start, snapshot = 0, None
     query = "SELECT number, content, digest FROM snapshot ORDER BY number DESC"
@@ -277,21 +275,18 @@ def _recover(database: sqlite3.Connection, path: Path) -> tuple[Recovered, int]:
         damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
     if damages and snapshot is None:
         raise _damaged(path, "no snapshot has the right checksum")
-    inputs = []
     query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
-    for expected, (number, content, digest) in enumerate(
-        database.execute(query, (start,)), start + 1
-    ):
-        if number != expected or digest != _digest(number, content):
+    rows = database.execute(query, (start,)).fetchall()
+    for expected, row in zip_longest(range(start + 1, newest + 1), rows):
+        if row is None or row[0] != expected or row[2] != _digest(*row[:2]):
             raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
-        inputs.append(content)
-    return Recovered(snapshot, tuple(inputs), tuple(damages)), start + len(inputs)
+    return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
 
 
 def _digest(number: int, content: object) -> bytes:
     if not isinstance(content, bytes):
         return b""
-    return hashlib.sha256(number.to_bytes(8, "big") + content).digest()
+    return hashlib.sha256(str(number).encode() + b" " + content).digest()
 
 
 def _damaged(path: Path, why: object) -> FileError:
