@@ -188,7 +188,8 @@ def _require_layout(folder: Path) -> None:
         if _log_of(path).exists():
             raise FileError(path, "is missing, and its log is there; restore it from a copy")
         return
-    header = _read_header(path)
+    with path.open("rb") as file:
+        header = file.read(_HEADER.size)
     if len(header) < _HEADER.size or not header.startswith(_SQLITE):
         raise FileError(path, "is damaged or no tracker's state; choose another folder")
     _, layout, application = _HEADER.unpack(header)
@@ -197,11 +198,6 @@ def _require_layout(folder: Path) -> None:
     if layout != LAYOUT:
         message = f"is state of layout {layout}, expected {LAYOUT}; choose another folder"
         raise FileError(path, f"{message}, or continue with the calibgraph that wrote it")
-
-
-def _read_header(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_HEADER.size)
 
 
 def _log_of(path: Path) -> Path:
@@ -220,14 +216,23 @@ def _create(path: Path) -> None:
     write_atomically(path, write)
 
 
+_OPEN_FOR_WRITING = """
+    PRAGMA locking_mode=EXCLUSIVE;
+    PRAGMA journal_mode=WAL;
+    PRAGMA synchronous=FULL;
+    UPDATE status SET is_open = 1;
+    PRAGMA wal_checkpoint(PASSIVE);
+"""
+
+
 def _connect(path: Path) -> sqlite3.Connection:
-    """A connection for writing, which no other can share."""
+    """A connection for writing, which no other can share; it is noted in the database itself."""
     connection = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
-    connection.execute("PRAGMA locking_mode=EXCLUSIVE")
-    connection.execute("PRAGMA journal_mode=WAL")
-    connection.execute("PRAGMA synchronous=FULL")
-    connection.execute("UPDATE status SET is_open = 1")
-    connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()  # into the database itself
+    try:
+        connection.executescript(_OPEN_FOR_WRITING)
+    except BaseException:
+        connection.close()
+        raise
     return connection
 
 

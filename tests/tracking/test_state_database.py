@@ -306,11 +306,12 @@ def work(folder, round):
             database.snapshot(b"\\n".join(lines))
 
 random.seed(5)
+StateDatabase(Path(sys.argv[1])).close()
 for round in range(int(sys.argv[2])):
     child = os.fork()
     if child == 0:
         work(Path(sys.argv[1]), round)
-    time.sleep(random.uniform(0.01, 0.06))
+    time.sleep(random.uniform(0.02, 0.25))
     os.kill(child, signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL, "it ended on its own"
 """
