@@ -22,7 +22,7 @@ from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, ma
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.run import Say, follow
-from calibgraph.tracking.stream import Item, frames_of
+from calibgraph.tracking.streams import Item, frames_of
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 

@@ -17,7 +17,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.stream import Item, Refused, StreamFrame
+from calibgraph.tracking.streams import Item, Refused, StreamFrame
 
 
 def first_frames(dataset: Dataset, matcher: FullMatcher, config: Config) -> Calibration:

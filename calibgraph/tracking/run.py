@@ -9,7 +9,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.report import json_line
-from calibgraph.tracking.stream import Item, Refused, StreamFrame
+from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.tracker import Update
 
 Say = Callable[[str], None]

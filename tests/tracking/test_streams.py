@@ -19,8 +19,9 @@ import pytest
 from pyarrow import ipc, parquet
 
 from calibgraph import Correspondences, FileError, concatenate
-from calibgraph.tracking import stream_folder, stream_input
-from calibgraph.tracking.stream import Refused, StreamFrame, frames_of
+from calibgraph.model.table_columns import to_arrow
+from calibgraph.tracking import stream_lines, streams
+from calibgraph.tracking.streams import Refused, StreamFrame, frames_of
 
 to_arrow = Correspondences.to_arrow
 
@@ -255,8 +256,8 @@ class Following:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than for real writers."""
-    monkeypatch.setattr(stream_folder, "POLL_S", 0.01)
-    monkeypatch.setattr(stream_folder, "QUIET_S", 0.4)
+    monkeypatch.setattr(streams, "POLL_S", 0.01)
+    monkeypatch.setattr(streams, "QUIET_S", 0.4)
 
 
 @pytest.mark.usefixtures("quick")
@@ -313,7 +314,7 @@ def test_a_followed_file_that_stays_unreadable_is_refused_once(tmp_path: Path) -
     following = Following(tmp_path)
     start = time.monotonic()
     messages = sorted(str(following.next()).removeprefix(f"{tmp_path}/") for _ in range(3))
-    assert time.monotonic() - start >= stream_folder.QUIET_S - stream_folder.POLL_S
+    assert time.monotonic() - start >= streams.QUIET_S - streams.POLL_S
     for message, expected in zip(
         messages, ["a.parquet: cannot", "b.parquet: no such", "c.parquet: is a folder"], strict=True
     ):
@@ -477,43 +478,64 @@ def test_empty_lines_are_skipped_but_counted() -> None:
         (b"\xfe\xfe", "is not UTF-8"),
         (line()[:-1].decode().encode("utf-16"), "is not UTF-8"),
         (b"[" * 100_000, "is nested too deeply"),
-        (b"[1]", "the line must be a JSON object, found [1]"),
+        (b"[1]", "Input should be a JSON object, found [1]"),
         (b'{"frame": 1, "frame": 2, "cameras": {}}', "key 'frame' is given twice"),
-        (b'{"frame": ' + b"9" * 5000 + b', "cameras": {}}', "is not to be read"),
+        (b'{"frame": ' + b"9" * 5000 + b', "cameras": {}}', "cannot be read"),
         (b'{"frame": 7}', "key 'cameras' is missing"),
-        (line(weather="rain"), "unknown key 'weather'; known are frame"),
-        (line(1.0), "frame must be a whole number of 64 bits, found 1.0"),
-        (line(True), "frame must be a whole number of 64 bits, found True"),
-        (line(2**63), "frame must be a whole number of 64 bits, found 9223372036854775808"),
-        (line("7"), "frame must be a whole number of 64 bits, found '7'"),
-        (line(stamp_ns=None), "stamp_ns must be a whole number"),
-        (line(cameras=[]), "cameras must be a JSON object, found []"),
-        (line(cameras={"left": None}), "camera 'left' must be a JSON object, found None"),
-        (line(cameras={"left": {}}), "camera 'left': key 'u_px' is missing"),
-        (line(cameras={"left": camera(depth=[1])}), "unknown key 'depth'"),
-        (line(cameras={"left": camera(u_px=5)}), "u_px must be a list of numbers, found 5"),
-        (line(cameras={"left": camera(u_px=[True])}), "must hold numbers, found True in row 0"),
-        (line(cameras={"left": camera(u_px=[[1]])}), "must hold numbers, found [1] in row 0"),
-        (line(cameras={"left": camera(u_px=[None])}), "must hold numbers, found None"),
-        (line(cameras={"left": camera(u_px=[10**400])}), "u_px holds a number that is too large"),
+        (line(weather="rain"), "unknown key 'weather'; remove it"),
+        (line(1.0), "frame: Input should be a valid integer, found 1.0"),
+        (line(True), "frame: Input should be a valid integer, found True"),
+        (line(2**63), "frame: Input should be less than 9223372036854775808, found"),
+        (line("7"), "frame: Input should be a valid integer, found '7'"),
+        (line(stamp_ns=None), "stamp_ns: Input should be a valid integer, found None"),
+        (line(cameras=[]), "cameras: Input should be a JSON object, found []"),
+        (line(cameras={"left": None}), "cameras.left: Input should be a JSON object, found None"),
+        (line(cameras={"left": {}}), "key 'cameras.left.u_px' is missing"),
+        (line(cameras={"left": camera(depth=[1])}), "unknown key 'cameras.left.depth'"),
+        (line(cameras={"left": camera(u_px=5)}), "u_px: Input should be a valid list, found 5"),
+        (
+            line(cameras={"left": camera(u_px=[True])}),
+            "u_px.0: Input should be a valid number, found True",
+        ),
+        (
+            line(cameras={"left": camera(u_px=[[1]])}),
+            "u_px.0: Input should be a valid number, found [1]",
+        ),
+        (
+            line(cameras={"left": camera(u_px=[None])}),
+            "u_px.0: Input should be a valid number, found None",
+        ),
+        (
+            line(cameras={"left": camera(u_px=[10**400])}),
+            "u_px.0: Input should be a valid number, found 1000",
+        ),
         (line(cameras={"left": camera(u_px=[float("nan")])}), "NaN is no number"),
         (line(cameras={"left": camera(u_px=[-float("inf")])}), "-Infinity is no number"),
         (line().replace(b"[1.5]", b"[1e999]"), "pixel must be finite"),
         (line(cameras={"left": camera(u_px=[1, 2])}), "differ in length: {'u_px': 2, 'v_px': 1"),
         (line(cameras={"left": camera(confidence=[2])}), "confidence must lie in (0, 1]"),
         (line(cameras={"left": camera(confidence=[1e300])}), "confidence must lie in (0, 1]"),
-        (line(cameras={"left": camera(point_index=[0.5])}), "must hold whole numbers, found 0.5"),
-        (line(cameras={"left": camera(point_index=[2**63])}), "too large"),
+        (
+            line(cameras={"left": camera(point_index=[0.5])}),
+            "point_index.0: Input should be a valid integer, found 0.5",
+        ),
+        (
+            line(cameras={"left": camera(point_index=[2**63])}),
+            "point_index.0: Input should be less than 9223372036854775808",
+        ),
         (line(cameras={"left": camera(i_uu_px=[1])}), "has only ['i_uu_px'] of"),
-        (line(cameras={str(i): camera(0) for i in range(1001)}), "expected at most 1000"),
-        (line(metadata=[]), "metadata must be a mapping"),
+        (
+            line(cameras={str(i): camera(0) for i in range(1001)}),
+            "cameras: Dictionary should have at most 1000 items",
+        ),
+        (line(metadata=[]), "metadata: Input should be a JSON object, found []"),
         (
             line(metadata={"systematic_rotation_rad": "x"}),
             "must be a number from 0 to 3.14, found 'x'",
         ),
         (
             line(metadata={"systematic_rotation_rad": 10**400}),
-            "must be a number from 0 to 3.14, found inf",
+            "must be a number from 0 to 3.14, found 1000",
         ),
         (line(metadata={"k": json.loads("[" * 40 + "]" * 40)}), "more than 32 levels"),
     ],
@@ -525,7 +547,7 @@ def test_a_wrong_line_is_refused_and_the_next_one_read(wrong: bytes, message: st
 def test_a_line_that_is_too_long_is_refused_without_being_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(stream_input, "MAX_LINE_BYTES", 100_000)
+    monkeypatch.setattr(stream_lines, "MAX_LINE_BYTES", 100_000)
     long = b'{"frame": "' + b"x" * 1_000_000 + b'"}'
     assert "is longer than 100000 bytes" in refusal(long)
     # Neither does one byte too many pass, nor is one that just fits refused.
@@ -600,7 +622,7 @@ def test_a_waiting_stream_ends_when_it_is_stopped(
         assert said([next(frames)]) == [1]
     until = time.monotonic() + 0.05
     assert said(frames) == []
-    assert time.monotonic() < until + 5 * stream_input.POLL_S
+    assert time.monotonic() < until + 5 * streams.POLL_S
 
 
 def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
@@ -616,7 +638,7 @@ def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
 def test_a_signal_ends_the_waiting_for_standard_input(begin: bytes) -> None:
     program = """
         import signal, sys
-        from calibgraph.tracking.stream import frames_of
+        from calibgraph.tracking.streams import frames_of
         stopped = []
         signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
         for item in frames_of("-", stop=lambda: bool(stopped)):
