@@ -406,7 +406,7 @@ def track(
     result, written = track(
         wanted,
         source,
-        tell=lambda text: console.print(text, soft_wrap=True, markup=False, highlight=False),
+        notify=lambda text: console.print(text, soft_wrap=True, markup=False, highlight=False),
     )
     from calibgraph.cli.tables import print_result
 

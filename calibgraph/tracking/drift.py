@@ -11,16 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.tracking.epoch_summary import Memory
-from calibgraph.tracking.events import (
-    CLEARLY,
-    Event,
-    Size,
-    Steps,
-    alarm_limit,
-    cause_of,
-    unexplained,
-)
+from calibgraph.tracking.cause import CLEARLY, Steps, alarm_limit, find_cause, unexplained
+from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.posterior import inverse, is_determined, posterior
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal
 
@@ -28,28 +21,30 @@ _QUIET = 1000  # frames in which a drift of the same camera is not told again
 _PATIENCE = 300  # frames until it is told in any case
 
 
-def drifting(state: State, camera: int, walk: int) -> State:
+def follow_drift(state: State, camera: int, walk: int) -> State:
     """The state in which a camera walks, and is watched until it is clear what drifts."""
-    known = state.cameras[camera]
-    said = known.drift_said_at
+    camera_state = state.cameras[camera]
+    said = camera_state.drift_reported_at
     quiet = said >= 0 and state.updates - said < _QUIET
     if state.drift is None and not quiet:
-        anchors = tuple(one.memory for one in state.cameras)
-        since = _frames_ago(state, known.memory, walk)
+        anchors = tuple(one.summary for one in state.cameras)
+        since = _frames_ago(state, camera_state.summary, walk)
         watch = DriftWatch(camera, state.updates, since, anchors)
         state = replace(state, drift=watch)
-    if known.memory.walk:
+    if camera_state.summary.walk:
         return state
-    return state.with_camera(camera, replace(known, memory=known.memory.walking(walk)))
+    return state.with_camera(
+        camera, replace(camera_state, summary=camera_state.summary.with_walk(walk))
+    )
 
 
-def _frames_ago(state: State, memory: Memory, walk: int) -> int:
+def _frames_ago(state: State, summary: EpochSummary, walk: int) -> int:
     """Number of the frame from which the walking memory still knows something."""
     oldest = state.live_frames[0].number if state.live_frames else state.frame or 0
-    return max(0, oldest - int(memory.frames[walk]))
+    return max(0, oldest - int(summary.frames[walk]))
 
 
-def told(state: State) -> tuple[State, list[Event]]:
+def report_drift(state: State) -> tuple[State, list[Event]]:
     """The state after a drift has been told, if it is clear by now what drifts."""
     watch = state.drift
     if watch is None:
@@ -61,7 +56,7 @@ def told(state: State) -> tuple[State, list[Event]]:
     waited = state.updates - watch.begun
     if abs(by_lidar - by_camera) < CLEARLY and waited < _PATIENCE and len(steps.cameras) > 1:
         return state, []
-    cause = cause_of(steps, sure={watch.camera})
+    cause = find_cause(steps, found_by={watch.camera})
     if cause.lidar:
         name, size = None, Size.of(*cause.lidar)
     else:
@@ -69,8 +64,8 @@ def told(state: State) -> tuple[State, list[Event]]:
         size = Size.of(*steps.of(steps.cameras.index(watch.camera)))
     event = Event("drifts", name, watch.frame, state.frame or 0, state.stamp_ns, size)
     for camera in range(len(state.cameras)) if cause.lidar else (watch.camera,):
-        known = replace(state.cameras[camera], drift_said_at=state.updates)
-        state = state.with_camera(camera, known)
+        camera_state = replace(state.cameras[camera], drift_reported_at=state.updates)
+        state = state.with_camera(camera, camera_state)
     return replace(state, drift=None), [event]
 
 

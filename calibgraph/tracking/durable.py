@@ -14,7 +14,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
-from calibgraph.tracking.tracker import IncrementalCalibrator, Update
+from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.tracking.update import Update
 
 _SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many
 

@@ -39,7 +39,7 @@ _LEAST_FRAMES = 4.0  # to predict anything from
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class EpochSummary:
     """One camera's past, under every walk.
 
     Attributes:
@@ -64,10 +64,10 @@ class Memory:
     next_half: int
 
     @staticmethod
-    def empty() -> Memory:
+    def empty() -> EpochSummary:
         """Nothing is known."""
         w = len(STRENGTHS)
-        return Memory(
+        return EpochSummary(
             hessian=np.zeros((w, 6, 6)),
             gradient=np.zeros((w, 6)),
             scatter=np.zeros((w, 6, 6)),
@@ -79,7 +79,7 @@ class Memory:
             next_half=0,
         )
 
-    def seen_from(self, step: Array) -> Memory:
+    def shift_reference(self, step: Array) -> EpochSummary:
         """With the reference moved by a tangent step."""
         return replace(
             self,
@@ -87,7 +87,7 @@ class Memory:
             halves_gradient=self.halves_gradient + self.halves_hessian @ step,
         )
 
-    def plus(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> Memory:
+    def add(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> EpochSummary:
         """With an epoch's sums added, taken at the same reference."""
         halves_hessian, halves_gradient = self.halves_hessian.copy(), self.halves_gradient.copy()
         halves_hessian[self.next_half] += hessian
@@ -103,7 +103,7 @@ class Memory:
             next_half=1 - self.next_half,
         )
 
-    def after_walk(self, variance: Array, inflation: float) -> tuple[Memory, Array]:
+    def propagate(self, variance: Array, inflation: float) -> tuple[EpochSummary, Array]:
         """What is known after an epoch in which the extrinsic may have walked.
 
         Args:
@@ -114,14 +114,14 @@ class Memory:
             The memory; (6, 6) G of the walk that is believed.
         """
         gains = np.stack([
-            kept_share(H, strength**2 * variance / inflation)
+            gain_of_walk(H, strength**2 * variance / inflation)
             for H, strength in zip(self.hessian, STRENGTHS, strict=True)
         ])  # fmt: skip
         hessian = gains @ self.hessian
         hessian = (hessian + hessian.transpose(0, 2, 1)) / 2
         walked = STRENGTHS[:, None, None] ** 2 * np.diag(variance)
         kept = np.trace(gains, axis1=1, axis2=2) / 6
-        memory = replace(
+        summary = replace(
             self,
             hessian=hessian,
             gradient=np.einsum("wij,wj->wi", gains, self.gradient),
@@ -130,9 +130,9 @@ class Memory:
             halves_hessian=self.halves_hessian * kept[self.walk],
             halves_gradient=self.halves_gradient * kept[self.walk],
         )
-        return memory, gains[self.walk]
+        return summary, gains[self.walk]
 
-    def judged(self, hessian: Array, gradient: Array, noise: Array) -> Memory:
+    def update_evidence(self, hessian: Array, gradient: Array, noise: Array) -> EpochSummary:
         """With the walks' evidence updated by how well each predicts an epoch.
 
         Args:
@@ -153,7 +153,7 @@ class Memory:
         gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm)
         return replace(self, evidence=_EVIDENCE_KEPT * self.evidence + gain)
 
-    def reconsidered(self) -> Memory:
+    def select_walk(self) -> EpochSummary:
         """With the walk that the evidence speaks for.
 
         While the camera walks, the memory that stands still goes stale. It starts anew from the
@@ -163,27 +163,31 @@ class Memory:
         if self.walk == 0:
             if self.evidence[best] - self.evidence[0] <= _BELIEVE_WALK:
                 return self
-            return replace(self, walk=best, evidence=np.zeros_like(self.evidence))._still_from(best)
+            return replace(
+                self, walk=best, evidence=np.zeros_like(self.evidence)
+            )._restart_static_from(best)
         if self.evidence[0] - self.evidence[self.walk] > _BELIEVE_STILL:
             return replace(self, walk=0, evidence=np.zeros_like(self.evidence))
         walk = self.walk
         if self.evidence[best] - self.evidence[walk] > _PREFER_WALK:
             walk = best
-        memory = replace(self, walk=walk)
+        summary = replace(self, walk=walk)
         if self.evidence[walk] - self.evidence[0] > _PREFER_WALK:
-            memory = memory._still_from(walk)
-        return memory
+            summary = summary._restart_static_from(walk)
+        return summary
 
     @property
     def best_walk(self) -> int:
         """The walk that the evidence speaks for, standing still left out."""
         return 1 + int(np.argmax(self.evidence[1:]))
 
-    def walking(self, walk: int) -> Memory:
+    def with_walk(self, walk: int) -> EpochSummary:
         """With a walk believed for other reasons than the evidence."""
-        return replace(self, walk=walk, evidence=np.zeros_like(self.evidence))._still_from(walk)
+        return replace(self, walk=walk, evidence=np.zeros_like(self.evidence))._restart_static_from(
+            walk
+        )
 
-    def _still_from(self, walk: int) -> Memory:
+    def _restart_static_from(self, walk: int) -> EpochSummary:
         """The memory that stands still starts anew from a walking one."""
         columns = {}
         for name in ("hessian", "gradient", "scatter", "frames", "evidence"):
@@ -193,7 +197,7 @@ class Memory:
         return replace(self, **columns)
 
 
-def kept_share(hessian: Array, variance: Array) -> Array:
+def gain_of_walk(hessian: Array, variance: Array) -> Array:
     """(6, 6) G with ``(H^-1 + diag(variance))^-1 = G H``; H may be singular."""
     if not variance.any():
         return np.eye(6)

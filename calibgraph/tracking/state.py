@@ -15,9 +15,14 @@ from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.epoch_summary import Memory
-from calibgraph.tracking.repetition import Groups, inflation, none_seen, widening
-from calibgraph.tracking.spread import Spread
+from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.noise import (
+    GroupScatter,
+    ResidualHistogram,
+    inflation,
+    no_groups,
+    widening,
+)
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -52,7 +57,7 @@ class LiveFrame:
         used = {c: m for c, m in self.used.items() if c != camera}
         return LiveFrame(self.number, raw, used, hessian, gradient)
 
-    def plus(
+    def add(
         self, camera: int, raw: CameraBlock, used: CameraBlock, sums: tuple[Array, Array]
     ) -> LiveFrame:
         """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
@@ -78,11 +83,11 @@ class Epoch:
     """
 
     frames: tuple[LiveFrame, ...]
-    poses: tuple[gtsam.Pose3, ...]
+    T_lidar_camera: tuple[gtsam.Pose3, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Suspect:
+class OutlierFrame:
     """A frame that disagrees with a camera's estimate but has a pose of its own.
 
     Attributes:
@@ -93,7 +98,7 @@ class Suspect:
 
     number: int
     raw: CameraBlock
-    pose: gtsam.Pose3
+    T_lidar_camera: gtsam.Pose3
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +126,16 @@ class CameraState:
     started: bool = False
     waiting: tuple[Correspondences, ...] = ()
     refused: tuple[str, ...] = ()
-    spread: Spread = field(default_factory=Spread)
+    residuals: ResidualHistogram = field(default_factory=ResidualHistogram)
     scale: ResidualScale = ResidualScale(1.0, 1.0, 1.0, 1.0)
     recent: Array = field(default_factory=lambda: np.empty((0, 2)))
-    memory: Memory = field(default_factory=Memory.empty)
-    suspects: tuple[Suspect, ...] = ()
-    verdicts: tuple[tuple[int, bool], ...] = ()
+    summary: EpochSummary = field(default_factory=EpochSummary.empty)
+    outlier_frames: tuple[OutlierFrame, ...] = ()
+    agreements: tuple[tuple[int, bool], ...] = ()
     absent: int = 0
-    groups: tuple[Groups, ...] = field(default_factory=none_seen)
+    groups: tuple[GroupScatter, ...] = field(default_factory=no_groups)
     moved_at: int = -1
-    drift_said_at: int = -1
+    drift_reported_at: int = -1
     counts: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -138,7 +143,7 @@ class CameraState:
         """The usual share of inliers."""
         return float(np.median(self.recent[:, 0]))
 
-    def counted(self, **more: int) -> CameraState:
+    def count(self, **more: int) -> CameraState:
         """With some counts raised."""
         counts = dict(self.counts)
         for key, number in more.items():
@@ -160,7 +165,7 @@ class DriftWatch:
     camera: int
     begun: int
     frame: int
-    anchors: tuple[Memory, ...]
+    anchors: tuple[EpochSummary, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,13 +210,13 @@ class State:
     def initial(rig: Rig, config: Config) -> State:
         """Before the first frame."""
         n = len(rig.cameras)
-        poses = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
+        guess = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
         return State(
             rig=rig,
             config=config,
             cameras=tuple(CameraState() for _ in range(n)),
-            references=poses,
-            epochs=(Epoch((), poses),),
+            references=guess,
+            epochs=(Epoch((), guess),),
             cross=np.zeros((6 * n, 6 * n)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
@@ -224,9 +229,9 @@ class State:
         return tuple(self.rig.cameras)
 
     @property
-    def poses(self) -> tuple[gtsam.Pose3, ...]:
+    def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
         """Per camera, the present estimate of T_lidar_camera."""
-        return self.epochs[-1].poses
+        return self.epochs[-1].T_lidar_camera
 
     @property
     def live_frames(self) -> tuple[LiveFrame, ...]:
@@ -235,7 +240,7 @@ class State:
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """With one camera's knowledge replaced."""
-        return replace(self, cameras=put(self.cameras, index, camera))
+        return replace(self, cameras=replace_item(self.cameras, index, camera))
 
     def walk_variance(self, frames: int) -> Array:
         """(6,) variance of the configured walk over so many frames: rotation, translation."""
@@ -255,7 +260,7 @@ class State:
         """How much more a camera's epochs scatter than their frames say, at least 1."""
         return inflation(self.cameras[index].groups)
 
-    def widened(self, scatter: Array) -> Array:
+    def widen(self, scatter: Array) -> Array:
         """(6 n, 6 n) scatter of all cameras' gradients, by what groups of frames show."""
         parts = []
         for index, camera in enumerate(self.cameras):
@@ -294,6 +299,6 @@ def block_diagonal(blocks: Array) -> Array:
     return matrix.reshape(6 * n, 6 * n)
 
 
-def put(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
+def replace_item(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
     """The tuple with one item replaced."""
     return (*items[:index], item, *items[index + 1 :])

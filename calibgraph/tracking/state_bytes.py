@@ -30,16 +30,15 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.epoch_summary import Memory
-from calibgraph.tracking.repetition import Groups
-from calibgraph.tracking.spread import Spread
+from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.state import (
     CameraState,
     DriftWatch,
     Epoch,
     LiveFrame,
+    OutlierFrame,
     State,
-    Suspect,
 )
 from factors import Lens, ProjectionBlock
 
@@ -52,8 +51,9 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
-    for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, Suspect, Groups, Memory, Spread,
-                 ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
+    for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
+                 EpochSummary, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
+                 ProjectionBlock)
 }  # fmt: skip
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 

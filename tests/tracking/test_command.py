@@ -213,10 +213,10 @@ def test_a_line_is_given_once_its_update_is_on_disk(world: World, tmp_path: Path
     written: list[str] = []
     frames = [StreamFrame(int(table.frame[0]), None, table) for table in world.tables[:7]]
     with DurableCalibrator(tmp_path / "state", rig) as calibrator:
-        done = follow(
-            frames, calibrator, History(), every=1, stop=lambda: False, write=write, tell=print
+        counts = follow(
+            frames, calibrator, History(), every=1, stop=lambda: False, write=write, notify=print
         )
-    assert done.updates == 7 and written == world.lines[:7]
+    assert counts.updates == 7 and written == world.lines[:7]
 
 
 def test_every_nth_frame_is_taken_also_after_a_restart(
@@ -509,7 +509,7 @@ def test_a_reader_that_goes_away_ends_it_with_all_saved(
         patch.setattr(sys, "stdout", gone)
         code, _, err = call(*arguments)
     assert code == 1  # one frame gives no estimate: FAIL
-    assert "nobody reads standard output" in err and "Traceback" not in err
+    assert "the reader of standard output is gone" in err and "Traceback" not in err
     code, out, _ = call(*arguments)
     assert code == 0 and out.splitlines() == world.lines[1:]
 
@@ -593,7 +593,7 @@ def test_a_second_signal_ends_it_at_once_and_loses_nothing(
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(command, "_write_line", write)
             patch.setattr(sys, "stdin", SimpleNamespace(buffer=lines))
-            track(wanted, [Path("-")], tell=print)
+            track(wanted, [Path("-")], notify=print)
     finally:
         signal.signal(signal.SIGINT, before)
     _, out, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
@@ -848,7 +848,7 @@ def test_a_dataset_goes_on_after_a_crash_and_around_an_unreadable_frame(
         monkeypatch.setattr(command, "_write_line", write)
         wanted = Tracking(rig=recorded.rig, config=Config(), out=out, matcher=matcher)
         try:
-            track(wanted, recorded.folders, tell=said.append)
+            track(wanted, recorded.folders, notify=said.append)
         except Crashed:
             assert crash is not None
         return given, said

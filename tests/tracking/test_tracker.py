@@ -29,10 +29,11 @@ from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking import tracker as tracker_module
-from calibgraph.tracking.epoch_summary import STRENGTHS, Memory
-from calibgraph.tracking.events import Steps, cause_of
-from calibgraph.tracking.spread import Spread
-from calibgraph.tracking.step_detection import Found, shifted
+from calibgraph.tracking.cause import Steps, find_cause
+from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
+from calibgraph.tracking.noise import ResidualHistogram
+from calibgraph.tracking.restart import handle_small_step
+from calibgraph.tracking.step_detection import DetectedStep
 from tests.conftest import make_camera, stereo_relative_pose
 
 Array = np.ndarray
@@ -337,9 +338,9 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     """H'^-1 B' H'^-1 = H^-1 B H^-1 + Q, whatever the gain."""
     rng = np.random.default_rng(0)
     A, C = rng.standard_normal((2, 6, 6))
-    memory = Memory.empty().plus(A @ A.T + np.eye(6), rng.standard_normal(6), C @ C.T, 10)
+    memory = EpochSummary.empty().add(A @ A.T + np.eye(6), rng.standard_normal(6), C @ C.T, 10)
     variance = np.linspace(0.1, 0.6, 6)
-    after, gain = memory.after_walk(variance, inflation=3.0)
+    after, gain = memory.propagate(variance, inflation=3.0)
     for walk, strength in enumerate(STRENGTHS):
         expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
         np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)
@@ -350,7 +351,7 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     )
 
 
-def inverse_sandwich(memory: Memory, walk: int) -> Array:
+def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
     inverse = np.linalg.inv(memory.hessian[walk])
     return np.asarray(inverse @ memory.scatter[walk] @ inverse)
 
@@ -364,9 +365,9 @@ def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
     """Its bins are 1 % wide and values within them are taken as even: 0.3 % is a third of one."""
     table = simulate_correspondences(pair, frames=40, matches=300, errors=ERRORS, seed=5)
     T = pair.T_camera_lidar["left"]
-    spread = Spread()
+    spread = ResidualHistogram()
     for frame in range(40):
-        spread = spread.plus(matches_of(pair, table.select(table.frame == frame), "left"), T)
+        spread = spread.add(matches_of(pair, table.select(table.frame == frame), "left"), T)
     expected = matches_of(pair, table, "left").scale(T, Config())
     found = spread.scale(Config())
     assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
@@ -400,25 +401,29 @@ def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> Non
 
 
 def steps_of(rig: Rig, steps: list[Array], sigma: float) -> Steps:
-    poses = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
-    n = len(poses)
+    T_lidar_cameras = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
+    n = len(T_lidar_cameras)
     return Steps(
-        tuple(range(n)), np.ravel(steps), sigma**2 * np.eye(6 * n), np.full(n, 60.0), poses
+        tuple(range(n)),
+        np.ravel(steps),
+        sigma**2 * np.eye(6 * n),
+        np.full(n, 60.0),
+        T_lidar_cameras,
     )
 
 
 def test_the_cause_of_a_step_is_told_by_what_all_cameras_did(mixed_rig: Rig) -> None:
-    poses = [gtsam.Pose3(T).inverse() for T in mixed_rig.T_camera_lidar.values()]
+    T_lidar_cameras = [gtsam.Pose3(T).inverse() for T in mixed_rig.T_camera_lidar.values()]
     D = gtsam.Pose3.Expmap(step_of(0.3, 2))
-    by_lidar = [np.asarray(p.localCoordinates(D.compose(p))) for p in poses]
-    cause = cause_of(steps_of(mixed_rig, by_lidar, 1e-4))
+    by_lidar = [np.asarray(p.localCoordinates(D.compose(p))) for p in T_lidar_cameras]
+    cause = find_cause(steps_of(mixed_rig, by_lidar, 1e-4))
     assert cause.lidar is not None
     np.testing.assert_allclose(cause.lidar[0], step_of(0.3, 2), atol=1e-9)
     still = np.zeros(6)
-    assert cause_of(steps_of(mixed_rig, [still, by_lidar[1], still], 1e-4)).cameras == (1,)
-    two = cause_of(steps_of(mixed_rig, [by_lidar[0], -by_lidar[1], still], 1e-4))
+    assert find_cause(steps_of(mixed_rig, [still, by_lidar[1], still], 1e-4)).cameras == (1,)
+    two = find_cause(steps_of(mixed_rig, [by_lidar[0], -by_lidar[1], still], 1e-4))
     assert two.lidar is None and two.cameras == (0, 1)
-    assert cause_of(steps_of(mixed_rig, [still] * 3, 1e-4)).cameras == ()
+    assert find_cause(steps_of(mixed_rig, [still] * 3, 1e-4)).cameras == ()
 
 
 def test_an_update_that_fails_leaves_nothing_behind(
@@ -429,7 +434,7 @@ def test_an_update_that_fails_leaves_nothing_behind(
     tracker, _ = tracked(pair, tables[:19])
     before = tracker.to_bytes()
 
-    judge, calls = tracker_module.health_of, []
+    judge, calls = tracker_module.assess, []
 
     def broken_once(*arguments: object) -> object:
         calls.append(arguments)
@@ -437,7 +442,7 @@ def test_an_update_that_fails_leaves_nothing_behind(
             raise RuntimeError("broken")
         return judge(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(tracker_module, "health_of", broken_once)
+    monkeypatch.setattr(tracker_module, "assess", broken_once)
     with pytest.raises(CorrespondenceError, match=r"frame 19: .*broken.*left out"):
         tracker.update(tables[19])
     assert tracker.to_bytes() == before
@@ -452,4 +457,4 @@ def test_a_change_at_any_live_epoch_can_be_followed(pair: Rig, live_epochs: int)
     tracker, _ = tracked(pair, drive(lambda frame: pair, 100), live_epochs=live_epochs)
     state = tracker._state
     for epoch in state.epochs[:-1]:  # the last one is open, and empty here
-        shifted(state, Found(epoch.frames[0].number, frozenset([0])))
+        handle_small_step(state, DetectedStep(epoch.frames[0].number, frozenset([0])))
