@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict, above
 from calibgraph.solver.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
@@ -88,7 +88,7 @@ def _verdict(
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
         return _start_check(state, one)
-    rows = slice(6 * camera, 6 * camera + 6)
+    rows = pose_rows(camera)
     own = covariance[rows, rows]
     evidence = Evidence(
         residuals=recent_residuals(one),
@@ -209,7 +209,7 @@ def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict
     """Per camera (6, 6); None with too few frames."""
     covariance: dict[str, Array | None] = {}
     for camera, name in enumerate(names):
-        rows = slice(6 * camera, 6 * camera + 6)
+        rows = pose_rows(camera)
         own = assessment.joint_covariance[rows, rows]
         covariance[name] = None if np.isnan(own).any() else own
     return covariance

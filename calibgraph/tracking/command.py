@@ -66,9 +66,9 @@ def track(
     """
     if sys.stdout is None:
         raise FileError("standard output", "is closed; give the updates somewhere to go")
+    history = History()
     with _stopped_by_signals() as stop:
         items, calibrator = _opened(settings, source, stop, notify)
-        history = History()
         with calibrator:
             counts = follow(
                 items,
@@ -86,11 +86,15 @@ def track(
     notify(
         f"{counts.updates} updates, {counts.refused} left out, {counts.skipped} known from before"
     )
-    written = [result.save(settings.out)]
-    if counts.updates:
-        history.draw(settings.out / PICTURE)
-        written.append(settings.out / PICTURE)
-    return result, written
+    return result, _write_results(settings.out, result, history if counts.updates else None)
+
+
+def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
+    written = [result.save(folder)]
+    if history is not None:
+        history.draw(folder / PICTURE)
+        written.append(folder / PICTURE)
+    return written
 
 
 def _opened(
@@ -145,19 +149,19 @@ def _stopped_by_signals() -> Iterator[Callable[[], bool]]:
 
     A second one has its usual effect: a blocked output may delay the reaction to the first.
     """
-    asked: list[int] = []
+    received: list[int] = []
 
-    def ask(number: int, _: FrameType | None) -> None:
-        asked.append(number)
+    def receive(number: int, _: FrameType | None) -> None:
+        received.append(number)
         restore()
 
     def restore() -> None:
         for kind, handler in before.items():
             signal.signal(kind, handler)
 
-    before = {kind: signal.signal(kind, ask) for kind in (signal.SIGTERM, signal.SIGINT)}
+    before = {kind: signal.signal(kind, receive) for kind in (signal.SIGTERM, signal.SIGINT)}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         restore()
 

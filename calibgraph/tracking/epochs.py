@@ -1,4 +1,4 @@
-"""The end of an epoch: the oldest live one goes into the memory, a new one begins."""
+"""The end of an epoch: the oldest live one is summarized, a new one begins."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _regate(state: State, epoch: Epoch) -> Epoch:
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with its sums about other reference poses."""
+    """The state with its sums about other references."""
     steps = np.array([*map(step_between, state.references, references)])
     cameras = tuple(
         replace(camera_state, summary=camera_state.summary.shift_reference(step))
@@ -91,7 +91,7 @@ def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State
 
 @dataclass(frozen=True, eq=False)
 class _EpochSums:
-    """An epoch's matches, gated anew, as sums about a camera's reference.
+    """Sums of an epoch's matches, gated anew, about a camera's reference.
 
     Attributes:
         hessian: (6, 6).
@@ -129,7 +129,7 @@ def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
 
 
 def _summarize_oldest(state: State) -> State:
-    """The state with its oldest epoch in the memories."""
+    """The state with its oldest epoch added to the summaries."""
     epoch, *younger = state.epochs
     sums = [_epoch_sums(state, epoch, camera) for camera in range(len(state.cameras))]
     update_evidence = [_update_evidence(state, camera, s) for camera, s in enumerate(sums)]
@@ -153,7 +153,7 @@ def _summarize_oldest(state: State) -> State:
 
 
 def _between_cameras(scores: Array) -> Array:
-    """(6 n, 6 n) scatter of (f, 6 n) gradients, without that of each camera with itself."""
+    """(6 n, 6 n) scatter of (f, 6 n) gradients; 0 in the blocks of one camera."""
     scatter: Array = scores.T @ scores
     for rows in range(0, len(scatter), 6):
         scatter[rows : rows + 6, rows : rows + 6] = 0.0
@@ -161,10 +161,9 @@ def _between_cameras(scores: Array) -> Array:
 
 
 def _update_evidence(state: State, camera: int, sums: _EpochSums) -> CameraState:
-    """A camera whose walks are judged by how well they predicted an epoch.
+    """The camera with the evidence of its walks updated by how well they predict an epoch.
 
-    What groups of frames show is learned here too, from epochs old enough for a move within them
-    to have been found.
+    The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
     camera_state, alone = state.cameras[camera], state.scatter_of_frames(camera)
     noise = state.frame_noise(camera)
@@ -177,7 +176,7 @@ def _update_evidence(state: State, camera: int, sums: _EpochSums) -> CameraState
 
 
 def _select_walks(state: State) -> State:
-    """The state with the walks believed that the evidence speaks for."""
+    """The state with each camera's walk selected by the evidence."""
     for camera, camera_state in enumerate(state.cameras):
         summary = camera_state.summary.select_walk()
         if summary.walk > 0 == camera_state.summary.walk:

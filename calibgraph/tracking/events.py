@@ -15,7 +15,7 @@ Kind = Literal["started", "moved", "drifts", "blind", "back"]
 
 @dataclass(frozen=True)
 class Size:
-    """How far something moved.
+    """Size of a move, with its standard deviations.
 
     Attributes:
         rotation_deg: angle.
@@ -58,17 +58,17 @@ def _length_and_sigma(step: Array, covariance: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that the user should know.
+    """An event of the drive, for the user.
 
     Attributes:
-        kind: ``started``: a camera has its first estimate; ``moved``: it is elsewhere since a
-            frame; ``drifts``: it moves slowly, and is followed; ``blind``: no usable matches for
-            a while; ``back``: they are there again.
+        kind: ``started``: a camera has its first estimate; ``moved``: it stepped; ``drifts``: it
+            moves slowly, and is followed; ``blind``: no usable matches for a while; ``back``:
+            usable matches again.
         camera: its name; None: the LiDAR, under all cameras.
-        frame: number of the frame since which it is so.
-        detected_frame: number of the frame with which it was found.
-        stamp_ns: time of that frame, if frames have one.
-        size: how far it moved, in the camera's (the LiDAR's) own frame.
+        frame: number of the first frame of the event.
+        detected_frame: number of the frame at which it was detected.
+        stamp_ns: time of that frame, or None.
+        size: of a move, in the camera's (the LiDAR's) own frame.
     """
 
     kind: Kind

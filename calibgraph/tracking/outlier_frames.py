@@ -19,7 +19,7 @@ from calibgraph.tracking.state import CameraState, OutlierFrame
 Array = NDArray[np.float64]
 
 AGREEMENT = 0.7
-"""A frame agrees with a pose that explains this share of the matches that are usually explained."""
+"""A frame agrees with an estimate that explains this share of the usual share of its matches."""
 
 
 def inlier_share(block: CameraBlock, T_lidar_camera: gtsam.Pose3, scale: ResidualScale) -> float:
@@ -29,7 +29,7 @@ def inlier_share(block: CameraBlock, T_lidar_camera: gtsam.Pose3, scale: Residua
 
 
 def agrees(block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: CameraState) -> bool:
-    """Whether a pose explains about as many of a frame's matches as usual."""
+    """Whether a T_lidar_camera explains about the usual share of a frame's matches."""
     share = inlier_share(block, T_lidar_camera, camera_state.scale)
     enough = share * len(block.frame) >= MIN_MATCHES
     return enough and share >= AGREEMENT * camera_state.inlier_share
@@ -44,7 +44,7 @@ def find_outlier_frame(
     camera_state: CameraState,
     config: Config,
 ) -> OutlierFrame | None:
-    """The frame with a pose of its own, if there is one that explains it; else it has failed."""
+    """The frame with its own T_lidar_camera; None if none explains it, so the matching failed."""
     for start in _starts(block, T_lidar_camera, camera, config):
         T_own = refine(block, start, camera_state.scale, config)
         if agrees(block, T_own, camera_state):
@@ -55,7 +55,7 @@ def find_outlier_frame(
 def _starts(
     block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera: Camera, config: Config
 ) -> list[gtsam.Pose3]:
-    """Where to look for the frame's own pose: by PnP if points are matched, else nearby."""
+    """Start values for the frame's own T_lidar_camera: by PnP if possible, and the estimate."""
     if block.information is not None or config.stage1 == "rig":
         return [T_lidar_camera]
     table = Correspondences.from_arrays(
@@ -71,7 +71,7 @@ def _starts(
 def refine(
     block: CameraBlock, start: gtsam.Pose3, scale: ResidualScale, config: Config
 ) -> gtsam.Pose3:
-    """The T_lidar_camera that matches of a camera say, with a wide loss first."""
+    """The T_lidar_camera that fits a camera's matches, with a wide loss first."""
     T = to_T_camera_lidar(start)
     widening = max(config.pnp_threshold_px / scale.gate_px, 1.0)
     for factor in (widening, 1.0):

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
@@ -78,7 +78,7 @@ class Posterior:
         summaries = [camera.summary for camera in state.cameras]
         scatter = state.cross.copy()
         for place, summary in enumerate(summaries):
-            rows = slice(6 * place, 6 * place + 6)
+            rows = pose_rows(place)
             scatter[rows, rows] = summary.scatter[summary.walk]
         return Posterior(
             np.array([m.hessian[m.walk] for m in summaries]),

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merged
 from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
 from calibgraph.tracking.drift import follow_drift
@@ -36,7 +36,7 @@ _FOLLOWING = 2  # the least walk by which a change is followed: the configured o
 
 
 def handle_small_step(state: State, detected: DetectedStep) -> tuple[State, tuple[Event, ...]]:
-    """The state after a small step; or with a drift followed, if it was none.
+    """The state after a small step; or with a drift followed, if it was slow.
 
     A change that lies as far back as the live epochs go, or comes soon after another one, came
     slowly: it would have been found earlier, or at once.
@@ -51,7 +51,7 @@ def handle_small_step(state: State, detected: DetectedStep) -> tuple[State, tupl
 
 
 def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tuple[Event, ...]]:
-    """The state after a step: what moved is told, and its cameras begin anew where they are."""
+    """The state after a step, with the moved cameras restarted, and the events."""
     detected = _date_step(state, detected)
     steps, now = steps_between(state, detected)
     cause = find_cause(steps, detected.found_by)
@@ -74,7 +74,7 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
 
 
 def _date_step(state: State, detected: DetectedStep) -> DetectedStep:
-    """The step with its first frame found: the one from which the new pose fits better."""
+    """The step with its first frame: the one from which the new estimates fit better."""
     steps, now = steps_between(state, detected)
     found_by = [camera for camera in detected.found_by if camera in steps.cameras]
     if not found_by:
@@ -104,7 +104,7 @@ def _fits_better(
     frame: LiveFrame,
     before_and_after: dict[int, tuple[gtsam.Pose3, gtsam.Pose3]],
 ) -> bool | None:
-    """Whether a frame fits the second poses better than the first; None if it cannot tell."""
+    """Whether a frame fits the second estimates better than the first; None without matches."""
     outlier_frames = {
         c: s.raw
         for c in before_and_after
@@ -137,7 +137,7 @@ def _make_events(state: State, since: int, steps: Steps, cause: Cause) -> tuple[
 def _restart_camera(
     state: State, camera: int, T_lidar_camera: gtsam.Pose3, parts: list[CameraBlock]
 ) -> State:
-    """The state with all forgotten of a camera but the frames since it moved, at a pose."""
+    """The state with a camera restarted at T_lidar_camera from the frames since it moved."""
     camera_state = state.cameras[camera]
     set_aside = {suspect.number for suspect in camera_state.outlier_frames}
     epochs = tuple(
@@ -145,7 +145,7 @@ def _restart_camera(
         for epoch in state.epochs
     )
     cross = state.cross.copy()
-    rows = slice(6 * camera, 6 * camera + 6)
+    rows = pose_rows(camera)
     cross[rows], cross[:, rows] = 0.0, 0.0
     camera_state = camera_state.count(
         left_out=-sum(1 for part in parts if part.frame[0] in set_aside)
@@ -172,7 +172,7 @@ def _restart_camera(
 
 
 def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> DriftWatch | None:
-    """The watch of a drift, of which one camera stepped aside: its anchor is where it now is."""
+    """The watch with one camera's anchor moved by the step of that camera."""
     if drift is None:
         return None
     anchor = drift.anchors[camera].shift_reference(step)
@@ -180,7 +180,7 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
 
 
 def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
-    """A camera that moved alone is no longer where the rig's relative poses say."""
+    """The state without the relative poses of cameras that moved alone."""
     wrong = [
         place
         for place, pair in enumerate(state.rig.relative_poses)
@@ -190,7 +190,7 @@ def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
 
 
 def blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:
-    """A camera's matches in the frames since a step, those set aside too."""
+    """A camera's matches in the frames since a step, including those set aside."""
     live = state.live_frames
     parts = [f.raw[camera] for f in live if f.number >= detected.since and camera in f.raw]
     return parts + [
@@ -199,7 +199,7 @@ def blocks_since(state: State, detected: DetectedStep, camera: int) -> list[Came
 
 
 def _sums_since(state: State, detected: DetectedStep) -> Posterior:
-    """The sums over the frames since a step, linearized at the pose that they say themselves."""
+    """The sums over the frames since a step, linearized at the estimate that fits them."""
     n = len(state.cameras)
     hessian, gradient, frames = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n)
     for camera, camera_state in enumerate(state.cameras):
@@ -221,7 +221,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
 
 
 def steps_between(state: State, detected: DetectedStep) -> tuple[Steps, dict[int, Array]]:
-    """How far each camera seems to have stepped; and where it is now, from its reference."""
+    """The steps of the cameras; and per camera its estimate now, from its reference."""
     before, after = posterior(state, detected.since), _sums_since(state, detected)
     cameras, steps, now = [], [], {}
     for camera, camera_state in enumerate(state.cameras):
@@ -237,12 +237,12 @@ def steps_between(state: State, detected: DetectedStep) -> tuple[Steps, dict[int
 
 
 def _covariance(state: State, before: Posterior, after: Posterior, cameras: list[int]) -> Array:
-    """(6 m, 6 m) of the difference of what is known before and after."""
+    """(6 m, 6 m) covariance of the difference between the estimates before and after."""
     rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])
     one, two = (block_diagonal(inverse(sums.hessian[cameras])) for sums in (before, after))
     noise = state.total.copy()
     for camera in cameras:
-        own = slice(6 * camera, 6 * camera + 6)
+        own = pose_rows(camera)
         if state.frame_noise(camera) is None:
             noise[own], noise[:, own] = 0.0, 0.0
             noise[own, own] = after.hessian[camera] * _GUESSED_OVERCONFIDENCE

@@ -22,7 +22,7 @@ _TRY_AGAIN = 1.5  # so many times more frames than at the last attempt
 
 
 def try_to_start(state: State, camera: int, table: Correspondences) -> State:
-    """The state after a camera that has no estimate yet saw one more frame.
+    """The state after one more frame of a camera that has no estimate yet.
 
     Args:
         state: before.
@@ -61,13 +61,13 @@ def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> State:
 
 
 def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> State:
-    """The state with a camera's first frames absorbed at its first pose."""
+    """The state with a camera's first frames absorbed at its first estimate."""
     parts = [_camera_block(state, camera, table) for table in state.cameras[camera].waiting]
     usable = [part for part in parts if part is not None]
     residuals = ResidualHistogram()
     for part in usable:
         residuals = residuals.add(part, to_T_camera_lidar(T_lidar_camera))
-    scale = residuals.scale(state.config)  # what `noted` counts inliers by
+    scale = residuals.scale(state.config)  # the gate by which inliers are counted below
     camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for part in usable:
         camera_state = count_residuals(camera_state, part, T_lidar_camera)
@@ -79,9 +79,9 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
 def absorb_frames(
     state: State, camera: int, blocks: list[CameraBlock], T_lidar_camera: gtsam.Pose3
 ) -> State:
-    """The state with a camera at a pose, and frames of it that had been set aside.
+    """The state with a camera at a new estimate, and frames absorbed that had been set aside.
 
-    Those of live frames take their places in them; older ones are left out.
+    Blocks of live frames are added to them; older ones are left out.
     """
     scale = state.cameras[camera].scale
     T = to_T_camera_lidar(T_lidar_camera)
@@ -117,7 +117,7 @@ def absorb_frames(
 def count_residuals(
     camera_state: CameraState, blocks: CameraBlock, T_lidar_camera: gtsam.Pose3
 ) -> CameraState:
-    """The camera with a frame's residuals counted in what is usual."""
+    """The camera with a frame's residuals counted."""
     T = to_T_camera_lidar(T_lidar_camera)
     errors, valid = blocks.errors_px(T)
     share = float(np.mean(valid & (errors <= camera_state.scale.gate_px)))

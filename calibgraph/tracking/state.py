@@ -1,4 +1,4 @@
-"""What the tracker knows: everything that a restart needs, as plain arrays."""
+"""The state of the tracker, whole and immutable: a restart needs nothing else."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
@@ -27,8 +27,8 @@ from calibgraph.tracking.noise import (
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
-HISTORY = 50
-"""Frames over which the size of the residuals and the share of inliers are taken."""
+LEAST_FRAMES = 15  # for the scatter of a six-vector
+HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class LiveFrame:
 
     Attributes:
         number: of the frame.
-        raw: per camera (by its place in the rig) that the frame agrees with: all its matches.
+        raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
         used: those within the gate.
         hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
-        gradient: (n, 6) at the cameras' reference poses.
+        gradient: (n, 6) at the cameras' references.
     """
 
     number: int
@@ -50,7 +50,7 @@ class LiveFrame:
     gradient: Array
 
     def without(self, camera: int) -> LiveFrame:
-        """The frame as if a camera had not seen it."""
+        """The frame without one camera's matches."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         hessian[camera], gradient[camera] = 0.0, 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
@@ -69,7 +69,7 @@ class LiveFrame:
 
     @staticmethod
     def empty(number: int, cameras: int) -> LiveFrame:
-        """A frame that no camera has seen yet."""
+        """A frame without matches."""
         return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
 
 
@@ -79,7 +79,7 @@ class Epoch:
 
     Attributes:
         frames: in order.
-        poses: per camera, the estimate of T_lidar_camera.
+        T_lidar_camera: per camera, the estimate.
     """
 
     frames: tuple[LiveFrame, ...]
@@ -88,12 +88,12 @@ class Epoch:
 
 @dataclass(frozen=True, eq=False)
 class OutlierFrame:
-    """A frame that disagrees with a camera's estimate but has a pose of its own.
+    """A frame that disagrees with a camera's estimate but fits another T_lidar_camera.
 
     Attributes:
         number: of the frame.
         raw: its matches.
-        pose: T_lidar_camera that they say.
+        T_lidar_camera: that fits them.
     """
 
     number: int
@@ -103,24 +103,24 @@ class OutlierFrame:
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """What is known of one camera.
+    """The state of one camera.
 
     Attributes:
         started: whether it has an estimate of its own.
         waiting: before that, the frames it may start from.
         refused: why it has not started from them.
-        spread: of its residuals.
-        scale: that this spread says, as of the last epoch's beginning.
+        residuals: their histogram.
+        scale: of the residuals, as of the beginning of the last epoch.
         recent: (f, 2) of its last absorbed frames: the share of inliers, the median error [px].
-        memory: its past.
-        suspects: its last frames that disagree with the estimate but not with each other, newest
+        summary: of its older epochs.
+        outlier_frames: its last frames that disagree with the estimate but fit another one, newest
             last.
-        verdicts: of its last frames, newest last: whether each agreed, with its number.
+        agreements: of its last frames, newest last: its number, and whether it agreed.
         absent: frames since the last usable one.
-        groups: whether neighbouring frames repeat each other's errors.
-        moved_at: how many updates there were when it last moved, or -1.
-        drift_said_at: how many when its drift was last told, or -1.
-        counts: frames and correspondences, by what became of them.
+        groups: scatter of groups of epochs, by which errors shared by neighbouring frames show.
+        moved_at: number of updates when it last moved, or -1.
+        drift_reported_at: number of updates when its drift was last reported, or -1.
+        counts: of frames and correspondences that were given, used, left out.
     """
 
     started: bool = False
@@ -140,11 +140,11 @@ class CameraState:
 
     @property
     def inlier_share(self) -> float:
-        """The usual share of inliers."""
+        """Median share of inliers of the last absorbed frames."""
         return float(np.median(self.recent[:, 0]))
 
     def count(self, **more: int) -> CameraState:
-        """With some counts raised."""
+        """The camera with some counts raised."""
         counts = dict(self.counts)
         for key, number in more.items():
             counts[key] = counts.get(key, 0) + number
@@ -153,13 +153,13 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class DriftWatch:
-    """A drift that has been noticed, and of which it is not clear yet what drifts.
+    """A drift that has been detected, but whose cause is not clear yet.
 
     Attributes:
         camera: that showed it first.
-        begun: how many updates there were then.
+        begun: number of updates at its detection.
         frame: number of the frame since which it drifts.
-        anchors: per camera, its memory at the time.
+        anchors: per camera, its summary at the time.
     """
 
     camera: int
@@ -170,7 +170,7 @@ class DriftWatch:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything the tracker knows.
+    """The whole state of the tracker.
 
     Attributes:
         rig: the initial guess.
@@ -178,16 +178,16 @@ class State:
         cameras: per camera of the rig.
         references: per camera, T_lidar_camera about which sums are taken.
         epochs: the live ones; the last is open.
-        cross: (6 n, 6 n) scatter between different cameras in the memories.
+        cross: (6 n, 6 n) scatter between different cameras in the summaries.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
         total_frames: (n,) and of frames.
-        dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has made wrong.
-        drift: that is being watched, or None.
-        systematic_sigmas: rotation [rad] and translation [m] that the matcher says frames share.
+        dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
+        drift: whose cause is not clear yet, or None.
+        systematic_sigmas: rotation [rad], translation [m]: of the error that all frames share.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
-        updates: how many there were.
+        updates: number of updates.
     """
 
     rig: Rig
@@ -230,7 +230,7 @@ class State:
 
     @property
     def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
-        """Per camera, the present estimate of T_lidar_camera."""
+        """Per camera, the present estimate."""
         return self.epochs[-1].T_lidar_camera
 
     @property
@@ -239,7 +239,7 @@ class State:
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
-        """With one camera's knowledge replaced."""
+        """The state with one camera replaced."""
         return replace(self, cameras=replace_item(self.cameras, index, camera))
 
     def walk_variance(self, frames: int) -> Array:
@@ -251,17 +251,17 @@ class State:
     def frame_noise(self, index: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
 
-        As much larger than that of frames as epochs scatter more than their frames say.
+        That of the frames alone, times the inflation.
         """
         noise = self.scatter_of_frames(index)
         return None if noise is None else noise * self.inflation(index)
 
     def inflation(self, index: int) -> float:
-        """How much more a camera's epochs scatter than their frames say, at least 1."""
+        """Ratio of the scatter of a camera's epochs to that of their frames, at least 1."""
         return inflation(self.cameras[index].groups)
 
     def widen(self, scatter: Array) -> Array:
-        """(6 n, 6 n) scatter of all cameras' gradients, by what groups of frames show."""
+        """(6 n, 6 n) scatter of all cameras' gradients, widened by the scatter of groups."""
         parts = []
         for index, camera in enumerate(self.cameras):
             noise = self.scatter_of_frames(index)
@@ -274,21 +274,17 @@ class State:
         frames = self.total_frames[index]
         if frames < LEAST_FRAMES:
             return None
-        rows = slice(6 * index, 6 * index + 6)
+        rows = pose_rows(index)
         return np.asarray(self.total[rows, rows] / (frames - 1))
 
     def overconfidence(self, index: int) -> float:
-        """How much too large a camera's Hessian is as an information, on average."""
+        """Mean ratio of a camera's Hessian to its information, at least 1."""
         frames = self.total_frames[index]
         if frames < LEAST_FRAMES:
             return 1.0
-        rows = slice(6 * index, 6 * index + 6)
+        rows = pose_rows(index)
         share = np.linalg.solve(self.total_hessian[index], self.total[rows, rows])
         return max(1.0, float(np.trace(share)) / 6)
-
-
-LEAST_FRAMES = 15
-"""Frames from which the scatter of a six-vector can be taken."""
 
 
 def block_diagonal(blocks: Array) -> Array:

@@ -29,13 +29,11 @@ from pathlib import Path
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
 
-DATABASE, LOCK = "state.sqlite", "lock"
-LAYOUT = 2
-"""Of the tables; 1 was a folder of files ``snapshot-*.state`` and ``journal-*.log``."""
+DATABASE = "state.sqlite"
+LAYOUT = 2  # 1 was a folder of files snapshot-*.state and journal-*.log
 
 _APPLICATION = 0x43474254  # "CGBT", in the header of the database
 _HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
-_SQLITE = b"SQLite format 3\0"
 _EARLIER_FILES = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA journal_mode=WAL;
@@ -54,8 +52,7 @@ class Recovered:
 
     Attributes:
         snapshot: the newest undamaged snapshot; None if there is none yet.
-        inputs: the inputs appended after it, in order. The last may be one whose ``append`` did
-            not return: it was written, but never acknowledged.
+        inputs: the inputs after it, in order; the last may be one that was not acknowledged.
         damages: one line for each damaged snapshot, and for a log that is missing.
     """
 
@@ -67,8 +64,7 @@ class Recovered:
 class StateDatabase:
     """The state of one tracker in a folder, locked against a second process.
 
-    Append each input before it is acknowledged; now and then, write a snapshot. After a write has
-    failed, every further one is refused: open the folder anew.
+    After a write has failed, every further one is refused: open the folder anew.
 
     Args:
         folder: where the state is kept; made if it is not there.
@@ -112,7 +108,7 @@ class StateDatabase:
     def snapshot(self, state: bytes) -> None:
         """Keep ``state``, which all inputs so far led to; it is durable when this returns.
 
-        Snapshots and inputs that are older than the snapshot before this one are removed.
+        Snapshots and inputs older than the snapshot before this one are removed.
 
         Raises:
             OSError: if it cannot be written; the earlier snapshot and the inputs are safe.
@@ -159,13 +155,13 @@ def _make_folder(folder: Path) -> None:
     require_place_for_folder(folder)
     new = [part for part in (folder, *folder.parents) if not part.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    for part in reversed(new):
+    for part in new:
         sync_folder(part.parent)
 
 
 def _lock(folder: Path) -> int:
     """A descriptor that holds the folder's lock until it is closed, or the process ends."""
-    descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BaseException as error:
@@ -190,7 +186,7 @@ def _require_layout(folder: Path) -> None:
         return
     with path.open("rb") as file:
         header = file.read(_HEADER.size)
-    if len(header) < _HEADER.size or not header.startswith(_SQLITE):
+    if len(header) < _HEADER.size or not header.startswith(b"SQLite format 3\0"):
         raise FileError(path, "is damaged or no tracker's state; choose another folder")
     _, layout, application = _HEADER.unpack(header)
     if application != _APPLICATION:

@@ -28,8 +28,8 @@ class DetectedStep:
 
     Attributes:
         since: number of the first frame after it.
-        sure: the cameras that it was found by.
-        suspects: per camera, the frames set aside that agree on its new place.
+        found_by: the cameras whose frames show it.
+        outlier_frames: per camera, the frames set aside that agree on its new place.
     """
 
     since: int
@@ -40,8 +40,8 @@ class DetectedStep:
 def detect_step(state: State) -> DetectedStep | None:
     """A step so large that frames after it do not agree with the estimate.
 
-    It is believed when enough suspects agree with each other, and all other cameras have had
-    their say.
+    It is accepted when enough outlier frames agree with each other, and every other camera has had
+    as many frames to show whether it moved too.
     """
     needed = state.config.tracking.step_frames
     clusters = {c: _cluster(camera_state) for c, camera_state in enumerate(state.cameras)}
@@ -67,7 +67,7 @@ def detect_step(state: State) -> DetectedStep | None:
 
 
 def _cluster(camera_state: CameraState) -> tuple[OutlierFrame, ...]:
-    """The suspects that agree with the newest one; a single one may be anything."""
+    """The outlier frames that agree with the newest one; a single one is no evidence."""
     if not camera_state.outlier_frames:
         return ()
     newest = camera_state.outlier_frames[-1]
@@ -78,12 +78,12 @@ def _cluster(camera_state: CameraState) -> tuple[OutlierFrame, ...]:
 
 
 def _count_agreeing(camera_state: CameraState, since: int) -> int:
-    """How many frames since a number agree with the estimate."""
+    """Number of frames since a frame number that agree with the estimate."""
     return sum(1 for number, good in camera_state.agreements if good and number >= since)
 
 
 def _is_pending(camera_state: CameraState) -> bool:
-    """Whether the last frame was a suspect, which others may follow."""
+    """Whether the last frame was an outlier frame, which more may follow."""
     last = camera_state.agreements[-1] if camera_state.agreements else None
     return bool(
         last
@@ -96,7 +96,7 @@ def _is_pending(camera_state: CameraState) -> bool:
 def detect_small_step(state: State) -> DetectedStep | None:
     """A step so small that frames after it still agree with the estimate, at an epoch's start.
 
-    Not while suspects may show that it is a large one.
+    Not while outlier frames may show that it is a large one.
     """
     best, detected = 0.0, None
     if any(_is_pending(camera_state) for camera_state in state.cameras):
@@ -114,9 +114,9 @@ def detect_small_step(state: State) -> DetectedStep | None:
 
 
 def _shift_excess(state: State, camera: int, before: Posterior, after: Posterior) -> float:
-    """By how much a camera's frames after a time contradict those before, over the limit.
+    """Excess of the contradiction between a camera's frames before and after, over the limit.
 
-    A score test: what the frames do not determine does not count.
+    A score test: undetermined directions do not count.
     """
     step, frames = before.step(camera), before.frames[camera]
     known_scatter = state.cameras[camera].groups[0].count >= _LEAST_EPOCHS
@@ -135,7 +135,7 @@ def _shift_excess(state: State, camera: int, before: Posterior, after: Posterior
 
 
 def _absorbed_since(state: State, since: int) -> Posterior:
-    """The sums over the absorbed frames since a number, as linearized at the estimate."""
+    """The sums over the absorbed frames since a frame number, linearized at the estimate."""
     n = len(state.cameras)
     nothing = Posterior(
         np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((6 * n, 6 * n)), np.zeros(n)

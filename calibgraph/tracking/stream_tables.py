@@ -95,7 +95,7 @@ def _frame_spans(file: Any) -> list[tuple[int, int]] | None:
 
 
 def _row_groups(file: Any, spans: Sequence[tuple[int, int]]) -> Iterator[pa.Table]:
-    """One row group at a time; a frame that goes on in the next one is held until it ends."""
+    """One row group at a time; a frame that continues in the next one is held until it ends."""
     import pyarrow as pa
 
     held: list[pa.Table] = []
@@ -103,9 +103,9 @@ def _row_groups(file: Any, spans: Sequence[tuple[int, int]]) -> Iterator[pa.Tabl
         table = pa.concat_tables([*held, file.read_row_group(group)])
         held = []
         if group + 1 < len(spans) and spans[group + 1][0] == last:
-            goes_on = table["frame"].to_numpy() == last
-            held = [table.filter(pa.array(goes_on))]
-            table = table.filter(pa.array(~goes_on))
+            continues = table["frame"].to_numpy() == last
+            held = [table.filter(pa.array(continues))]
+            table = table.filter(pa.array(~continues))
         yield table
 
 

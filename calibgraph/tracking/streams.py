@@ -97,7 +97,7 @@ def frames_of_folder(folder: Path, *, follow: bool, stop: Callable[[], bool]) ->
 
     Hidden files are ignored: a table is best written under a hidden name and then renamed. With
     ``follow`` a file that cannot be read is tried again until it has not changed for ``QUIET_S``,
-    and a CSV is not read before, since nothing in it says that it is complete.
+    and a CSV is not read before, since nothing in it shows that it is complete.
 
     Args:
         folder: of tables, each of one or several frames.
@@ -176,7 +176,7 @@ def frames_of_input(file: BinaryIO, *, stop: Callable[[], bool]) -> Iterator[Ite
     """The frames of an Arrow IPC stream or of JSON lines; the first bytes show which it is.
 
     Args:
-        file: standard input, say: if it has a descriptor, waiting for it can be stopped.
+        file: for example standard input: if it has a descriptor, waiting for it can be stopped.
         stop: called while waiting, every ``POLL_S``; True ends the input.
 
     Raises:
