@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from calibgraph import (
 from calibgraph.cli import app as cli
 from calibgraph.tracking import durable
 from calibgraph.tracking.history import History
+from tests.conftest import SAMPLE
 from tests.tracking.drives import (
     FRAMES,
     World,
@@ -221,3 +223,31 @@ def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
     assert running.wait() in (0, 1)
     assert all(json.loads(line) for line in rest.splitlines())
     writer.join()
+
+
+@pytest.mark.statistics
+def test_the_structure_matcher_goes_on_after_kills_and_around_corrupt_files(
+    tmp_path: Path,
+) -> None:
+    """The sample and three frames more: an image cut short, an empty image, a cloud cut short."""
+    data = tmp_path / "data"
+    shutil.copytree(SAMPLE, data)
+    places = [*(data / "cameras").iterdir(), data / "lidar"]
+    for place in places:
+        for path in sorted(place.iterdir())[:4]:
+            shutil.copy(path, path.with_stem(f"{int(path.stem) + 6:06d}"))
+    for path, size in (
+        (data / "cameras" / "left" / "000006.jpg", 500),
+        (data / "cameras" / "left" / "000007.jpg", 0),
+        (data / "lidar" / "000008.npy", 60),
+    ):
+        path.write_bytes(path.read_bytes()[:size])
+    arguments = [str(data), str(data), "--matcher", "structure", "--out"]
+    whole = Killed(arguments + [str(tmp_path / "whole")], tmp_path / "whole.jsonl")
+    assert whole.run(None)
+    assert [json.loads(line)["frame"] for line in whole.lines] == [0, 1, 2, 3, 4, 5, 9]
+    killed = Killed(arguments + [str(tmp_path / "killed")], tmp_path / "killed.jsonl")
+    for count in (1, 3, 5, 6):
+        killed.run(lambda done=count: len(set(killed.lines)) >= done)
+    assert killed.run(None)
+    assert killed.acknowledged() == whole.lines

@@ -16,7 +16,6 @@ from calibgraph import (
     CorrespondenceError,
     Correspondences,
     Event,
-    FileError,
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
@@ -26,12 +25,7 @@ from calibgraph import (
     solve,
 )
 from calibgraph.simulation.correspondences import simulate_drive
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking import tracker as tracker_module
-from calibgraph.tracking.cause import Steps, find_cause
-from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
-from calibgraph.tracking.noise import ResidualHistogram
 from calibgraph.tracking.restart import handle_small_step
 from calibgraph.tracking.step_detection import DetectedStep
 from tests.conftest import make_camera, stereo_relative_pose
@@ -305,125 +299,6 @@ def test_a_tracker_of_degenerate_frames_alone_never_throws() -> None:
             )
         )
     assert update.verdicts["only"].status == "FAIL"
-
-
-@pytest.mark.parametrize("cut", [0, 3, 5, 29, 43, 44, 50])
-def test_a_saved_tracker_goes_on_with_the_same_numbers(pair: Rig, tmp_path: Path, cut: int) -> None:
-    """Saved while starting, between epochs, within one, with suspects, after a step."""
-    after = moved(pair, "left", step_of(0.5, 3))
-    tables = drive(lambda frame: after if frame >= 42 else pair, 56, failed_share=0.1)
-    _, whole = tracked(pair, tables)
-    tracker, _ = tracked(pair, tables[:cut])
-    tracker.save(tmp_path / "tracker")
-    resumed = IncrementalCalibrator.load(tmp_path / "tracker")
-    for table, expected in zip(tables[cut:], whole[cut:], strict=True):
-        found = resumed.update(table)
-        assert found.events == expected.events and found.verdicts == expected.verdicts
-        for name, T in expected.T_camera_lidar.items():
-            np.testing.assert_array_equal(found.T_camera_lidar[name], T)
-            np.testing.assert_array_equal(found.covariance[name], expected.covariance[name])
-
-
-def test_a_damaged_saved_tracker_is_named(pair: Rig, tmp_path: Path) -> None:
-    path = tmp_path / "tracker"
-    IncrementalCalibrator(pair).save(path)
-    data = path.read_bytes()
-    for damaged in (data[:-1], data[:-9] + b"\0" * 9, b"", b"calibgraph-tracker/2\n" + data[21:]):
-        path.write_bytes(damaged)
-        with pytest.raises(FileError, match="tracker"):
-            IncrementalCalibrator.load(path)
-
-
-def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
-    """H'^-1 B' H'^-1 = H^-1 B H^-1 + Q, whatever the gain."""
-    rng = np.random.default_rng(0)
-    A, C = rng.standard_normal((2, 6, 6))
-    memory = EpochSummary.empty().add(A @ A.T + np.eye(6), rng.standard_normal(6), C @ C.T, 10)
-    variance = np.linspace(0.1, 0.6, 6)
-    after, gain = memory.propagate(variance, inflation=3.0)
-    for walk, strength in enumerate(STRENGTHS):
-        expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
-        np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)
-    np.testing.assert_array_equal(gain, np.eye(6))  # it stands still
-    np.testing.assert_allclose(
-        np.linalg.solve(after.hessian, after.gradient[..., None]),
-        np.linalg.solve(memory.hessian, memory.gradient[..., None]),
-    )
-
-
-def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
-    inverse = np.linalg.inv(memory.hessian[walk])
-    return np.asarray(inverse @ memory.scatter[walk] @ inverse)
-
-
-def matches_of(rig: Rig, table: Correspondences, name: str) -> CameraBlock:
-    kept = preprocess(rig, table, Config())
-    return camera_blocks(rig, kept.table, Config())[name]
-
-
-def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
-    """Its bins are 1 % wide and values within them are taken as even: 0.3 % is a third of one."""
-    table = simulate_correspondences(pair, frames=40, matches=300, errors=ERRORS, seed=5)
-    T = pair.T_camera_lidar["left"]
-    spread = ResidualHistogram()
-    for frame in range(40):
-        spread = spread.add(matches_of(pair, table.select(table.frame == frame), "left"), T)
-    expected = matches_of(pair, table, "left").scale(T, Config())
-    found = spread.scale(Config())
-    assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
-    assert found.gate_px == pytest.approx(expected.gate_px, rel=3e-3)
-
-
-def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> None:
-    """By differences: 60,000 matches, 2 % of them near the edge, so about 1 / sqrt(1200) = 3 %;
-
-    of a band that the two take differently: within 15 %.
-    """
-    errors = MatcherErrors(noise_px=1.0, outlier_share=0.3)
-    table = simulate_correspondences(pair, frames=60, matches=1000, errors=errors, seed=6)
-    matches = matches_of(pair, table, "left")
-    T = pair.T_camera_lidar["left"]
-    scale = matches.scale(T, Config())
-    pose = gtsam.Pose3(T).inverse()
-    added = matches.gate_hessian(T, scale)
-    for axis in range(3):
-        step = np.zeros(6)
-        step[axis] = 4e-4  # 0.3 px, as wide as the band
-        pulls = [
-            matches.without_outliers(pose.retract(way * step).inverse().matrix(), scale)
-            .scaled(scale)
-            .sums(pose)
-            .gradient
-            for way in (1, -1)
-        ]
-        by_differences = (pulls[0] - pulls[1])[axis] / (2 * step[axis])
-        assert added[axis, axis] == pytest.approx(by_differences, rel=0.15)
-
-
-def steps_of(rig: Rig, steps: list[Array], sigma: float) -> Steps:
-    T_lidar_cameras = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
-    n = len(T_lidar_cameras)
-    return Steps(
-        tuple(range(n)),
-        np.ravel(steps),
-        sigma**2 * np.eye(6 * n),
-        np.full(n, 60.0),
-        T_lidar_cameras,
-    )
-
-
-def test_the_cause_of_a_step_is_told_by_what_all_cameras_did(mixed_rig: Rig) -> None:
-    T_lidar_cameras = [gtsam.Pose3(T).inverse() for T in mixed_rig.T_camera_lidar.values()]
-    D = gtsam.Pose3.Expmap(step_of(0.3, 2))
-    by_lidar = [np.asarray(p.localCoordinates(D.compose(p))) for p in T_lidar_cameras]
-    cause = find_cause(steps_of(mixed_rig, by_lidar, 1e-4))
-    assert cause.lidar is not None
-    np.testing.assert_allclose(cause.lidar[0], step_of(0.3, 2), atol=1e-9)
-    still = np.zeros(6)
-    assert find_cause(steps_of(mixed_rig, [still, by_lidar[1], still], 1e-4)).cameras == (1,)
-    two = find_cause(steps_of(mixed_rig, [by_lidar[0], -by_lidar[1], still], 1e-4))
-    assert two.lidar is None and two.cameras == (0, 1)
-    assert find_cause(steps_of(mixed_rig, [still] * 3, 1e-4)).cameras == ()
 
 
 def test_an_update_that_fails_leaves_nothing_behind(
