@@ -13,6 +13,8 @@ from pyarrow import ipc
 from calibgraph import Correspondences
 from calibgraph.tracking.streams import Refused, StreamFrame, frames_of
 
+to_arrow = Correspondences.to_arrow
+
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 
 

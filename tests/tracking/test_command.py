@@ -16,12 +16,12 @@ import pytest
 from pyarrow import ipc, parquet
 
 from calibgraph import (
+    Correspondences,
     Rig,
     concatenate,
     perturb,
 )
 from calibgraph.io.rigs import load_rig
-from calibgraph.model.table_columns import to_arrow
 from tests.conftest import KANNALA, Call, make_camera, stereo_relative_pose
 from tests.tracking.drives import (
     FRAMES,
@@ -34,6 +34,7 @@ from tests.tracking.drives import (
     pair_of,
 )
 
+to_arrow = Correspondences.to_arrow
 pytestmark = pytest.mark.usefixtures("no_picture")
 
 

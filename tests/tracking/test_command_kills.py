@@ -22,7 +22,7 @@ from calibgraph import (
     concatenate,
     perturb,
 )
-from calibgraph.cli import app as cli
+from calibgraph.cli import app
 from calibgraph.tracking import durable
 from calibgraph.tracking.history import History
 from tests.conftest import SAMPLE
@@ -50,7 +50,7 @@ def _command(arguments: list[str], lines: Path, snapshot_every: int) -> None:
     durable._SNAPSHOT_EVERY = snapshot_every
     History.draw = lambda self, path: path.write_bytes(b"")  # type: ignore[method-assign]
     sys.argv = ["calibgraph", "track", *arguments]
-    cli.main()
+    app.main()
 
 
 @dataclass
@@ -165,7 +165,7 @@ def test_forty_random_kills_under_load_lose_nothing_and_change_nothing(
 @pytest.fixture
 def running(world: World, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     arguments = [world.rig, "-", "--out", tmp_path / "out"]
-    program = "from calibgraph import cli; cli.main()"
+    program = "from calibgraph.cli import app; app.main()"
     with subprocess.Popen(
         [sys.executable, "-c", program, "track", *map(str, arguments)],
         stdin=subprocess.PIPE,

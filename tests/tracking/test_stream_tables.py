@@ -11,7 +11,6 @@ import pytest
 from pyarrow import parquet
 
 from calibgraph import concatenate
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
     arrow_stream,
@@ -19,6 +18,7 @@ from tests.tracking.stream_data import (
     said,
     spoilt,
     table,
+    to_arrow,
 )
 
 # Tables

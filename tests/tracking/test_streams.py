@@ -19,7 +19,6 @@ import pytest
 from pyarrow import ipc
 
 from calibgraph import FileError
-from calibgraph.model.table_columns import to_arrow
 from calibgraph.tracking import streams
 from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
@@ -28,6 +27,7 @@ from tests.tracking.stream_data import (
     said,
     spoilt,
     table,
+    to_arrow,
 )
 
 # Folders
