@@ -296,6 +296,17 @@ def test_a_write_that_fails_at_any_byte_loses_no_acknowledged_input(memory: Path
     pytest.fail("no limit was large enough")
 
 
+def test_an_interrupted_append_is_taken_back(tmp_path: Path) -> None:
+    with opened(tmp_path) as database:
+        database.append(b"first")
+        with pytest.raises(KeyboardInterrupt), database._writing() as connection:
+            connection.execute("INSERT INTO journal VALUES (2, x'00', x'00')")
+            raise KeyboardInterrupt
+        with pytest.raises(ValueError, match="is closed"):
+            database.append(b"next")
+    assert recovered(tmp_path) == Recovered(None, (b"first",), ())
+
+
 def test_a_full_disk_is_reported_as_one(tmp_path: Path) -> None:
     with opened(tmp_path) as database:
         database.append(b"first")

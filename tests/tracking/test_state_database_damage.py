@@ -148,15 +148,6 @@ def test_damaged_rows_are_refused(tmp_path: Path, statement: str, match: str) ->
     require_refused(tmp_path, match)
 
 
-def test_another_folders_log_is_not_taken_for_ones_own(tmp_path: Path) -> None:
-    files, _ = crashed(tmp_path / "one", 5)
-    other, _ = crashed(tmp_path / "other", 9)
-    folder = restored(tmp_path / "copy", files | {LOG: b"", DATABASE: other[DATABASE]})
-    with pytest.MonkeyPatch.context():
-        result = recovered(folder)
-    assert held(result) == b"" and "is missing" in result.damages[0]
-
-
 # Files of others.
 
 
