@@ -39,7 +39,7 @@ def handle_small_step(state: State, detected: DetectedStep) -> tuple[State, tupl
     """The state after a small step; or with a drift followed, if it was slow.
 
     A change that lies as far back as the live epochs go, or comes soon after another one, came
-    slowly: it would have been found earlier, or at once.
+    slowly: a step would have been detected earlier, or at once.
     """
     (camera,) = detected.found_by
     camera_state = state.cameras[camera]
@@ -53,7 +53,7 @@ def handle_small_step(state: State, detected: DetectedStep) -> tuple[State, tupl
 def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tuple[Event, ...]]:
     """The state after a step, with the moved cameras restarted, and the events."""
     detected = _date_step(state, detected)
-    steps, now = steps_between(state, detected)
+    steps, now = _measure_steps(state, detected)
     cause = find_cause(steps, detected.found_by)
     events = _make_events(state, detected.since, steps, cause)
     targets = {camera: state.references[camera].retract(now[camera]) for camera in cause.cameras}
@@ -66,7 +66,7 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
             targets[camera] = near[-1].T_lidar_camera
     for camera, T_lidar_camera in targets.items():
         state = _restart_camera(
-            state, camera, T_lidar_camera, blocks_since(state, detected, camera)
+            state, camera, T_lidar_camera, _blocks_since(state, detected, camera)
         )
     if not cause.lidar:
         state = _drop_pairs_of(state, targets)
@@ -75,7 +75,7 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
 
 def _date_step(state: State, detected: DetectedStep) -> DetectedStep:
     """The step with its first frame: the one from which the new estimates fit better."""
-    steps, now = steps_between(state, detected)
+    steps, now = _measure_steps(state, detected)
     found_by = [camera for camera in detected.found_by if camera in steps.cameras]
     if not found_by:
         return detected
@@ -94,7 +94,7 @@ def _date_step(state: State, detected: DetectedStep) -> DetectedStep:
     ):
         place += 1
     dated = replace(detected, since=frames[min(place, len(frames) - 1)].number)
-    dated_steps, _ = steps_between(state, dated)
+    dated_steps, _ = _measure_steps(state, dated)
     return dated if set(found_by) <= set(dated_steps.cameras) else detected
 
 
@@ -111,7 +111,9 @@ def _fits_better(
         for s in detected.outlier_frames.get(c, ())
         if s.number == frame.number
     }
-    seen = {c: m for c, m in {**frame.raw, **outlier_frames}.items() if c in before_and_after}
+    seen = {
+        c: block for c, block in {**frame.raw, **outlier_frames}.items() if c in before_and_after
+    }
     if not seen:
         return None
     gain = 0.0
@@ -139,7 +141,7 @@ def _restart_camera(
 ) -> State:
     """The state with a camera restarted at T_lidar_camera from the frames since it moved."""
     camera_state = state.cameras[camera]
-    set_aside = {suspect.number for suspect in camera_state.outlier_frames}
+    set_aside = {frame.number for frame in camera_state.outlier_frames}
     epochs = tuple(
         replace(epoch, frames=tuple(frame.without(camera) for frame in epoch.frames))
         for epoch in state.epochs
@@ -189,7 +191,7 @@ def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
     return replace(state, dropped_pairs=tuple(sorted({*state.dropped_pairs, *wrong})))
 
 
-def blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:
+def _blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:
     """A camera's matches in the frames since a step, including those set aside."""
     live = state.live_frames
     parts = [f.raw[camera] for f in live if f.number >= detected.since and camera in f.raw]
@@ -203,7 +205,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
     n = len(state.cameras)
     hessian, gradient, frames = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n)
     for camera, camera_state in enumerate(state.cameras):
-        parts = blocks_since(state, detected, camera)
+        parts = _blocks_since(state, detected, camera)
         if not camera_state.started or not parts:
             continue
         near = detected.outlier_frames.get(camera, ())
@@ -220,7 +222,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
     return Posterior(hessian, gradient, np.zeros((6 * n, 6 * n)), frames)
 
 
-def steps_between(state: State, detected: DetectedStep) -> tuple[Steps, dict[int, Array]]:
+def _measure_steps(state: State, detected: DetectedStep) -> tuple[Steps, dict[int, Array]]:
     """The steps of the cameras; and per camera its estimate now, from its reference."""
     before, after = posterior(state, detected.since), _sums_since(state, detected)
     cameras, steps, now = [], [], {}

@@ -18,7 +18,7 @@ from calibgraph.tracking.noise import ResidualHistogram
 from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
-_TRY_AGAIN = 1.5  # so many times more frames than at the last attempt
+_TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 
 
 def try_to_start(state: State, camera: int, table: Correspondences) -> State:
@@ -115,14 +115,14 @@ def absorb_frames(
 
 
 def count_residuals(
-    camera_state: CameraState, blocks: CameraBlock, T_lidar_camera: gtsam.Pose3
+    camera_state: CameraState, block: CameraBlock, T_lidar_camera: gtsam.Pose3
 ) -> CameraState:
     """The camera with a frame's residuals counted."""
     T = to_T_camera_lidar(T_lidar_camera)
-    errors, valid = blocks.errors_px(T)
+    errors, valid = block.errors_px(T)
     share = float(np.mean(valid & (errors <= camera_state.scale.gate_px)))
     recent = np.vstack([camera_state.recent, [share, float(np.median(errors))]])[-HISTORY:]
-    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(blocks, T))
+    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(block, T))
 
 
 def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:

@@ -14,7 +14,8 @@ from __future__ import annotations
 import json
 import re
 import reprlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -87,9 +88,29 @@ class CameraColumns(BaseModel):
         """The columns that the line has, in the order of the model."""
         return tuple(key for key in type(self).model_fields if key in self.model_fields_set)
 
-    def column(self, key: str) -> NDArray[np.float64] | None:
-        """(n,) one column, or None if the line does not have it."""
-        return np.array(getattr(self, key), np.float64) if key in self.given else None
+    def table(self, camera: str, frame: int, stamp_ns: int | None) -> Correspondences:
+        """The correspondences of this camera.
+
+        Raises:
+            CorrespondenceError: if a value is out of its range.
+        """
+        n = len(self.u_px)
+        confidence = self.confidence if "confidence" in self.given else np.ones(n)
+        informed = INFORMATION[0] in self.given
+        return Correspondences(
+            cameras=(camera,),
+            camera_index=np.zeros(n, np.int32),
+            frame=np.full(n, frame, np.int64),
+            pixels_px=self._stack(COORDINATES[:2]),
+            points_lidar_m=self._stack(COORDINATES[2:]),
+            confidence=as_confidence(np.array(confidence, np.float64)),
+            information_px=self._stack(INFORMATION) if informed else None,
+            stamp_ns=None if stamp_ns is None else np.full(n, stamp_ns, np.int64),
+            point_index=np.array(self.point_index or [-1] * n, np.int64),
+        )
+
+    def _stack(self, keys: Sequence[str]) -> NDArray[np.float64]:
+        return np.stack([np.array(getattr(self, key), np.float64) for key in keys], axis=1)
 
 
 class FrameLine(BaseModel):
@@ -108,35 +129,14 @@ class FrameLine(BaseModel):
         Raises:
             CorrespondenceError: if a value is out of its range.
         """
-        indexed = any("point_index" in columns.given for columns in self.cameras.values())
-        tables = [self._table(camera, indexed=indexed) for camera in self.cameras]
         stamp_ns = self.stamp_ns if "stamp_ns" in self.model_fields_set else None
+        tables = [
+            columns.table(camera, self.frame, stamp_ns) for camera, columns in self.cameras.items()
+        ]
+        if not any("point_index" in columns.given for columns in self.cameras.values()):
+            tables = [replace(table, point_index=None) for table in tables]
         table = concatenate([_empty_table(self.metadata), *tables])
         return StreamFrame(self.frame, stamp_ns, table)
-
-    def _table(self, camera: str, *, indexed: bool) -> Correspondences:
-        columns = self.cameras[camera]
-        n = len(columns.u_px)
-        stamped = "stamp_ns" in self.model_fields_set
-        information = [
-            np.array(getattr(columns, key)) for key in INFORMATION if key in columns.given
-        ]
-        confidence = columns.column("confidence")
-        point_index = None
-        if indexed:
-            own = "point_index" in columns.given
-            point_index = np.array(columns.point_index if own else [-1] * n, np.int64)
-        return Correspondences(
-            cameras=(camera,),
-            camera_index=np.zeros(n, np.int32),
-            frame=np.full(n, self.frame, np.int64),
-            pixels_px=np.column_stack([getattr(columns, key) for key in COORDINATES[:2]]),
-            points_lidar_m=np.column_stack([getattr(columns, key) for key in COORDINATES[2:]]),
-            confidence=as_confidence(np.ones(n) if confidence is None else confidence),
-            information_px=np.column_stack(information) if information else None,
-            stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
-            point_index=point_index,
-        )
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:

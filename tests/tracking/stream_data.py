@@ -60,14 +60,14 @@ def of_bytes(data: bytes) -> list[StreamFrame | Refused]:
     return list(frames_of("-", stdin=io.BytesIO(data)))
 
 
-def said(items: Any) -> list[int | str]:
+def outcomes(items: Any) -> list[int | str]:
     """Frame numbers, and the messages in between."""
     return [item.frame if isinstance(item, StreamFrame) else item.message for item in items]
 
 
 def refusal(data: bytes) -> str:
     """The message of the first of two lines; the second, good one must come through."""
-    message, frame = said(of_bytes(data.rstrip(b"\n") + b"\n" + line(8)))
+    message, frame = outcomes(of_bytes(data.rstrip(b"\n") + b"\n" + line(8)))
     assert frame == 8
     assert isinstance(message, str)
     assert message.startswith("standard input, line 1: ")

@@ -118,7 +118,7 @@ def test_frame_numbers_may_be_any_of_64_bits(
 
 
 @pytest.mark.parametrize("kind", ["one", "fisheye", "mixed", "tied"])
-def test_any_rig_goes_on_with_the_same_lines(
+def test_any_rig_continues_with_the_same_lines(
     kind: str, mixed_rig: Rig, call: Call, tmp_path: Path
 ) -> None:
     tied = pair_of()
@@ -158,7 +158,7 @@ def test_a_camera_may_come_later_or_never(call: Call, tmp_path: Path) -> None:
 # Sources that hold nothing, and standard streams that are closed
 
 
-def test_an_empty_source_is_told_in_one_line(
+def test_an_empty_source_is_reported_in_one_line(
     world: World, call: Call, piped: Callable[..., Any], tmp_path: Path
 ) -> None:
     out = ("--out", tmp_path / "out")
@@ -177,7 +177,7 @@ def test_an_empty_source_is_told_in_one_line(
 
 
 @pytest.mark.parametrize("which", ["stdin", "stdout"])
-def test_a_closed_standard_stream_is_told_in_one_line(
+def test_a_closed_standard_stream_is_reported_in_one_line(
     which: str, world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(sys, which, None)
@@ -203,7 +203,7 @@ def test_a_reader_that_goes_away_ends_it_with_all_saved(
     assert code == 0 and out.splitlines() == world.lines[1:]
 
 
-def test_a_full_disk_under_standard_output_is_told_in_one_line(
+def test_a_full_disk_under_standard_output_is_reported_in_one_line(
     world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with open("/dev/full", "w") as full, monkeypatch.context() as patch:

@@ -78,8 +78,8 @@ def test_wrong_input_is_left_out_with_a_line_each_and_leaves_no_trace(
     code, out, err = piped(world.rig, given + half_a_line, "--out", tmp_path / "out")
     assert code == 0
     assert out.splitlines() == expected_lines(world.guess, tables)
-    said = left_out(err)
-    assert len(said) == len(wrong) + 1
-    for line, what in zip(said, (*wrong, "is not JSON"), strict=True):
+    messages = left_out(err)
+    assert len(messages) == len(wrong) + 1
+    for line, what in zip(messages, (*wrong, "is not JSON"), strict=True):
         assert what in line
     assert "Traceback" not in err

@@ -226,7 +226,7 @@ def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
 
 
 @pytest.mark.statistics
-def test_the_structure_matcher_goes_on_after_kills_and_around_corrupt_files(
+def test_the_structure_matcher_continues_after_kills_and_around_corrupt_files(
     tmp_path: Path,
 ) -> None:
     """The sample and three frames more: an image cut short, an empty image, a cloud cut short."""

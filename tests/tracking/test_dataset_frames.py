@@ -69,7 +69,7 @@ def recorded(world: World, tmp_path: Path) -> Dataset:
 
 
 @pytest.mark.parametrize("at", [0, 3, 8])
-def test_a_dataset_goes_on_after_a_crash_and_around_an_unreadable_frame(
+def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
     at: int,
     world: World,
     recorded: Dataset,
@@ -81,7 +81,7 @@ def test_a_dataset_goes_on_after_a_crash_and_around_an_unreadable_frame(
 
     def lines(out: Path, crash: int | None) -> tuple[list[str], list[str]]:
         given: list[str] = []
-        said: list[str] = []
+        messages: list[str] = []
 
         def write(line: str) -> None:
             if len(given) == crash:
@@ -91,14 +91,14 @@ def test_a_dataset_goes_on_after_a_crash_and_around_an_unreadable_frame(
         monkeypatch.setattr(command, "_write_line", write)
         wanted = Tracking(rig=recorded.rig, config=Config(), out=out, matcher=matcher)
         try:
-            track(wanted, recorded.folders, notify=said.append)
+            track(wanted, recorded.folders, notify=messages.append)
         except Crashed:
             assert crash is not None
-        return given, said
+        return given, messages
 
-    whole, said = lines(tmp_path / "whole", None)
+    whole, messages = lines(tmp_path / "whole", None)
     assert [json.loads(line)["frame"] for line in whole] == [f for f in range(FRAMES) if f != 7]
-    assert [s for s in said if s.startswith("left out")] == [
+    assert [s for s in messages if s.startswith("left out")] == [
         "left out: frame 007 (7): image 7 is truncated"
     ]
     first, _ = lines(tmp_path / "crashed", at)

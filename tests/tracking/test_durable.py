@@ -107,13 +107,13 @@ def test_a_state_of_another_rig_or_config_is_refused_in_one_line(
     before = files_in(tmp_path / "out" / "state")
     pair_of(model="fisheye", distortion=KANNALA).save(tmp_path / "other.yaml")
     (tmp_path / "config.yaml").write_text("tracking: {epoch_frames: 7}\n")
-    for arguments, said in (
+    for arguments, reason in (
         ((tmp_path / "other.yaml", world.source), "another rig"),
         ((world.rig, world.source, "--config", tmp_path / "config.yaml"), "other settings"),
     ):
         code, text, err = call("track", *arguments, *out)
         assert (code, text) == (2, "")
-        assert said in err and str(tmp_path) in err and err.count("\n") == 1
+        assert reason in err and str(tmp_path) in err and err.count("\n") == 1
         assert files_in(tmp_path / "out" / "state") == before
     moved = perturb(world.guess, rotation_deg=1, translation_m=0.1, seed=9)
     moved.save(tmp_path / "moved.yaml")  # another guess of the same rig is no other rig
@@ -178,7 +178,7 @@ def test_a_state_of_another_version_is_refused_in_one_line(
     assert "holds a state of another version" in err and err.count("\n") == 1
 
 
-def test_a_counter_that_starts_anew_is_told(
+def test_a_counter_that_starts_anew_is_reported(
     world: World, piped: Callable[..., Any], tmp_path: Path
 ) -> None:
     later = [replace(table, frame=table.frame + 100) for table in world.tables]
@@ -189,7 +189,7 @@ def test_a_counter_that_starts_anew_is_told(
     assert f"{FRAMES} known from before" in err
 
 
-def test_a_full_disk_under_the_state_is_told_in_one_line_and_costs_nothing(
+def test_a_full_disk_under_the_state_is_reported_in_one_line_and_costs_nothing(
     world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     append = StateDatabase.append

@@ -23,8 +23,10 @@ Array = np.ndarray
 
 
 @pytest.mark.parametrize("cut", [0, 3, 5, 29, 43, 44, 50])
-def test_a_saved_tracker_goes_on_with_the_same_numbers(pair: Rig, tmp_path: Path, cut: int) -> None:
-    """Saved while starting, between epochs, within one, with suspects, after a step."""
+def test_a_saved_tracker_continues_with_the_same_numbers(
+    pair: Rig, tmp_path: Path, cut: int
+) -> None:
+    """Saved while starting, between epochs, within one, with outlier frames, after a step."""
     after = moved(pair, "left", step_of(0.5, 3))
     tables = drive(lambda frame: after if frame >= 42 else pair, 56, failed_share=0.1)
     _, whole = tracked(pair, tables)

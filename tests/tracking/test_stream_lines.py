@@ -15,7 +15,7 @@ from tests.tracking.stream_data import (
     line,
     of_bytes,
     refusal,
-    said,
+    outcomes,
 )
 
 # JSON lines
@@ -54,7 +54,7 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
 
 
 def test_empty_lines_are_skipped_but_counted() -> None:
-    assert said(of_bytes(b"\n \r\n" + line(1) + b"{\n" + line(2).rstrip())) == [
+    assert outcomes(of_bytes(b"\n \r\n" + line(1) + b"{\n" + line(2).rstrip())) == [
         1,
         "standard input, line 4: is not JSON (Expecting property name enclosed in double quotes "
         "at column 2); send one frame a line, as JSON",
@@ -143,15 +143,15 @@ def test_a_line_that_is_too_long_is_refused_without_being_kept(
     assert "is longer than 100000 bytes" in refusal(long)
     # Neither does one byte too many pass, nor is one that just fits refused.
     fits = line()[:-1].ljust(100_000)
-    assert said(of_bytes(fits)) == [7]
+    assert outcomes(of_bytes(fits)) == [7]
     assert "is longer than" in refusal(fits + b" ")
-    assert len(said(of_bytes(long))) == 1
+    assert len(outcomes(of_bytes(long))) == 1
 
 
 def test_json_lines_cut_or_damaged_anywhere_raise_nothing() -> None:
     data = line(1) + line(2)
     for cut in range(len(data)):
-        items = said(of_bytes(data[:cut]))
+        items = outcomes(of_bytes(data[:cut]))
         assert items[: cut // len(line(1))] == [1][: cut // len(line(1))]
         assert len(items) <= 2
     rng = np.random.default_rng(0)

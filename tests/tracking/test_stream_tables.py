@@ -15,7 +15,7 @@ from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
     arrow_stream,
     of_bytes,
-    said,
+    outcomes,
     spoilt,
     table,
     to_arrow,
@@ -30,7 +30,7 @@ def test_a_table_gives_its_frames_in_ascending_order(suffix: str, tmp_path: Path
     stamps = {"stamp_ns": [30, 10, 20, 31]}
     table([3, 1, 2, 3], camera="left", metadata={"matcher": "m"}, **stamps).save(path)
     frames = list(frames_of(path))
-    assert said(frames) == [1, 2, 3]
+    assert outcomes(frames) == [1, 2, 3]
     last = frames[-1]
     assert isinstance(last, StreamFrame)
     assert last.table.pixels_px[:, 0].tolist() == [0, 3]
@@ -77,9 +77,9 @@ def test_a_sorted_table_is_read_by_row_groups(
 
     monkeypatch.setattr(parquet.ParquetFile, "read_row_group", counted)
     frames = frames_of(path)
-    assert said([next(frames), next(frames)]) == [0, 1]
+    assert outcomes([next(frames), next(frames)]) == [0, 1]
     assert read == [0]
-    assert said(frames) == list(range(2, 50))
+    assert outcomes(frames) == list(range(2, 50))
     assert read == list(range(20))
 
 
@@ -100,7 +100,7 @@ def test_a_wrong_value_refuses_its_frame_alone(
     path = tmp_path / "table.parquet"
     wrong = spoilt(to_arrow(table([0, 0, 1, 1, 2])), column, 2, value)
     parquet.write_table(wrong, path, row_group_size=row_group_size)
-    first, refused, last = said(frames_of(path))
+    first, refused, last = outcomes(frames_of(path))
     assert (first, last) == (0, 2)
     assert str(refused).startswith(f"{path}: frame 1 is left out; among its rows, row 0")
     assert message in str(refused)
@@ -110,7 +110,7 @@ def test_rows_without_a_frame_are_refused_together(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
     wrong = spoilt(spoilt(to_arrow(table([0, 1, 2, 3])), "frame", 0, None), "frame", 2, None)
     parquet.write_table(wrong, path)
-    refused, *frames = said(frames_of(path))
+    refused, *frames = outcomes(frames_of(path))
     assert refused == f"{path}: column 'frame' is empty in 2 rows; fill in or drop them"
     assert frames == [1, 3]
 
@@ -131,7 +131,7 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
     for message, arrow in wrong.items():
         parquet.write_table(arrow, path)
-        (refused,) = said(frames_of(path))
+        (refused,) = outcomes(frames_of(path))
         assert message in str(refused)
         assert str(path) in str(refused)
     for name, data in {
@@ -139,7 +139,7 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path) -> None:
         "names.csv": b"camera,fr\xffame\nleft,1\n",
     }.items():  # fmt: skip
         (tmp_path / name).write_bytes(data)
-        (refused,) = said(frames_of(tmp_path / name))
+        (refused,) = outcomes(frames_of(tmp_path / name))
         assert "\n" not in str(refused)
         assert name in str(refused)
 
@@ -155,7 +155,7 @@ def test_a_damaged_row_group_ends_the_table_after_the_good_ones(tmp_path: Path) 
         group.column(2).total_compressed_size // 2
     )
     path.write_bytes(data)
-    *frames, refused = said(frames_of(path))
+    *frames, refused = outcomes(frames_of(path))
     assert frames == [0, 1]
     assert "cannot be read as Parquet" in str(refused)
 
@@ -178,14 +178,14 @@ def test_an_arrow_stream_gives_whole_batches_frame_by_frame(strings: bool) -> No
 
 def test_a_wrong_value_in_an_arrow_stream_refuses_its_frame_alone() -> None:
     wrong = spoilt(to_arrow(table([0, 1, 2])), "u_px", 1, np.inf)
-    first, refused, *others = said(of_bytes(arrow_stream(wrong, to_arrow(table([3])))))
+    first, refused, *others = outcomes(of_bytes(arrow_stream(wrong, to_arrow(table([3])))))
     assert (first, others) == (0, [2, 3])
     assert str(refused).startswith("standard input, batch 1: frame 1 is left out")
 
 
 def test_a_null_in_the_dictionary_of_cameras_refuses_its_frame_alone() -> None:
     cameras = pa.DictionaryArray.from_arrays([0, 1, 0], ["left", None])
-    (first, refused, last) = said(
+    (first, refused, last) = outcomes(
         of_bytes(arrow_stream(to_arrow(table([0, 1, 2])).set_column(0, "camera", cameras)))
     )
     assert (first, last) == (0, 2)
@@ -211,7 +211,7 @@ def test_a_wrong_schema_ends_an_arrow_stream_in_one_line() -> None:
         "has a column twice": good.append_column("u_px", pa.array([1.0, 2.0])),
         "metadata": good.replace_schema_metadata({"matcher": "[" * 100_000}),
     }.items():
-        (refused,) = said(of_bytes(arrow_stream(arrow, arrow)))
+        (refused,) = outcomes(of_bytes(arrow_stream(arrow, arrow)))
         assert str(refused).startswith("standard input: ")
         assert message in str(refused)
 
@@ -221,7 +221,7 @@ def test_a_broken_arrow_stream_gives_what_came_and_one_refusal() -> None:
     data = arrow_stream(to_arrow(table([0])), to_arrow(table([1])))
     seen = set()
     for cut in range(4, len(data)):
-        *frames, last = [*said(of_bytes(data[:cut])), None]
+        *frames, last = [*outcomes(of_bytes(data[:cut])), None]
         refusals = [item for item in frames if isinstance(item, str)]
         assert last is None
         assert len(refusals) <= 1
@@ -242,14 +242,14 @@ def test_flipped_bytes_in_an_arrow_stream_raise_nothing() -> None:
 
 def test_a_damaged_length_in_an_arrow_stream_takes_no_memory() -> None:
     endless = b"\xff\xff\xff\xff" + (2**30).to_bytes(4, "little") + bytes(1000)
-    (refused,) = said(of_bytes(endless))
+    (refused,) = outcomes(of_bytes(endless))
     assert "a message of 1073741824 bytes, expected at most" in str(refused)
 
 
 def test_a_file_that_is_no_stream_is_named(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
     table([0]).save(path)
-    assert said(of_bytes(path.read_bytes())) == [
+    assert outcomes(of_bytes(path.read_bytes())) == [
         "standard input: is a Parquet file; send an Arrow stream or JSON lines"
     ]
-    assert "is an Arrow file" in str(said(of_bytes(b"ARROW1\0\0"))[0])
+    assert "is an Arrow file" in str(outcomes(of_bytes(b"ARROW1\0\0"))[0])

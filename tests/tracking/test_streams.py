@@ -24,7 +24,7 @@ from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
     arrow_stream,
     line,
-    said,
+    outcomes,
     spoilt,
     table,
     to_arrow,
@@ -38,7 +38,7 @@ def test_a_folder_gives_its_tables_in_the_order_of_their_names(tmp_path: Path) -
         table(numbers).save(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no table")
     (tmp_path / "c.parquet").write_bytes(b"half")
-    *frames, refused = said(frames_of(tmp_path))
+    *frames, refused = outcomes(frames_of(tmp_path))
     assert frames == [5, 1, 2]
     assert "c.parquet: cannot be read" in str(refused)
 
@@ -56,7 +56,7 @@ class Following:
     def next(self, *, seconds: float = 10) -> int | str | None:
         self._until = time.monotonic() + seconds
         item = next(self._frames, None)
-        return None if item is None else said([item])[0]
+        return None if item is None else outcomes([item])[0]
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_followed_folder_that_goes_away_ends_in_one_line(tmp_path: Path) -> No
     folder.mkdir()
     frames = frames_of(folder, follow=True)
     folder.rmdir()
-    (refused,) = said(frames)
+    (refused,) = outcomes(frames)
     assert "the folder cannot be read any more" in str(refused)
 
 
@@ -156,9 +156,9 @@ def test_a_complete_line_is_given_while_the_next_is_being_written(
     frames = frames_of("-", stdin=reader)
     for number in range(3):
         writer.write(line(number) + b'{"fra')
-        assert said([next(frames)]) == [number]
+        assert outcomes([next(frames)]) == [number]
         writer.write(b"me\n")
-        assert "is not JSON" in str(said([next(frames)])[0])
+        assert "is not JSON" in str(outcomes([next(frames)])[0])
 
 
 def test_a_complete_arrow_batch_is_given_before_the_next_comes(
@@ -170,9 +170,9 @@ def test_a_complete_arrow_batch_is_given_before_the_next_comes(
     with ipc.new_stream(pa.PythonFile(writer, mode="w"), one.schema) as arrow:
         for number in range(3):
             arrow.write_table(spoilt(one, "frame", 0, number))
-            assert said([next(frames)]) == [number]
+            assert outcomes([next(frames)]) == [number]
     writer.close()
-    assert said(frames) == []
+    assert outcomes(frames) == []
 
 
 @pytest.mark.parametrize(
@@ -186,9 +186,9 @@ def test_a_waiting_stream_ends_when_it_is_stopped(
     until = float("inf")
     frames = frames_of("-", stdin=reader, stop=lambda: time.monotonic() > until)
     if begin:
-        assert said([next(frames)]) == [1]
+        assert outcomes([next(frames)]) == [1]
     until = time.monotonic() + 0.05
-    assert said(frames) == []
+    assert outcomes(frames) == []
     assert time.monotonic() < until + 5 * streams.POLL_S
 
 
@@ -196,9 +196,9 @@ def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
     stopped: list[int] = []
     three = io.BytesIO(line(1) + line(2) + line(3))
     frames = frames_of("-", stdin=three, stop=lambda: len(stopped) > 0)
-    assert said([next(frames)]) == [1]
+    assert outcomes([next(frames)]) == [1]
     stopped.append(1)
-    assert said(frames) == []
+    assert outcomes(frames) == []
 
 
 @pytest.mark.parametrize("begin", [line(1), arrow_stream(to_arrow(table([1])))[:-8]])
@@ -231,9 +231,9 @@ def test_a_signal_ends_the_waiting_for_standard_input(begin: bytes) -> None:
 
 def test_a_source_is_what_it_looks_like(tmp_path: Path) -> None:
     table([3]).save(tmp_path / "a.parquet")
-    assert said(frames_of(tmp_path)) == [3]
-    assert said(frames_of(str(tmp_path / "a.parquet"))) == [3]
-    assert said(frames_of("-", stdin=io.BytesIO(line(4)))) == [4]
+    assert outcomes(frames_of(tmp_path)) == [3]
+    assert outcomes(frames_of(str(tmp_path / "a.parquet"))) == [3]
+    assert outcomes(frames_of("-", stdin=io.BytesIO(line(4)))) == [4]
 
 
 def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
@@ -253,11 +253,11 @@ def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
 def test_a_closed_or_unreadable_stream_is_refused_in_one_line() -> None:
     closed = io.BytesIO()
     closed.close()
-    assert "standard input: cannot be read" in str(said(frames_of("-", stdin=closed))[0])
+    assert "standard input: cannot be read" in str(outcomes(frames_of("-", stdin=closed))[0])
 
     class Broken(io.BytesIO):
         def read1(self, size: int | None = -1, /) -> bytes:
             raise OSError("the wire is cut")
 
-    (refused,) = said(frames_of("-", stdin=Broken()))
+    (refused,) = outcomes(frames_of("-", stdin=Broken()))
     assert refused == "standard input: cannot be read (the wire is cut); restart"
