@@ -19,7 +19,7 @@ COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 
 
 def table(frames: list[int], *, camera: str = "left", **changes: Any) -> Correspondences:
-    """One row per given frame number; its pixel's column says which row it is."""
+    """One row per given frame number; its pixel's column is the number of its row."""
     n = len(frames)
     columns: dict[str, Any] = {
         "camera": camera,

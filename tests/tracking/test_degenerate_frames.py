@@ -25,7 +25,7 @@ from tests.tracking.drives import (
 
 
 def degenerate(number: int, good: Correspondences, rng: np.random.Generator) -> Correspondences:
-    """A frame that is well formed and says nothing, or nonsense."""
+    """A well-formed frame that determines nothing, or holds nonsense."""
     n = len(good)
     line = np.outer(np.linspace(5, 20, n), [1.0, 0.1, 0.05])
     kinds: tuple[Callable[[], Correspondences], ...] = (

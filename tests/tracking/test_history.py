@@ -32,7 +32,7 @@ def update(
     sigma: Array = SIGMA,
     events: Sequence[Event] = (),
 ) -> Update:
-    """What a tracker says: cameras at T_camera_lidar = exp(xi) START."""
+    """An update with cameras at T_camera_lidar = exp(xi) START."""
     xis = {"left": np.zeros(6)} if xis is None else xis
     return Update(
         frame=frame,

@@ -80,7 +80,7 @@ def test_a_database_cut_short_anywhere_is_refused(memory: Path) -> None:
 def test_a_log_that_is_damaged_or_cut_short_costs_the_inputs_from_there_on_at_most(
     memory: Path,
 ) -> None:
-    """SQLite cannot tell it from a log that a crash has cut short: nothing false comes back."""
+    """To SQLite it is a log that a crash has cut short: nothing false comes back."""
     files, truth = crashed(memory / "state", 8)
     log = files[LOG]
     lengths = set()

@@ -14,8 +14,8 @@ from tests.tracking.stream_data import (
     camera,
     line,
     of_bytes,
-    refusal,
     outcomes,
+    refusal,
 )
 
 # JSON lines
