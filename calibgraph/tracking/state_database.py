@@ -8,8 +8,7 @@ rows are noticed, and whether a log is in use, by which a missing log is noticed
 With a write-ahead log and ``synchronous=FULL``, a row is on disk when its transaction returns, and
 a crash leaves all of a transaction or none.
 
-The newest two snapshots are kept, with the inputs since the older one: if the newest is damaged,
-the older one and the journal lead to the same state.
+Two snapshots are kept, and the inputs since the older one, which replaces a damaged newer one.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class Recovered:
 class StateDatabase:
     """The state of one tracker in a folder, locked against a second process.
 
-    After a write has failed, every further one is refused: open the folder anew.
+    After a write has failed, every further one is refused.
 
     Args:
         folder: where the state is kept; made if it is not there.
@@ -291,8 +290,8 @@ def _digest(number: int, content: object) -> bytes:
 
 
 def _damaged(path: Path, why: object) -> FileError:
-    message = f"is damaged ({why}); restore its folder from a copy, or choose another folder"
-    return FileError(path, message)
+    advice = "restore its folder from a copy, or choose another folder"
+    return FileError(path, f"is damaged ({why}); {advice}")
 
 
 def _cannot_write(path: Path, error: sqlite3.Error) -> OSError:
