@@ -76,7 +76,7 @@ def track(
     wanted = Tracking(
         rig=load_rig(rig), config=settings, out=out, every=every, follow=follow, matcher=chosen
     )
-    result, written = track(wanted, source, tell=lambda text: print_plain(console, text))
+    result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
     print_result(console, result, written)
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)

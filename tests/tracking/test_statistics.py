@@ -52,7 +52,7 @@ def test_what_moves_is_found_and_named(scenario: str, runs: int) -> None:
 
 
 @pytest.mark.parametrize(("scenario", "runs"), [("nothing", 2), ("garbage", 4)])
-def test_what_stands_still_is_not_called_moved(scenario: str, runs: int) -> None:
+def test_what_is_static_is_not_reported_as_moved(scenario: str, runs: int) -> None:
     """2000 frames each; at most one alarm in 10,000 is allowed."""
     outcomes = outcomes_of(scenario, runs)
     assert sum(o.false_alarms for o in outcomes) <= 1, outcomes
