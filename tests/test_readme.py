@@ -13,7 +13,6 @@ from calibgraph.matching.structure.schedule import LEVELS
 from tests.conftest import ROOT, SAMPLE
 
 
-
 def example(page: str) -> str:
     """The one block of Python on a page."""
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
