@@ -34,7 +34,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn formulas into MathML, which browsers show without a script, and wrap tables."""
-    content = _FORMULA.sub(_to_mathml, content)
+    content = _ROLE.sub("", _FORMULA.sub(_to_mathml, content))
     return content.replace("<table>", '<div class="wide"><table>').replace(
         "</table>", "</table></div>"
     )
@@ -43,6 +43,9 @@ def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files
 _FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\[\[(](?P<latex>.*?)\\[\])]</(?P=tag)>', re.DOTALL
 )
+
+
+_ROLE = re.compile(r":(?:func|class|meth|mod):(?=<code>)")  # docstrings are written for Sphinx
 
 
 def _to_mathml(match: re.Match[str]) -> str:

@@ -81,11 +81,11 @@ def settings_table(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str
     schema = model.model_json_schema()["properties"]
     meanings = attributes_of(model.__doc__ or "")
     rows = [
-        [f"`{name}`", _values(schema[name]), _default(field.default), meanings[name]]
+        [f"`{name}`", meanings[name], _default(field.default), _values(schema[name])]
         for name, field in model.model_fields.items()
         if name not in set(leave_out)
     ]
-    return table(["setting", "values", "default", "meaning"], rows)
+    return table(["setting", "meaning", "default", "values"], rows)
 
 
 def attributes_of(docstring: str) -> dict[str, str]:
@@ -115,9 +115,9 @@ def _values(schema: Mapping[str, Any]) -> str:
     high = schema.get("maximum", schema.get("exclusiveMaximum"))
     if low is not None and high is not None:
         above = "above " if "exclusiveMinimum" in schema else ""
-        return f"{above}{low:g} to {high:g}"
+        return f"{above}{low:.10g} to {high:.10g}"
     if low is not None:
-        return f"above {low:g}" if "exclusiveMinimum" in schema else f"from {low:g}"
+        return f"above {low:.10g}" if "exclusiveMinimum" in schema else f"from {low:.10g}"
     words = {"boolean": "`true`, `false`", "array": "`[height, width]`", "integer": "whole number"}
     return words.get(schema["type"], schema["type"])
 
@@ -142,10 +142,10 @@ def _command(name: str, command: click.Command) -> str:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option"]
     usage = " ".join([name, *(p.metavar or p.name.upper() for p in arguments), "[options]"])
-    rows = [[f"`{p.metavar or p.name.upper()}`", "", _cell(p.help or "")] for p in arguments]
-    rows += [[_flags(p), _shown_default(p), _cell(p.help or "")] for p in options]
+    rows = [[f"`{p.metavar or p.name.upper()}`", _cell(p.help or ""), ""] for p in arguments]
+    rows += [[_flags(p), _cell(p.help or ""), _shown_default(p)] for p in options]
     parts = [f"### {name}", _cell(command.help or ""), f"```text\n{usage}\n```"]
-    return "\n\n".join([*parts, table(["option", "default", "meaning"], rows)])
+    return "\n\n".join([*parts, table(["option", "meaning", "default"], rows)])
 
 
 def _flags(option: click.Parameter) -> str:
