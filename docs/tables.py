@@ -77,11 +77,16 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def settings_table(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
-    """The fields of a model with their meaning, as its docstring has it."""
+    """The fields of a model with their meaning: their descriptions, or the docstring's."""
     schema = model.model_json_schema()["properties"]
     meanings = attributes_of(model.__doc__ or "")
     rows = [
-        [f"`{name}`", meanings[name], _default(field.default), _values(schema[name])]
+        [
+            f"`{name}`",
+            _cell(field.description or meanings[name]),
+            _default(field.default),
+            _values(schema[name]),
+        ]
         for name, field in model.model_fields.items()
         if name not in set(leave_out)
     ]

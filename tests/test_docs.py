@@ -9,10 +9,13 @@ from pathlib import Path
 
 import click
 import pytest
+import yaml
 from typer.main import get_command
 
 import calibgraph
 from calibgraph.cli.app import app
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
+from calibgraph.model.config import Config
 from docs.tables import GENERATED
 from tests.conftest import ROOT
 
@@ -109,6 +112,18 @@ def test_every_command_is_shown() -> None:
 def test_python_blocks_compile(page: Path) -> None:
     for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
         compile(block, name_of(page), "exec")
+
+
+def yaml_blocks(page: str) -> list[object]:
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+    return [yaml.safe_load(block) for block in blocks]
+
+
+def test_examples_of_settings_are_settings() -> None:
+    for example in yaml_blocks("docs/settings.md"):
+        Config.model_validate(example)
+    for example in yaml_blocks("docs/learned_matcher.md"):
+        TrainSettings.model_validate(example)
 
 
 def test_the_api_page_has_every_public_name() -> None:
