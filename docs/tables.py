@@ -1,4 +1,4 @@
-"""Tables that the pages ask for by a line ``<!-- generated: NAME -->``, from the code itself."""
+"""Tables for the pages, in place of a line ``<!-- generated: NAME -->``, from the code itself."""
 
 from __future__ import annotations
 

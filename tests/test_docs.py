@@ -21,7 +21,7 @@ from tests.conftest import ROOT
 
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
-ASKED = re.compile(r"<!-- generated: (.*) -->")
+PLACEHOLDER = re.compile(r"<!-- generated: (.*) -->")
 VALUES = ("--help", "--version", "--debug")
 
 
@@ -147,9 +147,9 @@ def test_generated_tables_have_rows(name: str) -> None:
         assert len({row.replace(r"\|", "").count("|") for row in rows}) == 1, "cells are missing"
 
 
-def test_pages_ask_for_tables_that_exist() -> None:
-    asked = {name for page in PAGES for name in ASKED.findall(page.read_text())}
-    assert asked == set(GENERATED)
+def test_pages_name_tables_that_exist() -> None:
+    named = {name for page in PAGES for name in PLACEHOLDER.findall(page.read_text())}
+    assert named == set(GENERATED)
 
 
 @pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)

@@ -88,7 +88,7 @@ def test_a_matcher_and_a_tracker_as_in_the_examples(
 def true_matches(
     image: np.ndarray, cloud: np.ndarray, camera: calibgraph.Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A matcher that knows the truth up to half a pixel."""
+    """A matcher with errors of half a pixel about the truth."""
     (name,) = [
         n
         for n, c in calibgraph.load_rig(SAMPLE).cameras.items()
