@@ -19,7 +19,7 @@ from calibgraph.model.config import Config
 from docs.tables import GENERATED
 from tests.conftest import ROOT
 
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
 READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
 PLACEHOLDER = re.compile(r"<!-- generated: (.*) -->")
 VALUES = ("--help", "--version", "--debug")
@@ -112,6 +112,13 @@ def test_every_command_is_shown() -> None:
 def test_python_blocks_compile(page: Path) -> None:
     for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
         compile(block, name_of(page), "exec")
+
+
+@pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
+def test_modules_that_pages_run_exist(page: Path) -> None:
+    for module in re.findall(r"python -m (benchmarks[\w.]*)", page.read_text()):
+        file = ROOT / (module.replace(".", "/") + ".py")
+        assert file.is_file(), module
 
 
 def yaml_blocks(page: str) -> list[object]:
