@@ -52,10 +52,10 @@ docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/test ## Measure the solve, the updates and the network against other ways
-	$(BIN)/python benchmarks/solve.py --frames 10 100 --cameras 2
-	$(BIN)/python benchmarks/scaling.py --rows 1e3 1e5 1e7
-	$(BIN)/python benchmarks/incremental.py
-	$(BIN)/python benchmarks/cmrnext.py
+	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
+	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
+	$(BIN)/python -m benchmarks.speed.incremental
+	$(BIN)/python -m benchmarks.speed.cmrnext
 
 clean: ## Remove everything that was made
 	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache

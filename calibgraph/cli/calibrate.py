@@ -1,7 +1,5 @@
 """The commands that make a calibration: calibrate, match, solve."""
 
-# ruff: noqa: PLR0913, PLR0917 - the options of a command are its parameters
-
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command that keeps a rig calibrated while driving: track."""
 
-# ruff: noqa: PLR0913, PLR0917 - the options of a command are its parameters
-
 from __future__ import annotations
 
 from pathlib import Path
