@@ -6,7 +6,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist l
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install run test test-ci test-slow lint type bench clean
+.PHONY: help install run test test-ci test-slow lint type docs bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -44,11 +44,18 @@ lint: type ## Check style, types and the layers
 type: $(VENV)/test ## Check types
 	$(BIN)/mypy
 
+$(VENV)/docs: $(VENV)/test
+	$(INSTALL) --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 bench: $(VENV)/test ## Measure the solve, the updates and the network against other ways
-	$(BIN)/python benchmarks/solve.py --frames 10 100 --cameras 2
-	$(BIN)/python benchmarks/scaling.py --rows 1e3 1e5 1e7
-	$(BIN)/python benchmarks/incremental.py
-	$(BIN)/python benchmarks/cmrnext.py
+	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
+	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
+	$(BIN)/python -m benchmarks.speed.incremental
+	$(BIN)/python -m benchmarks.speed.cmrnext
 
 clean: ## Remove everything that was made
 	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,6 +1,6 @@
-"""What can be wrong with the data (a wrong argument is a ``ValueError`` instead).
+"""Errors of the data (a wrong argument is a ``ValueError`` instead).
 
-Every message is one line that says what is wrong, where, what was found and what to do.
+Every message is one line: what is wrong, where, what was found and what to do.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 
 MAX_MESSAGE = 2000
-"""Characters of a message; what a file says of itself may be longer."""
+"""Characters of a message: it may quote a file, and a quote may be long."""
 
 
 class CalibrationError(Exception):
-    """Data that cannot be calibrated. ``camera`` and ``frame`` say where, when that is known."""
+    """Data that cannot be calibrated, at ``camera`` and ``frame`` (None if at no single one)."""
 
     def __init__(
         self, message: str, *, camera: str | None = None, frame: str | int | None = None
@@ -23,7 +23,7 @@ class CalibrationError(Exception):
 
 
 def _one_line(message: str) -> str:
-    """The message without line breaks and control characters, and of a readable length."""
+    """The message without line breaks and control characters, at most MAX_MESSAGE long."""
     text = " ".join(message.split())
     if len(text) > MAX_MESSAGE:
         text = f"{text[:MAX_MESSAGE]}..."
@@ -39,11 +39,11 @@ class FileError(CalibrationError):
 
 
 class RigError(CalibrationError):
-    """A rig, or a part of one, that does not make sense."""
+    """A rig, or a part of one, that is inconsistent."""
 
 
 class CorrespondenceError(CalibrationError):
-    """Correspondences that are malformed, unusable or too few; of which ``row``, if it is one."""
+    """Correspondences that are malformed, unusable or too few; ``row`` is None if not one row."""
 
     def __init__(
         self,
@@ -53,14 +53,14 @@ class CorrespondenceError(CalibrationError):
         frame: str | int | None = None,
         row: int | None = None,
     ) -> None:
-        whose = "" if camera is None else f" (camera {camera!r}, frame {frame})"
-        where = "" if row is None else f"row {row}{whose}: "
+        owner = "" if camera is None else f" (camera {camera!r}, frame {frame})"
+        where = "" if row is None else f"row {row}{owner}: "
         super().__init__(where + message, camera=camera, frame=frame)
         self.row = row
         self._message = message
 
     def after(self, rows: int) -> CorrespondenceError:
-        """The same error of a longer table, which has so many rows before these."""
+        """The same error in a table with this number of rows before these."""
         row = None if self.row is None else rows + self.row
         return CorrespondenceError(self._message, camera=self.camera, frame=self.frame, row=row)
 

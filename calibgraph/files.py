@@ -23,7 +23,7 @@ MAX_YAML_DEPTH = 200  # of brackets: the parser in C ends the process at some te
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step.
+    """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
 
     A crash leaves the old file or the new one, never half of one.
     """
@@ -50,12 +50,12 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
 
     Args:
         path: the file.
-        suffixes: one of which its name must end in, if there are any: so that no other kind of
-            file is overwritten by mistake.
+        suffixes: the endings that its name may have, if given: so that no other kind of file is
+            overwritten by mistake.
 
     Raises:
-        FileError: if a folder has its name, a file that of a folder above it, or the folder is not
-            to be written to; or if it ends in none of the suffixes.
+        FileError: if it is a folder, if a folder above it is a file or not writable, or if it ends
+            in none of the suffixes.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
@@ -65,17 +65,17 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
 
 
 def require_place_for_folder(folder: Path) -> None:
-    """Check, before hours of work, that a folder is there or can be made.
+    """Check, before hours of work, that a folder exists or can be created.
 
     Raises:
-        FileError: if a file has its name, or a parent's, or it is not to be written to.
+        FileError: if it or a parent is a file, or not writable.
     """
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():
             raise FileError(part, "is a file, expected a folder to write into; choose another")
-    there = next(part for part in (folder, *folder.parents) if part.exists())
-    if not os.access(there, os.W_OK):
-        raise FileError(there, "may not be written to; choose another folder")
+    existing = next(part for part in (folder, *folder.parents) if part.exists())
+    if not os.access(existing, os.W_OK):
+        raise FileError(existing, "may not be written to; choose another folder")
 
 
 def sync_folder(folder: Path) -> None:
@@ -111,11 +111,11 @@ def require_file(path: Path) -> Path:
     """Return ``path`` if it is a file.
 
     Raises:
-        FileError: if it is missing or a folder, or its name is none that a file can have.
+        FileError: if it is missing or a folder, or no file can have its name.
     """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()
-    except OSError as error:  # A name that is too long, or a folder above that is closed to us.
+    except OSError as error:  # a name that is too long, or a folder above that may not be read
         raise FileError(path, f"cannot be read ({error.strerror}); check the path") from error
     if is_folder:
         raise FileError(path, "is a folder, expected a file")
@@ -157,7 +157,7 @@ _TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
 
 
 def _bracket_depth(text: str) -> int:
-    """How deep brackets are nested, if those in quotes count too."""
+    """Depth to which brackets are nested; those in quotes count too."""
     data = np.frombuffer(text.encode(), np.uint8)
     opened = np.isin(data, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
     closed = np.isin(data, np.frombuffer(b"]}", np.uint8)).astype(np.int64)
@@ -168,7 +168,7 @@ def read_text(path: Path) -> str:
     """Read a text file.
 
     Raises:
-        FileError: if it is missing, or no text.
+        FileError: if it is missing, or not UTF-8.
     """
     try:
         return require_file(path).read_text("utf-8")
@@ -176,14 +176,14 @@ def read_text(path: Path) -> str:
         raise FileError(path, f"is not a text file ({error.reason})") from error
 
 
-def _expanded_size(value: Any, known: dict[int, int]) -> int:
-    """How many values there are when every alias is written out; each is visited once."""
+def _expanded_size(value: Any, sizes: dict[int, int]) -> int:
+    """Number of values when every alias is written out; each is visited once."""
     if not isinstance(value, (dict, list)):
         return 1
-    if id(value) not in known:
+    if id(value) not in sizes:
         children = value.values() if isinstance(value, dict) else value
-        known[id(value)] = 1 + sum(_expanded_size(child, known) for child in children)
-    return known[id(value)]
+        sizes[id(value)] = 1 + sum(_expanded_size(child, sizes) for child in children)
+    return sizes[id(value)]
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
@@ -196,7 +196,7 @@ def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
     """Build a pydantic model from file content.
 
     Raises:
-        FileError: with the first thing that is wrong: where, what was found, what is expected.
+        FileError: with the first problem: where, what was found, what is expected.
     """
     try:
         return model.model_validate(content)
@@ -205,7 +205,7 @@ def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
 
 
 def describe(error: ValidationError) -> str:
-    """First problem of a pydantic error, in one line; a misspelt key before what it then lacks."""
+    """First problem of a pydantic error, in one line; a misspelt key before a missing one."""
     first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":

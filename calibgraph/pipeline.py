@@ -16,19 +16,17 @@ from pathlib import Path
 
 from calibgraph.files import sha256
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check
-from calibgraph.progress import Progress, no_progress
+from calibgraph.model.verdict import Verdict
+from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.solution import Solution
-from calibgraph.trust.assess import assess
-from calibgraph.trust.guess import likely_intended_guess
-from calibgraph.trust.rematch_checks import assess_images
+from calibgraph.trust.assess import assess, assess_run
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.observability import weaknesses
 
 
 def calibrate(
@@ -67,12 +65,11 @@ def calibrate(
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
     with run.watch("checks"):
-        result = to_calibration(run.solution, guess=run.guess)  # checks on correspondences
-        result = result.with_checks(assess_images(run, inputs, report))  # checks on images
-        result = _with_hint_on_guess(result, run)
+        evidence = RunEvidence(run, inputs, report)
+        checks = assess_run(evidence)
     report("done", 1, 1)
     return replace(
-        result,
+        to_calibration(evidence.solution, checks),
         correspondences=run.correspondences,
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
@@ -107,34 +104,37 @@ def solve(
             and no relative pose that ties it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
-    return to_calibration(solve_joint(rig, table, config, terms))
+    solution = solve_joint(rig, table, config, terms)
+    evidence, watch = Evidence(solution, guess=solution.rig), Stopwatch()
+    with watch("checks"):
+        checks = assess(evidence)
+    result = to_calibration(evidence, checks)
+    return replace(result, timings_s={**result.timings_s, **watch.seconds})
 
 
-def to_calibration(solution: Solution, guess: Rig | None = None) -> Calibration:
-    """A solution with its error bar, its checks and its verdict.
+def to_calibration(evidence: Evidence, checks: Checks) -> Calibration:
+    """A solution with its error bar and its verdict.
 
     Args:
-        solution: of the joint solve.
-        guess: the first guess, if the solve started from a better one.
+        evidence: the solution, and what its checks computed.
+        checks: per camera, all of them.
     """
-    guess = guess or solution.rig
-    with solution.watch("checks"):
-        assessment = assess(solution, guess)
+    solution, cameras = evidence.solution, evidence.cameras
     return Calibration(
         rig=solution.solved_rig,
-        initial_rig=guess,
-        covariance=assessment.covariance,
-        joint_covariance=assessment.joint_covariance,
-        camera_verdicts=assessment.verdicts,
-        residuals=assessment.residuals,
+        initial_rig=evidence.guess,
+        covariance={name: evidence.covariance_of(name) for name in cameras},
+        joint_covariance=evidence.joint_covariance,
+        camera_verdicts={name: Verdict(tuple(checks.get(name, ()))) for name in cameras},
+        residuals=evidence.residuals,
         counts={name: dict(counts) for name, counts in solution.counts.items()},
-        timings_s=solution.watch.seconds,
+        timings_s=dict(solution.timings_s),
         terms=solution.terms,
         config=solution.config,
         stage1_T_camera_lidar=solution.T_hat,
-        weaknesses=assessment.weaknesses,
-        prior_share=assessment.prior_share,
-        bootstrap=assessment.bootstrap,
+        weaknesses={n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras},
+        prior_share=evidence.prior_shares,
+        bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
     )
 
@@ -145,16 +145,3 @@ def hash_inputs(dataset: Dataset) -> dict[str, str]:
         path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
     ]
     return {str(path): sha256(path) for path in files}
-
-
-def _with_hint_on_guess(result: Calibration, run: MatchingRun) -> Calibration:
-    """A failed result with the convention error in its guess that would explain the failure."""
-    if result.verdict.status != "FAIL" or run.out_of_time:
-        return result
-    intended = likely_intended_guess(run.dataset, run.guess)
-    if intended is None:
-        return result
-    text = f"the images fit better if the guess is {intended}: correct it and calibrate again"
-    check = Check("reading of the guess", "FAIL", text)
-    verdicts = {name: v.and_first([check]) for name, v in result.camera_verdicts.items()}
-    return replace(result, camera_verdicts=verdicts)

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many steps of it are done, and out of how many."""
+"""Called with the name of a task, the steps of it that are done, and their number."""
 
 
-def no_progress(what: str, done: int, total: int) -> None:
+def no_progress(task: str, done: int, total: int) -> None:
     """No-op progress callback."""
 
 
@@ -26,7 +26,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Add the time that the body takes to a stage's."""
+        """Add the wall time of the body to that of a stage."""
         start = time.perf_counter()
         try:
             yield

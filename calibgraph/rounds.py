@@ -27,8 +27,8 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.guess import likely_intended_guess
-from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, rematch_checks
+from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str
@@ -186,7 +186,7 @@ def _better_cameras(run: MatchingRun, again: _LastRound) -> set[str]:
     before, now = (t.findings.z_score for t in (run.correspondences, again.correspondences))
     near = {
         name
-        for name, checks in rematch_checks(run.rematch).items()
+        for name, checks in compare_ends(run.rematch).items()
         if all(check.status != "FAIL" for check in checks)
     }
     return {n for n in near if now.get(n, -np.inf) > _BETTER * before.get(n, np.inf)}

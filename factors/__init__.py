@@ -5,6 +5,7 @@ This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibg
 """
 
 from factors.block import BlockSums, ProjectionBlock, block_factor, square_root
+from factors.conditioning import smallest_scaled_eigenvalue, unit_diagonal
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pose import (
@@ -30,5 +31,7 @@ __all__ = [
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",
+    "smallest_scaled_eigenvalue",
     "square_root",
+    "unit_diagonal",
 ]

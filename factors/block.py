@@ -20,6 +20,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.conditioning import unit_diagonal
 from factors.kernel import (
     accumulate_alone,
     accumulate_shared,
@@ -37,7 +38,7 @@ _WORTH_SHARING = 300_000  # correspondences (1 ms): below, waking other threads 
 
 @dataclass(frozen=True)
 class BlockSums:
-    """What a block of correspondences says at one pose. Sums of blocks simply add.
+    """H, b and c of a block of correspondences at one pose. Sums of blocks simply add.
 
     Attributes:
         hessian: (6, 6) or (f, 6, 6), H above, in GTSAM's tangent of ``T_lidar_camera``.
@@ -52,7 +53,7 @@ class BlockSums:
 
 @dataclass(frozen=True, eq=False)
 class ProjectionBlock:
-    """Correspondences of one camera, as a structure of arrays.
+    """Correspondences of one camera, as a structure of arrays. Immutable: its arrays are read-only.
 
     Attributes:
         lens: the camera's lens.
@@ -79,12 +80,6 @@ class ProjectionBlock:
     sigma: float = 1.0
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, contiguous by row
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
-    _last: list[tuple[bytes, tuple[Array, Array]]] = field(
-        default_factory=list, init=False, repr=False
-    )
-    _seen: list[tuple[bytes, tuple[Array, NDArray[np.bool_]]]] = field(
-        default_factory=list, init=False, repr=False
-    )
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -93,47 +88,42 @@ class ProjectionBlock:
         if self.sqrt_information is not None:
             _check_shape("sqrt_information", self.sqrt_information, (n, 3))
         loss_id(self.loss)
+        _check_positive(scale=self.scale, sigma=self.sigma)
         columns = np.empty((5, n))
         columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
-        self._set(_columns=columns, _whitening=_whitening(self.sqrt_information, n))
-        self._set(points_lidar_m=columns[:3].T, pixels_px=columns[3:].T)  # held once
-        self._check_scales()
+        self._initialize(columns, _whitening(self.sqrt_information, n), self.sqrt_information)
 
-    def _check_scales(self) -> None:
-        for name in ("scale", "sigma"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"the robust {name} must be positive, found {getattr(self, name)}")
-
-    def _set(self, **attributes: Any) -> None:
-        for name, value in attributes.items():
-            object.__setattr__(self, name, value)
-
-    def _but(self, **attributes: Any) -> ProjectionBlock:
-        """A block with other attributes, of which those that are correspondences are known good."""
-        twin = copy.copy(self)
-        twin._set(_last=[], _seen=[], **attributes)
-        return twin
+    def _initialize(self, columns: Array, whitening: Array, root: Array | None) -> None:
+        """Set the arrays of a block that is being made: held once, as columns, and read-only."""
+        columns, whitening = _read_only(columns), _read_only(whitening)
+        object.__setattr__(self, "_columns", columns)
+        object.__setattr__(self, "_whitening", whitening)
+        object.__setattr__(self, "points_lidar_m", columns[:3].T)
+        object.__setattr__(self, "pixels_px", columns[3:].T)
+        object.__setattr__(self, "sqrt_information", None if root is None else _read_only(root))
 
     def __len__(self) -> int:
         return len(self.pixels_px)
 
-    def rescaled(self, *, scale: float, sigma: float = 1.0) -> ProjectionBlock:
+    def rescale(self, *, scale: float, sigma: float = 1.0) -> ProjectionBlock:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
-        twin = self._but(scale=scale, sigma=sigma)
-        twin._check_scales()
-        return twin
+        _check_positive(scale=scale, sigma=sigma)
+        other = copy.copy(self)  # not checked again: its correspondences are those of a good block
+        object.__setattr__(other, "scale", scale)
+        object.__setattr__(other, "sigma", sigma)
+        return other
 
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
         """The block with only some correspondences: a mask or an index array."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        columns, root = self._columns.take(rows, axis=1), self.sqrt_information
-        return self._but(
-            points_lidar_m=columns[:3].T,
-            pixels_px=columns[3:].T,
-            sqrt_information=None if root is None else root[rows],
-            _columns=columns,
-            _whitening=self._whitening.take(rows, axis=1),
+        root = self.sqrt_information
+        other = copy.copy(self)
+        other._initialize(
+            self._columns.take(rows, axis=1),
+            self._whitening.take(rows, axis=1),
+            None if root is None else root[rows],
         )
+        return other
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
@@ -145,51 +135,45 @@ class ProjectionBlock:
         return _unpacked(self._segment_sums(T_lidar_camera, np.asarray(edges, dtype=np.int64)))
 
     def _segment_sums(self, T_lidar_camera: gtsam.Pose3, edges: NDArray[np.int64]) -> Array:
-        T = np.ascontiguousarray(T_lidar_camera.inverse().matrix())
         run = accumulate_alone if len(self) < _WORTH_SHARING else accumulate_shared
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, T, self._columns, self._whitening,
-            loss_id(self.loss), self.scale * self.sigma, edges,
+            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma, edges,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable.
-
-        Those of the last pose are remembered, and not to be written to.
-        """
-        pose = T_lidar_camera.matrix().tobytes()
-        if not self._seen or self._seen[0][0] != pose:
-            self._seen[:] = [(pose, self._residuals(T_lidar_camera))]
-        return self._seen[0][1]
-
-    def _residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
-        T = np.ascontiguousarray(T_lidar_camera.inverse().matrix())
+        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
         run = residuals_alone if len(self) < _WORTH_SHARING else residuals_shared
-        residuals, valid = run(self.lens.kind, self.lens.packed, T, self._columns)
-        residuals.flags.writeable = valid.flags.writeable = False
-        return residuals, valid
+        residuals, projectable = run(
+            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns
+        )
+        return residuals, projectable
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
-        """The (7,) error and (7, 6) Jacobian of the block factor.
-
-        The last pose is remembered: an optimizer that judges a step and then linearizes there pays
-        for one pass.
-        """
-        pose = T_lidar_camera.matrix().tobytes()
-        if not self._last or self._last[0][0] != pose:
-            self._last[:] = [(pose, square_root(self.sums(T_lidar_camera)))]
-        return self._last[0][1]
+        """The (7,) error and (7, 6) Jacobian of the block factor."""
+        return square_root(self.sums(T_lidar_camera))
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
-    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors."""
+    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors.
+
+    The factor remembers the error and Jacobian of its last pose: an optimizer evaluates the error
+    of a step and then linearizes at the same pose, which takes one pass over the correspondences.
+    They are replaced as one tuple, so that threads never see a pose with the sums of another.
+    """
+    last: tuple[bytes, tuple[Array, Array]] | None = None
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
-        residual, jacobian = block.error_and_jacobian(values.atPose3(key))
+        nonlocal last
+        T_lidar_camera = values.atPose3(key)
+        pose, found = T_lidar_camera.matrix().tobytes(), last
+        if found is None or found[0] != pose:
+            last = found = (pose, block.error_and_jacobian(T_lidar_camera))
+        residual, jacobian = found[1]
         if jacobians is not None:
             jacobians[0] = jacobian
         return residual
@@ -203,9 +187,8 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
     lose no digits to each other; directions without information get a zero row.
     """
-    diagonal = np.sqrt(np.diag(sums.hessian))
-    units = np.where(diagonal > 0, diagonal, 1.0)
-    values, vectors = np.linalg.eigh(sums.hessian / np.outer(units, units))
+    scaled, units = unit_diagonal(sums.hessian)
+    values, vectors = np.linalg.eigh(scaled)
     informed = values > 1e-14 * max(float(values[-1]), 0.0)
     roots = np.sqrt(np.where(informed, values, 0.0))
     over = np.where(informed, 1.0 / np.where(informed, roots, 1.0), 0.0)
@@ -215,6 +198,22 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     error[:6] = over * (vectors.T @ (sums.gradient / units))
     error[6] = np.sqrt(max(float(sums.cost) - float(error[:6] @ error[:6]), 0.0))
     return error, jacobian
+
+
+def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
+    return np.ascontiguousarray(T_lidar_camera.inverse().matrix())
+
+
+def _read_only(array: Array) -> Array:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(f"the robust {name} must be positive, found {value}")
 
 
 def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:

@@ -3,8 +3,8 @@
 The formulas are OpenCV's (``projectPoints`` and ``fisheye.projectPoints``) wherever those are
 injective. Outside that domain (behind the camera, or past the field angle at which the
 distortion polynomial folds back) OpenCV returns pixels that mean nothing; here such a point is
-reported as invalid, and its projection is continued continuously (see ``project_one``) so that an
-optimizer that steps there sees a large, finite error instead of a NaN or a wrong small one.
+reported as invalid, and its projection is continued continuously (see ``project_one``), so that an
+optimizer that steps there gets a large, finite error instead of a NaN or a wrong small one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye"]
 
 MIN_DEPTH_M = 0.05
-"""A pinhole does not see points nearer to its image plane than this."""
+"""Points with a smaller z are not projectable by a pinhole."""
 
 PINHOLE, RADTAN, FISHEYE = 0, 1, 2
 _PINHOLE_COEFFICIENTS = (0, 4, 5, 8)
@@ -110,7 +110,7 @@ def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
 def _radtan_limit(coefficients: Array) -> float:
     """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does; tangential terms apart.
 
-    At most that of a ray 85 degrees off the axis: no polynomial was ever fitted beyond.
+    At most that of a ray 85 degrees off the axis: polynomials are not fitted beyond.
     """
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])

@@ -1,4 +1,4 @@
-"""Factors between poses only: the paper's two priors, and independently known relative poses.
+"""Factors of poses alone: the paper's two priors, and measured relative poses.
 
 All act on variables ``X = T_lidar_camera``. GTSAM's cost is half the squared whitened error, so a
 paper weight lambda is a sigma of 1 / sqrt(lambda).
@@ -62,7 +62,7 @@ def relative_pose_factor(
     rotation_sigma_rad: float,
     translation_sigma_m: float,
 ) -> gtsam.BetweenFactorPose3:
-    """Independent knowledge of a relative pose: stereo calibration, CAD, a Kalibr camchain.
+    """A measured relative pose: stereo calibration, CAD, a Kalibr camchain.
 
     Args:
         key_a: variable of camera a.

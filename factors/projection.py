@@ -1,7 +1,7 @@
 """The plain projection factor: one GTSAM factor per 2D-3D correspondence.
 
-It states the method in stock GTSAM terms and is the reference that the block factor is tested
-against. It costs a Python call per correspondence; use ``factors.block`` for real work.
+It is the method in stock GTSAM terms, and the reference in tests of the block factor. It costs a
+Python call per correspondence; use ``factors.block`` for real work.
 """
 
 from __future__ import annotations

@@ -1,14 +1,25 @@
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Intrinsics, RelativePose, Rig
+from calibgraph import (
+    Camera,
+    Intrinsics,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    load_rig,
+    simulate_correspondences,
+)
 from calibgraph.cli import app as cli
 
 Call = Callable[..., tuple[int, str, str]]
@@ -81,8 +92,45 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     return run
 
 
-@pytest.fixture
-def pair() -> Rig:
+@dataclass(frozen=True)
+class CommandRun:
+    """A run of the command line that several tests share: what it printed and its folder."""
+
+    code: int
+    stdout: str
+    stderr: str
+    folder: Path
+
+
+def run_command(*arguments: object, folder: Path) -> CommandRun:
+    """Run the command line in this process, outside of a test's fixtures."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as exit_,
+    ):
+        patch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])
+        cli.main()
+        raise SystemExit(0)
+    return CommandRun(int(exit_.value.code or 0), out.getvalue(), err.getvalue(), folder)
+
+
+@pytest.fixture(scope="session")
+def calibrated_sample(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
+    """``calibrate`` of the sample, with matches that are the truth and a pixel of noise."""
+    folder = tmp_path_factory.mktemp("sample")
+    truth = load_rig(SAMPLE / "reference.yaml")
+    table = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=0.1))
+    table.save(folder / "table.csv")
+    result = folder / "result"
+    return run_command(
+        "calibrate", SAMPLE, "--matcher", folder / "table.csv", "--out", result, folder=result
+    )
+
+
+def make_pair() -> Rig:
     """Two cameras side by side, without distortion."""
     return Rig(
         cameras={
@@ -90,6 +138,12 @@ def pair() -> Rig:
             "right": make_camera((0.3, -0.4, -0.1)),
         }
     )
+
+
+@pytest.fixture
+def pair() -> Rig:
+    """Two cameras side by side, without distortion."""
+    return make_pair()
 
 
 @pytest.fixture

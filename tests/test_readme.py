@@ -1,4 +1,4 @@
-"""What the README says, run."""
+"""The examples of the README and of the pages, run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ import calibgraph
 from calibgraph.matching.structure.schedule import LEVELS
 from tests.conftest import ROOT, SAMPLE
 
-README = (ROOT / "README.md").read_text()
+
+def example(page: str) -> str:
+    """The one block of Python on a page."""
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+    return str(block)
 
 
-FIRST, OWN_MATCHER, TRACKER = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+FIRST = example("README.md")
+OWN_MATCHER = example("docs/your_matcher.md")
+TRACKER = example("docs/tracking.md")
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
@@ -64,7 +70,7 @@ def test_a_matcher_and_a_tracker_as_in_the_examples(
 ) -> None:
     monkeypatch.chdir(folder)
     names: dict[str, object] = {"calibgraph": calibgraph, "your_matches": true_matches}
-    exec(compile(OWN_MATCHER, "README.md", "exec"), names)
+    exec(compile(OWN_MATCHER, "your_matcher.md", "exec"), names)
     table = calibgraph.load_correspondences(folder / "matches.parquet")
     assert table.point_index is not None and len(np.unique(table.frame)) == 6
     result = names["result"]
@@ -72,7 +78,7 @@ def test_a_matcher_and_a_tracker_as_in_the_examples(
     for error in calibgraph.evaluate(result.rig, TRUTH).cameras.values():
         assert error.rotation_error_deg < 0.1
     names["frame_tables"] = [table.select(table.frame == frame) for frame in range(6)]
-    exec(compile(TRACKER, "README.md", "exec"), names)
+    exec(compile(TRACKER, "tracking.md", "exec"), names)
     update = names["update"]
     assert isinstance(update, calibgraph.Update)
     assert update.verdicts["left"].status in ("PASS", "WARN")
@@ -82,7 +88,7 @@ def test_a_matcher_and_a_tracker_as_in_the_examples(
 def true_matches(
     image: np.ndarray, cloud: np.ndarray, camera: calibgraph.Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A matcher that knows the truth up to half a pixel."""
+    """A matcher with errors of half a pixel about the truth."""
     (name,) = [
         n
         for n, c in calibgraph.load_rig(SAMPLE).cameras.items()
@@ -99,10 +105,10 @@ def true_matches(
 
 
 def test_the_rig_example_is_a_rig(tmp_path: Path) -> None:
-    text = re.search(r"    format: calibgraph-rig/1\n.*?\n    relative_poses", README, re.DOTALL)
+    page = (ROOT / "docs" / "data.md").read_text()
+    text = re.search(r"(format: calibgraph-rig/1\n.*?\n)relative_poses", page, re.DOTALL)
     assert text is not None
-    lines = [line.removeprefix("    ") for line in text[0].splitlines()[:-1]]
-    (tmp_path / "rig.yaml").write_text("\n".join(lines))
+    (tmp_path / "rig.yaml").write_text(text[1])
     assert list(calibgraph.load_rig(tmp_path / "rig.yaml").cameras) == ["front"]
 
 
@@ -114,12 +120,3 @@ def test_every_public_name_is_there_and_documented() -> None:
 def test_the_names_that_types_see_are_the_names_that_run() -> None:
     stub = (ROOT / "calibgraph" / "__init__.pyi").read_text()
     assert set(re.findall(r"(\w+) as \1\b", stub)) == set(calibgraph.__all__)
-
-
-def test_every_command_of_the_readme_exists() -> None:
-    from typer.main import get_command
-
-    from calibgraph.cli.app import app
-
-    named = set(re.findall(r"^    calibgraph (\w+)", README, flags=re.MULTILINE))
-    assert named == set(get_command(app).commands)

@@ -11,10 +11,10 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
-from tests.matching.cmrnext.test_checkpoint import good_content, saved
+from tests.matching.cmrnext.builders import good_content, saved
 
 pytestmark = pytest.mark.realdata
 
@@ -32,7 +32,7 @@ def start_and_reference(folders: list[Path], seed: int) -> tuple[Rig, Rig]:
 
 @pytest.mark.parametrize("names", ["00", "06+07+08"])
 def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) -> None:
-    """One start each; benchmarks/search.py has more, and from farther."""
+    """One start each; benchmarks.accuracy.search has more, and from farther."""
     folders = sequences(realdata, names)
     start, reference = start_and_reference(folders, seed=0)
     matched = match_in_rounds(folders, start, progress=lambda *_: None)
@@ -62,7 +62,7 @@ def test_other_rigs_and_sensors_improve_in_rotation(realdata: Path, name: str) -
 
 def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, call: Call) -> None:
     """Their matches agree with each other and with the guess; the verdict is FAIL all the same."""
-    weights = saved(tmp_path / "random.tar", good_content(Variant(width=16)))
+    weights = saved(tmp_path / "random.tar", good_content(Architecture(width=16)))
     (folder,) = sequences(realdata, "07")
     for estimate in ("frame", "joint"):
         code, _, text = call(

@@ -1,14 +1,15 @@
-"""The commands for learned matching: what is in a file of weights, and training."""
+"""The commands of the learned matcher: what is in a file of weights, and training."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.support import checked_arguments, progress_bar, terminal
+from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.options import JsonOption
+from calibgraph.cli.terminal import progress_bar, terminal
 
 
 def weights(
@@ -18,7 +19,7 @@ def weights(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a file of CMRNext weights, say what is in it, and convert it to safetensors."""
+    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
     from calibgraph.matching.cmrnext import load_checkpoint
 
     with checked_arguments():
@@ -37,6 +38,15 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
+def _print_settings(requested: bool) -> None:
+    """Print a settings file with all defaults."""
+    if requested:
+        from calibgraph.matching.cmrnext.training.settings import commented_defaults
+
+        print(commented_defaults())
+        raise typer.Exit
+
+
 def train(
     dataset: Annotated[
         list[Path],
@@ -46,12 +56,31 @@ def train(
             "reference.yaml; they may be of different rigs.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Weights to write.")],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="Weights to write; their settings are written beside."),
+    ],
+    settings: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Settings of the training, YAML. (default: the published training's)",
+        ),
+    ] = None,
+    print_settings: Annotated[
+        bool,
+        typer.Option(
+            "--print-settings",
+            callback=_print_settings,
+            is_eager=True,
+            help="Print a settings file with all defaults and what they mean, and exit.",
+        ),
+    ] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="DATASET",
-            help="Folder to validate on (up to 100 images), may come again. "
+            help="Folder to validate on (up to 100 images); may be repeated. "
             "(default: the last fifth of each DATASET)",
         ),
     ] = None,
@@ -64,107 +93,44 @@ def train(
             "--from", metavar="FILE", help="Fine-tune these weights; the network is theirs."
         ),
     ] = None,
-    rotation_deg: Annotated[
-        float | None, typer.Option(help="Largest perturbation per axis (default: 20).")
-    ] = None,
-    translation_m: Annotated[
-        float | None, typer.Option(help="Largest perturbation per axis (default: 1.5).")
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(help="Optimizer steps in all (default: 100000).")
-    ] = None,
-    batch: Annotated[int | None, typer.Option(help="Samples per step (default: 4).")] = None,
-    width: Annotated[
-        int | None,
-        typer.Option(help="Channels of the first layer (default: 64, as published)."),
-    ] = None,
-    fourier_levels: Annotated[
-        int | None, typer.Option(help="Of the depth's encoding, -1: none (default: 12).")
-    ] = None,
-    reflectance: Annotated[
-        bool | None,
-        typer.Option("--reflectance", help="Show the network the LiDAR's intensity too."),
-    ] = None,
-    context: Annotated[
-        str | None,
-        typer.Option(metavar="lidar|rgb", help="What the context encoder reads (default: lidar)."),
-    ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="Of the recurrent update (default: 12).")
-    ] = None,
-    crop_px: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HxW|none", help="Random crops, at full resolution (default: 320x960)."
-        ),
-    ] = None,
-    half_resolution: Annotated[
-        bool | None, typer.Option("--half-resolution", help="Halve the images.")
-    ] = None,
-    learning_rate: Annotated[
-        float | None, typer.Option(help="Peak of the one-cycle (default: 3e-4).")
-    ] = None,
-    warm_up_share: Annotated[
-        float | None, typer.Option(help="Of the steps, until that peak (default: 0.4).")
-    ] = None,
-    correlation_weight: Annotated[
-        float | None,
-        typer.Option(
-            help="Of a loss on the correlation itself (default: 0; 0.3 for short trainings)."
-        ),
-    ] = None,
-    correlation_steps: Annotated[
-        int | None, typer.Option(help="Steps at first with that loss alone (default: 0).")
-    ] = None,
     validate_every: Annotated[
-        int, typer.Option(min=1, help="Steps; the weights are written then.")
+        int, typer.Option(min=1, help="Steps between validations; each writes the weights.")
     ] = 500,
-    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.")] = "auto",
-    seed: SeedOption = 0,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.")] = "auto",
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed, instead of that of the settings.")
+    ] = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on where FILE stopped, with the settings in it."),
+        typer.Option("--resume", help="Continue the training that wrote FILE, with its settings."),
     ] = False,
 ) -> None:
     """Train a CMRNext network by perturbing trusted extrinsics."""
     from calibgraph.cli.tables import print_validation
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
-    from calibgraph.matching.cmrnext.training.scenes import split, trusted_dataset
-    from calibgraph.matching.cmrnext.training.settings import parsed_crop
+    from calibgraph.matching.cmrnext.training.run import SETTINGS_SUFFIX
+    from calibgraph.matching.cmrnext.training.scenes import load_trusted_dataset, split
+    from calibgraph.matching.cmrnext.training.settings import load_settings
 
-    settings: dict[str, Any] = {
-        "rotation_deg": rotation_deg,
-        "translation_m": translation_m,
-        "steps": steps,
-        "batch": batch,
-        "iterations": iterations,
-        "learning_rate": learning_rate,
-        "warm_up_share": warm_up_share,
-        "correlation_weight": correlation_weight,
-        "correlation_steps": correlation_steps,
-        "crop_px": crop_px,
-        "half_resolution": half_resolution,
-        "width": width,
-        "fourier_levels": fourier_levels,
-        "reflectance": reflectance,
-        "context": context,
-        "seed": seed or None,
-        "from": start,
-    }
-    given = {key: value for key, value in settings.items() if value is not None}
+    given = {"settings": settings, "seed": seed, "from": start}
     with checked_arguments():
-        if resume and given:
-            option = next(iter(given)).replace("_", "-")
-            raise ValueError(f"--{option}: --resume goes on with the settings in {out}; leave out")
-        given.pop("from", None)
-        if crop_px is not None:
-            given["crop_px"] = parsed_crop(crop_px)
-        chosen = TrainSettings().changed(**given)
+        for option, value in given.items():
+            if resume and value is not None:
+                raise ValueError(
+                    f"--{option}: --resume goes on with the settings in {out}; leave out"
+                )
+        if (
+            settings is not None
+            and settings.resolve() == out.with_suffix(SETTINGS_SUFFIX).resolve()
+        ):
+            raise ValueError(f"--settings {settings}: would be written over; choose another name")
+        chosen = TrainSettings() if settings is None else load_settings(settings)
+        chosen = chosen if seed is None else chosen.changed(seed=seed)
     trusted = load_rig(rig) if rig else None
-    data = [trusted_dataset(folder, trusted) for folder in dataset]
+    data = [load_trusted_dataset(folder, trusted) for folder in dataset]
     if held_out:
-        others = [trusted_dataset(folder, trusted) for folder in held_out]
+        others = [load_trusted_dataset(folder, trusted) for folder in held_out]
     else:
         data, others = split(data)
     console = terminal()

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and those of the learned matcher."""
+"""Arguments and options that commands share, and those of the matchers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DatasetArgument = Annotated[
     typer.Argument(
         metavar="DATASET...",
         help="Dataset folder (rig.yaml, lidar/, cameras/NAME/) or KITTI odometry sequence; "
-        "several of one rig form one problem.",
+        "several of one rig are calibrated together.",
     ),
 ]
 RigOption = Annotated[
@@ -28,8 +28,8 @@ SearchDegOption = Annotated[
     str | None,
     typer.Option(
         metavar="DEG|none",
-        help="How far the guess may be off, per axis; none: no search, the guess is within about "
-        "2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
+        help="Largest rotation error of the guess, per axis; none: no search, for a guess within "
+        "about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
         rich_help_panel=_STRUCTURE,
     ),
 ]
@@ -38,7 +38,7 @@ SearchMetresOption = Annotated[
     typer.Option(
         "--search-m",
         metavar="M|none",
-        help="The same of the translation. (default: 1.5)",
+        help="Largest translation error of the guess, per axis; or none. (default: 1.5)",
         rich_help_panel=_STRUCTURE,
     ),
 ]
@@ -47,7 +47,7 @@ TimeLimitOption = Annotated[
     typer.Option(
         min=0.001,
         metavar="SECONDS",
-        help="Stop matching when it is over; a result of fewer rounds is said to be partial.",
+        help="Stop matching after this time; a result of fewer rounds is marked as partial.",
     ),
 ]
 _CMRNEXT = "Matcher cmrnext"
@@ -55,8 +55,8 @@ WeightsOption = Annotated[
     list[Path] | None,
     typer.Option(
         metavar="FILE...",
-        help="Weights of the networks, .tar or .safetensors, in the order in which they are run; "
-        "a file may come again: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
+        help="Weights of the networks, .tar or .safetensors, in the order in which they run; a "
+        "file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
         rich_help_panel=_CMRNEXT,
     ),
 ]
@@ -64,20 +64,20 @@ EstimateOption = Annotated[
     str | None,
     typer.Option(
         metavar="frame|joint",
-        help="What a network starts from: each frame's own pose by the network before (default), "
-        "or the joint solve over all frames and cameras.",
+        help="Where a network starts: at each frame's own pose from the previous network "
+        "(default), or at the joint solve over all frames and cameras.",
         rich_help_panel=_CMRNEXT,
     ),
 ]
 DeviceOption = Annotated[
-    str, typer.Option(metavar="auto|cpu|cuda", help="Of torch.", rich_help_panel=_CMRNEXT)
+    str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.", rich_help_panel=_CMRNEXT)
 ]
 IterationsOption = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=1000,
-        help="Of each network's recurrent update (default: 12).",
+        help="Iterations of each network's recurrent update (default: 12).",
         rich_help_panel=_CMRNEXT,
     ),
 ]
@@ -85,7 +85,8 @@ HalfOption = Annotated[
     bool | None,
     typer.Option(
         "--half-resolution/--full-resolution",
-        help="Halve the images or not (default: as the weights say, else from 1400 px width on).",
+        help="Halve the images or not (default: as stored with the weights, else from 1400 px "
+        "width on).",
         rich_help_panel=_CMRNEXT,
     ),
 ]
@@ -93,14 +94,16 @@ OcclusionOption = Annotated[
     bool | None,
     typer.Option(
         "--occlusion-filter",
-        help="Leave out points seen through something nearer.",
+        help="Leave out points that nearer surfaces occlude.",
         rich_help_panel=_CMRNEXT,
     ),
 ]
 BatchOption = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Images at once (default: 1 on a CPU, 4 on a GPU).", rich_help_panel=_CMRNEXT
+        min=1,
+        help="Images per batch (default: 1 on a CPU, 4 on a GPU).",
+        rich_help_panel=_CMRNEXT,
     ),
 ]
 FramesOption = Annotated[
@@ -128,8 +131,17 @@ BootstrapOption = Annotated[
     typer.Option(
         min=2,
         max=100_000,
-        help="Check the error bar: solve N times with frames drawn with replacement.",
+        help="Check the covariance: solve N times with frames drawn with replacement.",
     ),
 ]
-SeedOption = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")]
+_MAX_SEED = 2**31 - 1
+SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
+ConfigSeedOption = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=_MAX_SEED,
+        help="Seed of everything random. (default: that of --config, else 0)",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]

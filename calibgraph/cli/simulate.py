@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import SeedOption
-from calibgraph.cli.support import checked_arguments, progress_bar, terminal
+from calibgraph.cli.terminal import progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
 
 STREET = "street"
-RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # of the street, unless the user says otherwise
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of the street
 _STREET = "Scenario street"
 
 
@@ -24,9 +25,9 @@ def simulate(
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="street: a rig drives along a procedural street; a dataset of scans and images. "
-            "kitti, walkley, surround, fisheye: a table of correspondences, of a matcher that errs "
-            "as the paper's does (kitti, walkley) or in between.",
+            help="street: a dataset of scans and images of a drive along a procedural street. "
+            "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
+            "paper's matcher (kitti, walkley) or in between.",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
@@ -34,36 +35,36 @@ def simulate(
         str | None,
         typer.Option(
             metavar="NAME|RIG",
-            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), or a rig "
-            f"file of your own; its poses are the truth. (default: {RIG})",
+            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), sample "
+            f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
             rich_help_panel=_STREET,
         ),
     ] = None,
-    frames: Annotated[int, typer.Option(help="How many, at different places.")] = 10,
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 10,
     rotation_deg: Annotated[
-        float, typer.Option(min=0, help="Angle by which the guess, rig.yaml, is off.")
+        float, typer.Option(min=0, help="Rotation error of the guess, rig.yaml.")
     ] = 5.0,
     translation_m: Annotated[
-        float, typer.Option(min=0, help="Length by which the guess is off.")
+        float, typer.Option(min=0, help="Translation error of the guess.")
     ] = 0.3,
     seed: SeedOption = 0,
     beams: Annotated[
         int | None,
         typer.Option(
-            metavar="16|64|128",
-            help=f"Of the LiDAR. (default: {BEAMS})",
+            metavar="16|32|64|128",
+            help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
             rich_help_panel=_STREET,
         ),
     ] = None,
     step_m: Annotated[
         float | None,
         typer.Option(
-            help=f"Between two frames, on average. (default: {STEP_M:g})",
+            help=f"Mean distance between frames. (default: {STEP_M:g})",
             rich_help_panel=_STREET,
         ),
     ] = None,
 ) -> None:
-    """Make data with a known truth, reference.yaml, and a guess that is off, rig.yaml."""
+    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.scenarios import simulate_table
 
@@ -102,7 +103,7 @@ def _refuse_options_of_street(scenario: str, given: Mapping[str, object]) -> Non
     named = [option for option, value in given.items() if value is not None]
     if named and scenario_of(scenario):
         raise ValueError(
-            f"scenario {scenario!r} has a rig and a matcher of its own, {' and '.join(named)} "
+            f"scenario {scenario!r} has its own rig and matcher, {' and '.join(named)} "
             f"would change nothing; leave it out, or simulate {STREET!r}"
         )
 

@@ -1,4 +1,4 @@
-"""Results as tables for a terminal. Degrees and centimetres, because people read these."""
+"""Results as tables for a terminal, in degrees and centimetres."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from calibgraph.cli.terminal import print_plain
 from calibgraph.model.calibration import (
     FRAMES_SENTENCE,
     Array,
@@ -21,10 +22,10 @@ from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 
 if TYPE_CHECKING:
     from calibgraph.evaluation.paper import Report, Row
-    from calibgraph.evaluation.tune import Tuned
+    from calibgraph.evaluation.tune import TuningResult
     from calibgraph.matching.cmrnext.training.validation import Validation
 
-MOST_REASONS = 16  # the worst come first
+MAX_REASONS = 16  # the worst come first
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 
@@ -33,15 +34,14 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     status = result.verdict.status
     console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
     reasons = result.verdict.reasons
-    for reason in reasons[:MOST_REASONS]:
-        console.print(f"  {reason}", highlight=False, markup=False, soft_wrap=True)
-    if len(reasons) > MOST_REASONS:
-        more = f"  and {len(reasons) - MOST_REASONS} more: see camera_verdicts in calibration.yaml"
-        console.print(more, highlight=False)
-    for name, words in result.weaknesses.items():
-        if words:
-            text = f"  {name}: {'; '.join(words)}"
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
+    for reason in reasons[:MAX_REASONS]:
+        print_plain(console, f"  {reason}")
+    if len(reasons) > MAX_REASONS:
+        more = len(reasons) - MAX_REASONS
+        print_plain(console, f"  and {more} more: see camera_verdicts in calibration.yaml")
+    for name, sentences in result.weaknesses.items():
+        if sentences:
+            print_plain(console, f"  {name}: {'; '.join(sentences)}")
     console.print(result_table(result))
     console.print(
         "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
@@ -49,43 +49,43 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     )
     console.print(error_bar_table(result))
     console.print(
-        "one standard deviation: scatter between frames, and what the matcher says its frames "
-        "share; wrong intrinsics are not in it; A->B: of the transform from A to B, in B's axes"
+        "one standard deviation: scatter between frames, and the error that the matcher reports as "
+        "common to its frames; errors of the intrinsics are not included; A->B: of the transform "
+        "from A to B, in B's axes"
     )
     time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
     console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
-        console.print(f"  {path}", highlight=False, soft_wrap=True, markup=False)
+        print_plain(console, f"  {path}")
 
 
 def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:
-    """Print what a file of weights holds."""
-    console.print(f"{summary['file']}: CMRNext, {summary['parameters']} parameters", markup=False,
-                  soft_wrap=True, highlight=False)  # fmt: skip
+    """Print the content of a file of weights."""
     network = ", ".join(f"{key} {value}" for key, value in summary["network"].items())
     config = ", ".join(f"{key} {value}" for key, value in summary["config"].items())
+    print_plain(console, f"{summary['file']}: CMRNext, {summary['parameters']} parameters")
     for line in (f"sha256 {summary['sha256']}", f"network: {network}", f"config: {config}"):
-        console.print(f"  {line}", markup=False, soft_wrap=True, highlight=False)
+        print_plain(console, f"  {line}")
     if converted is not None:
-        console.print(f"{converted}: written", markup=False, soft_wrap=True, highlight=False)
+        print_plain(console, f"{converted}: written")
 
 
 def print_validation(console: Console, validation: Validation) -> None:
-    """Print how a network in training does on frames held out."""
+    """Print the errors of a network in training, on held-out frames."""
     v = validation
-    console.print(
+    print_plain(
+        console,
         f"step {v.step}: loss {v.train_loss:.4g}; held out: flow error {v.epe_px:.2f} px (median "
         f"{v.median_px:.2f}) of {v.zero_px:.2f}; pose of a frame {v.pose_deg:.3f} deg "
         f"{v.pose_cm:.1f} cm of {v.start_deg:.3f} deg {v.start_cm:.1f} cm (medians; "
         f"{v.failed_share:.0%} failed)",
-        markup=False, soft_wrap=True, highlight=False,
-    )  # fmt: skip
+    )
 
 
 def result_table(result: Calibration) -> Table:
-    """One row per camera: verdict, error bar, how far it moved, residuals and matches."""
+    """One row per camera: verdict, change from the guess, residuals and matches."""
     table = _table("Calibration", "camera", "verdict")
-    _add_numbers(
+    _add_number_columns(
         table, "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior"
     )
     for name, T in result.T_camera_lidar.items():
@@ -109,14 +109,14 @@ def result_table(result: Calibration) -> Table:
 def error_bar_table(result: Calibration) -> Table:
     """One row per camera and per pair of cameras: a standard deviation per axis."""
     table = _table("Error bar, along the axes of the camera", "camera")
-    _add_numbers(
+    _add_number_columns(
         table,
         "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
     )  # fmt: skip
     for name in (*result.covariance, *result.pair_covariance):
         sigmas = result.sigmas(name)
         if sigmas is None:
-            table.add_row(escape(name), "too few", "frames", "to say", "", "", "")
+            table.add_row(escape(name), "too few", "frames", "", "", "", "")
         else:
             table.add_row(escape(name), *_sigma_cells(*sigmas))
     for name, covariance in result.bootstrap.items():
@@ -130,31 +130,31 @@ def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:
 
 
 def _table(title: str, *names: str) -> Table:
-    """An empty table, narrow enough that numbers are whole on 80 columns."""
+    """An empty table, narrow enough not to cut numbers on 80 columns."""
     table = Table(title=title, box=SIMPLE, padding=0)
     for name in names:
         table.add_column(name, no_wrap=True)
     return table
 
 
-def _add_numbers(table: Table, *headings: str) -> None:
+def _add_number_columns(table: Table, *headings: str) -> None:
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
 
 
 def print_evaluation(console: Console, errors: Evaluation, estimate: Path, reference: Path) -> None:
-    """Print the errors, and which two files they are between."""
+    """Print the errors, and the two files that were compared."""
     console.print(evaluation_table(errors))
     for what, path in (("estimate", estimate), ("reference", reference)):
-        console.print(f"{what}: {path}", highlight=False, soft_wrap=True, markup=False)
+        print_plain(console, f"{what}: {path}")
     if errors.pairs:
-        console.print("A->B: of the transform from A to B, in the axes of B", highlight=False)
+        print_plain(console, "A->B: of the transform from A to B, in the axes of B")
 
 
 def evaluation_table(errors: Evaluation) -> Table:
     """One row per camera and per pair of cameras."""
     table = _table("Estimate - reference, in the axes of the camera", "camera")
-    _add_numbers(
+    _add_number_columns(
         table,
         "E_R\ndeg", "E_t\ncm", "x\ncm", "y\ncm", "z\ncm",
         "roll\ndeg", "pitch\ndeg", "yaw\ndeg",
@@ -182,7 +182,7 @@ def print_bench(console: Console, report: Report) -> None:
     for block in report.blocks:
         title = f"{report.data}, N = {block.frames}, {block.draws} draws, against {block.reference}"
         table = _table(escape(title), "worst camera: median, 95 %")
-        _add_numbers(table, "E_R deg", "", "E_t cm", "", "failed")
+        _add_number_columns(table, "E_R deg", "", "E_t cm", "", "failed")
         for name, row in block.rows.items():
             cells = [*_worst(row, "rotation_error_deg", 3), *_worst(row, "translation_error_cm", 2)]
             table.add_row(escape(name), *cells, str(row.failed) if row.failed else "")
@@ -190,7 +190,7 @@ def print_bench(console: Console, report: Report) -> None:
 
 
 def _worst(row: Row, metric: str, digits: int) -> list[str]:
-    """Median and 95 % quantile of the camera that errs most."""
+    """Median and 95 % quantile of the camera with the largest median error."""
     found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
     if not found:
         return ["-", "-"]
@@ -198,14 +198,14 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
     return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
 
 
-def print_tuned(console: Console, tuned: Tuned) -> None:
+def print_tuned(console: Console, tuned: TuningResult) -> None:
     """Print the scores of the best settings, the paper's and ``auto``."""
     table = _table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
-    _add_numbers(table, "lambda", "mu", "delta", "tau", "tuning", "test")
+    _add_number_columns(table, "lambda", "mu", "delta", "tau", "tuning", "test")
     for row in (tuned.best, *tuned.others):
         c = row.config
-        sets = (c.prior_weight, c.relative_prior_weight, c.loss_scale_px, c.gate_px)
-        cells = ["by spread" if value is None else f"{value:g}" for value in sets]
+        values = (c.prior_weight, c.relative_prior_weight, c.loss_scale_px, c.gate_px)
+        cells = ["by spread" if value is None else f"{value:g}" for value in values]
         test = "-" if row.test is None else f"{row.test:.4f}"
         table.add_row(escape(row.name), *cells, f"{row.tuning:.4f}", test)
     console.print(table)

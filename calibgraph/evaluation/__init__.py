@@ -1,1 +1,1 @@
-"""How good it is, by the paper's protocol: our ways beside the paper's and simpler ones."""
+"""The paper's experiment: accuracy of our method beside the paper's solver and simpler methods."""

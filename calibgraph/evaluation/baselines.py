@@ -1,4 +1,4 @@
-"""What ours is compared with: the paper's own solver, one camera at a time, and a bound."""
+"""What our method is compared with: the paper's solver, one camera at a time, and a bound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.joint import solve_joint
@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 
 TRF_TOLERANCE = 1e-6
 TRF_MAX_EVALUATIONS = 2000
-_DIMENSIONS = 6  # of a pose
+_DIMENSIONS = 6  # of an extrinsic
 
 
 def paper_solve(
     rig: Rig, table: Correspondences, T_hat: Transforms, config: Config, terms: Terms
 ) -> Transforms:
-    """The paper's Stage 2 as it describes it: SciPy's TRF, fit, gate, refit, from Stage 1.
+    """The paper's Stage 2 as published: SciPy's TRF from Stage 1; fit, gate, refit.
 
     Args:
         rig: lenses, and the order of the cameras.
@@ -40,36 +40,36 @@ def paper_solve(
         T_hat: (4, 4) Stage-1 estimate of T_camera_lidar per camera; also the start.
         config: with ``loss_scale_px`` and ``gate_px``: the preset kitti or walkley, say. Its loss
             must be Cauchy's.
-        terms: which parts of the objective.
+        terms: terms of the objective.
 
     Returns:
         (4, 4) T_camera_lidar per camera.
 
     Raises:
-        ValueError: if the settings leave scales open, or have another loss.
+        ValueError: if the settings leave scales to the data, or have another loss.
     """
     if config.loss_scale_px is None or config.gate_px is None or config.loss != "cauchy":
         raise ValueError("the paper's solver needs a Cauchy loss, its loss_scale_px and a gate_px")
     if terms == "stage1":
         return dict(T_hat)
-    matches = camera_blocks(rig, table, config) if terms != "priors" else {}
-    first = _one_pass(matches, T_hat, T_hat, config, terms)
-    inside = {
-        name: m.without_outliers(first[name], m.scale(first[name], config))
-        for name, m in matches.items()
+    blocks = camera_blocks(rig, table, config) if terms != "priors" else {}
+    first = _minimize_pass(blocks, T_hat, T_hat, config, terms)
+    inliers = {
+        name: block.without_outliers(first[name], block.scale(first[name], config))
+        for name, block in blocks.items()
     }
-    return _one_pass(inside, first, T_hat, config, terms)
+    return _minimize_pass(inliers, first, T_hat, config, terms)
 
 
-def _one_pass(
-    matches: Mapping[str, CameraBlock],
+def _minimize_pass(
+    blocks: Mapping[str, CameraBlock],
     start: Transforms,
     T_hat: Transforms,
     config: Config,
     terms: Terms,
 ) -> Transforms:
     def residuals(T: Transforms) -> Array:
-        rows = [_weighted_residuals(m, T[name]) for name, m in matches.items()]
+        rows = [_weighted_residuals(block, T[name]) for name, block in blocks.items()]
         return np.concatenate([*rows, np.empty((0, 2))])
 
     def priors(T: Transforms) -> Array:
@@ -89,23 +89,23 @@ def _weighted_residuals(matches: CameraBlock, T_camera_lidar: Array) -> Array:
 
 
 def prior_rows(T: Transforms, T_hat: Transforms, config: Config) -> Array:
-    """Both priors of Eq. 5 as residuals: the sum of their squares are its two terms.
+    """Both priors of Eq. 5 as residuals; the sum of their squares is the prior terms.
 
     Args:
         T: (4, 4) T_camera_lidar per camera.
         T_hat: Stage-1 estimates; the relative prior is over each camera with the next.
         config: lambda and mu.
     """
-    hat, now = ({name: gtsam.Pose3(pose) for name, pose in p.items()} for p in (T_hat, T))
-    rows = [
-        np.sqrt(config.prior_weight) * gtsam.Pose3.Logmap(hat[name].inverse().compose(now[name]))
-        for name in hat
-    ]
-    for one, two in pairwise(hat):
-        relative = hat[two].compose(hat[one].inverse())
-        step = relative.inverse().compose(now[two].compose(now[one].inverse()))
-        rows.append(np.sqrt(config.relative_prior_weight) * gtsam.Pose3.Logmap(step))
+    rows = [np.sqrt(config.prior_weight) * _log(invert(T_hat[a]) @ T[a]) for a in T_hat]
+    for a, b in pairwise(T_hat):
+        T_hat_b_a, T_b_a = relative_transform(T_hat[b], T_hat[a]), relative_transform(T[b], T[a])
+        rows.append(np.sqrt(config.relative_prior_weight) * _log(invert(T_hat_b_a) @ T_b_a))
     return np.concatenate(rows)
+
+
+def _log(T: Array) -> Array:
+    """(6,) logarithm of a (4, 4) transform: rotation [rad], translation [m]."""
+    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T)))
 
 
 def minimize_trf(
@@ -119,47 +119,49 @@ def minimize_trf(
 
     Axis-angle and translation per camera, tolerances of 1e-6, at most 2000 evaluations, a Jacobian
     by differences. SciPy's own losses are of single components and would take in the priors, so
-    Cauchy's is put into the residuals: r_k sqrt(rho(|r_k|^2)) / |r_k|, whose square is rho. That
-    serves TRF well; with the lengths |r_k| as residuals it needs up to thirty times as many
-    evaluations, and stops farther from the minimum.
+    Cauchy's is put into the residuals: r_k sqrt(rho(|r_k|^2)) / |r_k|, whose square is rho. With
+    the lengths |r_k| as residuals TRF needs up to thirty times as many evaluations, and stops
+    farther from the minimum.
 
     Args:
-        residuals: (n, 2) weighted residuals at some poses [px].
+        residuals: (n, 2) weighted residuals at given extrinsics [px].
         priors: (m,) residuals of the priors there.
         start: (4, 4) T_camera_lidar per camera.
         scale_px: delta.
     """
     names = list(start)
 
-    def stacked(x: Array) -> Array:
-        T = _unpacked(names, x)
-        return np.concatenate([_with_cauchy(residuals(T), scale_px).ravel(), priors(T)])
+    def stack(x: Array) -> Array:
+        T = _unpack(names, x)
+        return np.concatenate([_apply_cauchy(residuals(T), scale_px).ravel(), priors(T)])
 
-    x0 = np.concatenate([_six(T) for T in start.values()])
+    x0 = np.concatenate([_pack(T) for T in start.values()])
     found = least_squares(
-        stacked, x0, method="trf", ftol=TRF_TOLERANCE, xtol=TRF_TOLERANCE,
+        stack, x0, method="trf", ftol=TRF_TOLERANCE, xtol=TRF_TOLERANCE,
         max_nfev=TRF_MAX_EVALUATIONS,
     )  # fmt: skip
-    return _unpacked(names, found.x)
+    return _unpack(names, found.x)
 
 
-def _with_cauchy(r: Array, scale_px: float) -> Array:
-    """(n, 2) residuals, made so long that their squares are rho(|r|^2) = delta^2 log(1 + s)."""
+def _apply_cauchy(r: Array, scale_px: float) -> Array:
+    """(n, 2) residuals scaled so that their squares are rho(|r|^2) = delta^2 log(1 + s)."""
     s = np.maximum(np.einsum("ij,ij->i", r, r) / scale_px**2, np.finfo(float).eps)
     return np.asarray(r * np.sqrt(np.log1p(s) / s)[:, None])
 
 
-def _six(T: Array) -> Array:
+def _pack(T: Array) -> Array:
+    """(6,) axis-angle [rad] and translation [m] of a (4, 4)."""
     return np.append(Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3])
 
 
-def _unpacked(names: list[str], x: Array) -> Transforms:
-    poses = {}
+def _unpack(names: list[str], x: Array) -> Transforms:
+    """The (4, 4) of each camera from (6 N,) axis-angles and translations."""
+    T = {}
     for name, six in zip(names, x.reshape(-1, _DIMENSIONS), strict=True):
-        poses[name] = np.eye(4)
-        poses[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
-        poses[name][:3, 3] = six[3:]
-    return poses
+        T[name] = np.eye(4)
+        T[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
+        T[name][:3, 3] = six[3:]
+    return T
 
 
 def per_camera_adjustment(
@@ -171,25 +173,26 @@ def per_camera_adjustment(
         rig: lenses and the guess; its relative poses are not used.
         table: correspondences.
         config: with the scales of the loss and the gate.
-        pairwise: estimates of all cameras, if it is known.
+        pairwise: Stage 1 of all cameras; computed if None.
     """
-    poses: Transforms = {}
+    T_camera_lidar: Transforms = {}
     for name, camera in rig.cameras.items():
         alone = Rig(lidar=rig.lidar, cameras={name: camera})
         rows = table.of_camera(name)
         own = replace(rows, cameras=(name,), camera_index=np.zeros_like(rows.camera_index))
-        poses |= solve_joint(alone, own, config, "reprojection", pairwise=pairwise).T_camera_lidar
-    return poses
+        solution = solve_joint(alone, own, config, "reprojection", pairwise=pairwise)
+        T_camera_lidar |= solution.T_camera_lidar
+    return T_camera_lidar
 
 
 def oracle_solve(rig: Rig, table: Correspondences, truth: Transforms, config: Config) -> Transforms:
-    """About a bound: the reprojection term with weights that only a simulation can know.
+    """An approximate bound: the reprojection term with weights computed from the truth.
 
-    Every frame of a camera is weighted by the inverse of what its matches say wrongly: the mean
-    square of their noise, plus the mean square error of the frame's own pose in units of a single
-    match. Both are measured at the true poses. The fit starts there; loss and gate follow the
-    residuals' own spread, as with ``auto``. An error that all frames share is beyond weights, and
-    frames that make up for it by errors of their own are then preferred.
+    Every frame of a camera is weighted by the inverse mean square error of its matches: that of
+    their noise, plus that of the frame's own optimum in units of a single match. Both are measured
+    at the true extrinsics. The fit starts there; loss and gate follow the residuals' spread, as
+    with ``auto``. Weights cannot remove an error that is common to all frames; frames whose own
+    errors happen to compensate for it then get too much weight.
 
     Args:
         rig: lenses, and the order of the cameras.
@@ -197,22 +200,26 @@ def oracle_solve(rig: Rig, table: Correspondences, truth: Transforms, config: Co
         truth: (4, 4) true T_camera_lidar per camera.
         config: settings; those of the preset ``auto``, say.
     """
-    matches = {
-        name: m.weighted(oracle_weights(m, truth[name]))
-        for name, m in camera_blocks(rig, table, config).items()
+    blocks = {
+        name: block.with_weights(oracle_weights(block, truth[name]))
+        for name, block in camera_blocks(rig, table, config).items()
     }
     alone = Rig(lidar=rig.lidar, cameras=rig.cameras)
-    objective = Objective(alone, matches, {}, config, "reprojection")
-    poses, scales = objective.minimize_with_scale(truth)
-    return objective.without_outliers(poses, scales).minimize(poses, scales).T_camera_lidar
+    objective = Objective(alone, blocks, {}, config, "reprojection")
+    rough, scales = objective.minimize_with_scale(truth)
+    return objective.without_outliers(rough, scales).minimize(rough, scales).T_camera_lidar
 
 
 def oracle_weights(matches: CameraBlock, T_camera_lidar: Array) -> Array:
-    """(n,) a weight per match, alike in a frame and at most 1, from the true pose.
+    """(n,) a weight per match, equal within a frame and at most 1.
 
-    With the spread s of a frame's residuals and, for its own pose, the squared error b^T H^-1 b
-    over 6 (one Gauss-Newton step from the truth), it is 1 / (s^2 + b^T H^-1 b / 6): for a frame
-    that errs by noise alone the second is s^2 on average.
+    It is 1 / (s^2 + b^T H^-1 b / 6), with the spread s of the frame's residuals and the squared
+    error b^T H^-1 b of its own optimum (one Gauss-Newton step from the truth). With independent
+    noise alone the second term is s^2 on average.
+
+    Args:
+        matches: of one camera.
+        T_camera_lidar: (4, 4) the truth.
     """
     weights = []
     for edge in pairwise(matches.frame_edges):
@@ -220,7 +227,7 @@ def oracle_weights(matches: CameraBlock, T_camera_lidar: Array) -> Array:
         spread = robust_spread(part.sizes(T_camera_lidar)[1])
         block = replace(part.block, scale=CAUCHY_SCALE_SIGMAS * max(spread, part.least_spread))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar))
-        wrong = sums.gradient @ np.linalg.pinv(sums.hessian, hermitian=True) @ sums.gradient
-        weights.append(1 / (spread**2 + wrong / _DIMENSIONS + part.least_spread**2))
+        squared_error = sums.gradient @ np.linalg.pinv(sums.hessian, hermitian=True) @ sums.gradient
+        weights.append(1 / (spread**2 + squared_error / _DIMENSIONS + part.least_spread**2))
     each = np.repeat(weights, np.diff(matches.frame_edges))
     return np.asarray(each / each.max())

@@ -1,4 +1,4 @@
-"""The rows of the benchmark: what each way makes of one draw."""
+"""The rows of the experiment: every method, applied to one draw."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.evaluation.baselines import oracle_solve, paper_solve, per_camera_adjustment
-from calibgraph.evaluation.sources import Sample
+from calibgraph.evaluation.sources import Draw
 from calibgraph.model.config import Config, Terms, preset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_transform
@@ -39,90 +39,91 @@ HEADLINE = "ours (auto): full"
 RELATIVE = "ours (auto): full, relative pose known"
 ORACLE = "oracle weights"
 RELATIVE_SIGMA_RAD, RELATIVE_SIGMA_M = 1e-3, 2e-3
-"""Noise, per axis, of the relative poses that are known from elsewhere; and what they say of it."""
+"""Noise per axis of the given relative poses, which state it as their sigmas."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
-    """One draw, preprocessed once, with its Stage 1, for all ways.
+class PreparedDraw:
+    """One draw, preprocessed once for all methods.
 
     Attributes:
-        sample: the draw.
+        draw: the draw.
         theirs: the paper's settings.
         ours: our settings.
         seed: of the noise of the relative poses.
         table: what the preprocessing keeps with the paper's settings.
     """
 
-    sample: Sample
+    draw: Draw
     theirs: Config
     ours: Config
     seed: int
     table: Correspondences
 
     @staticmethod
-    def of(sample: Sample, theirs: Config, seed: int) -> Bench:
+    def prepare(draw: Draw, theirs: Config, seed: int) -> PreparedDraw:
         """Preprocess with the paper's settings; ours are those of the preset ``auto``."""
-        ours = preset("auto").changed(stage1="rig" if sample.matched else "pnp", seed=theirs.seed)
-        return Bench(sample, theirs, ours, seed, preprocess(sample.rig, sample.table, theirs).table)
+        ours = preset("auto").changed(stage1="rig" if draw.matched else "pnp", seed=theirs.seed)
+        table = preprocess(draw.rig, draw.table, theirs).table
+        return PreparedDraw(draw, theirs, ours, seed, table)
 
-    def aggregated(self, how: str) -> Transforms:
+    def aggregate_pnp(self, how: str) -> Transforms:
         """Per-frame PnP, aggregated over frames; the paper's Stage 1 is the median.
 
         Raises:
-            CorrespondenceError: if PnP gave a camera no pose.
+            CorrespondenceError: if PnP finds no extrinsic of a camera.
         """
-        found = self.sample.stage1(self.theirs)
-        for name in self.sample.rig.cameras:
+        found = self.draw.stage1(self.theirs)
+        for name in self.draw.rig.cameras:
             if name not in found or not len(found[name].per_frame):
-                raise CorrespondenceError(f"PnP gives camera {name!r} no pose", camera=name)
-        return {name: aggregate(found[name].per_frame, how) for name in self.sample.rig.cameras}
+                raise CorrespondenceError(f"PnP finds no extrinsic of camera {name!r}", camera=name)
+        return {name: aggregate(found[name].per_frame, how) for name in self.draw.rig.cameras}
 
-    def one_frame(self) -> Transforms:
-        """PnP of the first frame that it gives a pose of."""
-        _ = self.aggregated("median")  # there is one
-        found = self.sample.stage1(self.theirs)
-        return {name: camera.solved[min(camera.solved)] for name, camera in found.items()}
+    def pnp_of_first_frame(self) -> Transforms:
+        """PnP of the first frame in which it succeeds."""
+        self.aggregate_pnp("median")  # raises if there is none
+        found = self.draw.stage1(self.theirs)
+        return {name: camera.by_frame[min(camera.by_frame)] for name, camera in found.items()}
 
-    def of_paper(self, terms: Terms) -> Transforms:
+    def solve_as_paper(self, terms: Terms) -> Transforms:
         """The paper's solver, from its Stage 1."""
-        hat = self.aggregated("median")
-        return paper_solve(self.sample.rig, self.table, hat, self.theirs, terms)
+        hat = self.aggregate_pnp("median")
+        return paper_solve(self.draw.rig, self.table, hat, self.theirs, terms)
 
-    def of_ours(self, terms: Terms, rig: Rig | None = None) -> Transforms:
-        """Our solve with ``auto``, of the draw's rig or another."""
-        known = None if self.ours.stage1 == "rig" else self.sample.stage1(self.ours)
-        rig = rig or self.sample.rig
-        return solve_joint(rig, self.sample.table, self.ours, terms, pairwise=known).T_camera_lidar
+    def solve_jointly(self, terms: Terms, rig: Rig | None = None) -> Transforms:
+        """Our solve with the preset ``auto``, of the draw's rig or another one."""
+        known = None if self.ours.stage1 == "rig" else self.draw.stage1(self.ours)
+        rig = rig or self.draw.rig
+        return solve_joint(rig, self.draw.table, self.ours, terms, pairwise=known).T_camera_lidar
 
-    def each_alone(self) -> Transforms:
+    def solve_each_camera(self) -> Transforms:
         """Each camera alone, with the paper's scales."""
-        known = self.sample.stage1(self.theirs)
-        return per_camera_adjustment(
-            self.sample.rig, self.sample.table, self.theirs, pairwise=known
+        known = self.draw.stage1(self.theirs)
+        return per_camera_adjustment(self.draw.rig, self.draw.table, self.theirs, pairwise=known)
+
+    def solve_with_relative_poses(self) -> Transforms:
+        """Ours, with given relative poses of neighbouring cameras, with noise of their sigmas."""
+        truth = next(iter(self.draw.references.values()))
+        known = known_relative_poses(truth, self.seed)
+        return self.solve_jointly(
+            "full", self.draw.rig.model_copy(update={"relative_poses": known})
         )
 
-    def with_relative_poses(self) -> Transforms:
-        """Ours, with independently known relative poses of neighbours, that err by their sigmas."""
-        truth = next(iter(self.sample.references.values()))
-        known = known_relative_poses(truth, self.seed)
-        return self.of_ours("full", self.sample.rig.model_copy(update={"relative_poses": known}))
-
-    def bound(self) -> Transforms:
-        """With the weights that only the truth gives."""
-        truth = self.sample.references["truth"].T_camera_lidar
-        return oracle_solve(self.sample.rig, self.table, truth, self.ours)
+    def solve_with_oracle_weights(self) -> Transforms:
+        """The reprojection term with weights computed from the truth."""
+        truth = self.draw.references["truth"].T_camera_lidar
+        return oracle_solve(self.draw.rig, self.table, truth, self.ours)
 
 
 def known_relative_poses(truth: Rig, seed: int) -> tuple[RelativePose, ...]:
-    """Each camera with the next: the truth, with noise of 1 mrad and 2 mm per axis."""
+    """Of each camera with the next: the truth, with noise of 1 mrad and 2 mm per axis."""
     rng = np.random.default_rng([seed, 1])
     T = truth.T_camera_lidar
     pairs = []
     for a, b in pairwise(T):
         noise = np.eye(4)
-        turn = RELATIVE_SIGMA_RAD * rng.standard_normal(3)
-        noise[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        rotation = RELATIVE_SIGMA_RAD * rng.standard_normal(3)
+        noise[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
         noise[:3, 3] = RELATIVE_SIGMA_M * rng.standard_normal(3)
         T_a_b = noise @ relative_transform(T[a], T[b])
         pairs.append(RelativePose(a=a, b=b, T_a_b=T_a_b, rotation_sigma_rad=RELATIVE_SIGMA_RAD,
@@ -130,36 +131,42 @@ def known_relative_poses(truth: Rig, seed: int) -> tuple[RelativePose, ...]:
     return tuple(pairs)
 
 
-Way = Callable[[Bench], Transforms]
+Method = Callable[[PreparedDraw], Transforms]
 
-WAYS: dict[str, Way] = {
-    "PnP of one frame": Bench.one_frame,
-    STAGE1: lambda bench: bench.aggregated("median"),
-    "Stage 1: PnP, mean": lambda bench: bench.aggregated("mean"),
-    "Stage 1: PnP, mode": lambda bench: bench.aggregated("mode"),
-    **{row: partial(Bench.of_paper, terms=terms) for row, terms in TRF_TERMS.items()},
-    "per-camera BA": Bench.each_alone,
-    **{row: partial(Bench.of_ours, terms=terms) for row, terms in OUR_TERMS.items()},
-    RELATIVE: Bench.with_relative_poses,
-    ORACLE: Bench.bound,
+METHODS: dict[str, Method] = {
+    "PnP of one frame": PreparedDraw.pnp_of_first_frame,
+    STAGE1: partial(PreparedDraw.aggregate_pnp, how="median"),
+    "Stage 1: PnP, mean": partial(PreparedDraw.aggregate_pnp, how="mean"),
+    "Stage 1: PnP, mode": partial(PreparedDraw.aggregate_pnp, how="mode"),
+    **{row: partial(PreparedDraw.solve_as_paper, terms=terms) for row, terms in TRF_TERMS.items()},
+    "per-camera BA": PreparedDraw.solve_each_camera,
+    **{row: partial(PreparedDraw.solve_jointly, terms=terms) for row, terms in OUR_TERMS.items()},
+    RELATIVE: PreparedDraw.solve_with_relative_poses,
+    ORACLE: PreparedDraw.solve_with_oracle_weights,
 }
 """The rows, in order."""
 
 
-def run_all(bench: Bench, *, trf: bool) -> Iterator[tuple[str, Transforms | None, float]]:
-    """Every row with its poses, None where it found none, and the seconds that it took.
+def run_methods(
+    prepared: PreparedDraw, *, trf: bool
+) -> Iterator[tuple[str, Transforms | None, float]]:
+    """Every row with its T_camera_lidar, None if it failed, and its seconds.
 
-    The Stage 1 that several rows share is computed before, and not in their seconds.
+    The Stage 1 that several rows share is computed first and not part of their seconds.
+
+    Args:
+        prepared: the draw.
+        trf: whether to run the paper's solver.
     """
-    for config in (bench.theirs, bench.ours):
+    for config in (prepared.theirs, prepared.ours):
         if config.stage1 == "pnp":
-            bench.sample.stage1(config)
-    for row, way in WAYS.items():
-        if (row in TRF_TERMS and not trf) or (row == ORACLE and not bench.sample.simulated):
+            prepared.draw.stage1(config)
+    for row, method in METHODS.items():
+        if (row in TRF_TERMS and not trf) or (row == ORACLE and not prepared.draw.simulated):
             continue
         start = time.perf_counter()
         try:
-            poses = way(bench)
+            T_camera_lidar = method(prepared)
         except CorrespondenceError:
-            poses = None
-        yield row, poses, time.perf_counter() - start
+            T_camera_lidar = None
+        yield row, T_camera_lidar, time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""The benchmark's results as Markdown, JSON and a picture."""
+"""The experiment's report as Markdown, JSON and a plot."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ _HEADS = {
     "yaw_deg": "yaw [deg]", REPROJECTION: "reproj. [px]", IMPROVEMENT: "better than Stage 1 [px]",
 }  # fmt: skip
 _NOTES = """\
-Medians over the draws, in brackets what 90 % of them lie between (5 % and 95 % quantiles), over the
-draws in which a row found poses. Errors without signs. *paper*: the paper's published number for
-that row and N, of one run on its own data, which is not this data. All rows are given the same
-correspondences and the same guess.
+Medians over the draws in which the method found extrinsics, in brackets the 5 % and 95 % quantiles.
+Errors without signs. *paper*: the number that the paper publishes for this row and N, from one run
+on its own data, which is not this data. All rows have the same correspondences and the same guess.
 
 * Rows "paper (TRF)": the paper's objective, hyper-parameters and solver (SciPy), from its Stage 1.
-  By Eq. 5 the priors alone are least at Stage 1, so "priors only" repeats it; the paper's own
-  numbers for that row differ.
+  By Eq. 5 the priors alone have their minimum at Stage 1, so "priors only" repeats it; the paper's
+  own numbers for that row differ.
 * "per-camera BA": each camera alone, reprojection term only, the paper's scales, our solver.
-* "relative pose known": each camera's pose to the next is known from elsewhere, within 1 mrad and
-  2 mm per axis.
-* "oracle weights": every frame of a camera weighs the inverse mean square of how wrong it really
-  is, which only a simulation knows: about what weights can do. It is no strict bound where all
-  frames share an error: it then prefers frames whose own errors happen to make up for it.
+* "relative pose known": the relative pose of neighbouring cameras is given, within 1 mrad and 2 mm
+  per axis.
+* "oracle weights": every frame of a camera is weighted by its inverse mean square error, computed
+  from the simulation's truth: an approximate bound of what weights can achieve. It is not strict
+  where an error is common to all frames: frames whose own errors compensate for it get too much
+  weight.
 """
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-_SMALLEST = 1e-4  # deg or cm: what a logarithmic axis shows of nothing
-_INCHES = (3.3, 0.27, 2.6)  # per column, per row, for the names
+_MIN_SHOWN = 1e-4  # deg or cm: zero on a logarithmic axis
+_COLUMN_IN, _ROW_IN, _NAMES_IN = 3.3, 0.27, 2.6
 
 
 def write_report(report: Report, folder: Path) -> list[Path]:
@@ -65,7 +65,7 @@ def write_report(report: Report, folder: Path) -> list[Path]:
 
 
 def to_mapping(report: Report) -> dict[str, Any]:
-    """As plain values; times apart, so that the rest is the same for the same seed."""
+    """As plain values; times in their own key, so that the rest only depends on the seed."""
     content = asdict(report)
     content["seconds"] = [
         {"frames": b.frames, **{row: r.seconds for row, r in b.rows.items()}} for b in report.blocks
@@ -81,9 +81,9 @@ def markdown(report: Report) -> str:
     parts = [f"# {report.data}", _heading(report), _NOTES]
     for block in report.blocks:
         parts.append(f"## N = {block.frames}, against: {block.reference} ({block.draws} draws)")
-        for place, camera in enumerate(_cameras(block)):
+        for index, camera in enumerate(_cameras(block)):
             parts.append(f"### {camera}")
-            parts.append("\n".join(_camera_table(report, block, camera, place)))
+            parts.append("\n".join(_camera_table(report, block, camera, index)))
         parts.append("### Between cameras, and reprojection")
         parts.append("\n".join(_consistency_table(report, block)))
     return "\n\n".join(parts) + "\n"
@@ -93,11 +93,11 @@ def _heading(report: Report) -> str:
     return f"Settings of the paper's rows: preset {report.preset}. Seed {report.seed}."
 
 
-def _camera_table(report: Report, block: Block, camera: str, place: int) -> Iterator[str]:
+def _camera_table(report: Report, block: Block, camera: str, index: int) -> Iterator[str]:
     heads = ["method", *(_HEADS[m] for m in AXES), "paper E_t", "paper E_R", "failed", "s"]
     yield from _head(heads)
     for name, row in block.rows.items():
-        theirs = published(report.published_as, name, block.frames, place)
+        theirs = published(report.published_as, name, block.frames, index)
         yield _line([
             _name(name),
             *(_cell(row, camera, m) for m in AXES),
@@ -112,14 +112,14 @@ def _consistency_table(report: Report, block: Block) -> Iterator[str]:
     columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
     columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
     heads = [f"{name}: {_HEADS[m]}" for name, m in columns]
-    asked: list[tuple[int | str, str]] = [(PAIR, ROTATION), (PAIR, TRANSLATION)] * bool(pairs)
-    asked += [(place, REPROJECTION) for place in range(min(2, len(cameras)))]
-    paper = [f"paper {'between' if p == PAIR else cameras[int(p)]} {_HEADS[m]}" for p, m in asked]
+    theirs: list[tuple[int | str, str]] = [(PAIR, ROTATION), (PAIR, TRANSLATION)] * bool(pairs)
+    theirs += [(index, REPROJECTION) for index in range(min(2, len(cameras)))]
+    paper = [f"paper {'between' if c == PAIR else cameras[int(c)]} {_HEADS[m]}" for c, m in theirs]
     yield from _head(["method", *heads, *paper])
     for name, row in block.rows.items():
-        theirs = [published(report.published_as, name, block.frames, p).get(m) for p, m in asked]
-        cells = (_cell(row, who, m) for who, m in columns)
-        yield _line([_name(name), *cells, *(_number(value) for value in theirs)])
+        values = [published(report.published_as, name, block.frames, c).get(m) for c, m in theirs]
+        cells = (_cell(row, camera, m) for camera, m in columns)
+        yield _line([_name(name), *cells, *(_number(value) for value in values)])
 
 
 def _head(heads: Sequence[str]) -> Iterator[str]:
@@ -138,14 +138,14 @@ def _name(row: str) -> str:
 def _cell(row: Row, name: str, metric: str) -> str:
     if name not in row.numbers:
         return "failed"
-    found = row.numbers[name].get(metric)
-    if found is None or np.isnan(found.median):
+    values = row.numbers[name].get(metric)
+    if values is None or np.isnan(values.median):
         return "-"
-    return f"{_number(found.median)} ({_number(found.low)} to {_number(found.high)})"
+    return f"{_number(values.median)} ({_number(values.low)} to {_number(values.high)})"
 
 
 def _number(value: float | None) -> str:
-    """Three digits, as the paper writes numbers; nothing for none."""
+    """Three digits, as the paper writes numbers; empty for None."""
     if value is None:
         return ""
     digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1  # noqa: PLR2004 - digits
@@ -153,20 +153,20 @@ def _number(value: float | None) -> str:
 
 
 def _cameras(block: Block) -> list[str]:
-    return [name for name in _judged(block) if "->" not in name]
+    return [name for name in _names(block) if "->" not in name]
 
 
 def _pairs(block: Block) -> list[str]:
-    return [name for name in _judged(block) if "->" in name]
+    return [name for name in _names(block) if "->" in name]
 
 
-def _judged(block: Block) -> list[str]:
-    """Cameras and pairs, of the first row that found any."""
+def _names(block: Block) -> list[str]:
+    """Cameras and pairs, from the first row that did not always fail."""
     return next((list(row.numbers) for row in block.rows.values() if row.numbers), [])
 
 
 def _plot(report: Report, path: Path) -> None:
-    """E_t and E_R per camera, a line per way, a colour per N; against the first reference."""
+    """E_t and E_R per camera, a line per method, a colour per N; against the first reference."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -174,42 +174,44 @@ def _plot(report: Report, path: Path) -> None:
     blocks = [block for block in report.blocks if block.reference == first]
     cameras, rows = _cameras(blocks[0]), list(blocks[0].rows)
     columns = max(1, len(cameras))
-    width, height = _INCHES[2] + _INCHES[0] * columns, 2 * (_INCHES[1] * len(rows) + 0.8)
+    width, height = _NAMES_IN + _COLUMN_IN * columns, 2 * (_ROW_IN * len(rows) + 0.8)
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.subplots(2, columns, squeeze=False, sharey=True)
     for column, camera in enumerate(cameras):
         for line, metric in enumerate((TRANSLATION, ROTATION)):
-            _draw(grid[line, column], blocks, (camera, metric), rows)
+            _draw_panel(grid[line, column], blocks, (camera, metric), rows)
         grid[0, column].set_title(camera, fontsize=10)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(blocks), frameon=False)
     figure.savefig(path, format="png")
 
 
-def _draw(axes: Axes, blocks: Sequence[Block], what: tuple[str, str], rows: Sequence[str]) -> None:
+def _draw_panel(
+    axes: Axes, blocks: Sequence[Block], what: tuple[str, str], rows: Sequence[str]
+) -> None:
     """One panel: medians with their intervals."""
     camera, metric = what
     for index, block in enumerate(blocks):
         shift = 0.16 * (index - (len(blocks) - 1) / 2)
-        found: list[tuple[float, Interval]] = [
-            (place + shift, row.numbers[camera][metric])
-            for place, row in enumerate(block.rows.values())
+        places: list[tuple[float, Interval]] = [
+            (line + shift, row.numbers[camera][metric])
+            for line, row in enumerate(block.rows.values())
             if camera in row.numbers
         ]
-        middle = np.array([max(i.median, _SMALLEST) for _, i in found])
-        ends = np.array([[max(i.low, _SMALLEST), max(i.high, _SMALLEST)] for _, i in found])
+        middle = np.array([max(i.median, _MIN_SHOWN) for _, i in places])
+        ends = np.array([[max(i.low, _MIN_SHOWN), max(i.high, _MIN_SHOWN)] for _, i in places])
         spread = np.abs(ends.reshape(-1, 2).T - middle)
         axes.errorbar(
-            middle, [place for place, _ in found], xerr=spread, fmt="o", markersize=4, capsize=2,
+            middle, [place for place, _ in places], xerr=spread, fmt="o", markersize=4, capsize=2,
             color=_COLOURS[index % len(_COLOURS)], label=f"N = {block.frames}",
         )  # fmt: skip
     axes.set_xlabel(f"{_HEADS[metric]}, median and 90 % of the draws")
-    _with_scales(axes, rows)
+    _set_scales(axes, rows)
 
 
-def _with_scales(axes: Axes, rows: Sequence[str]) -> None:
-    """Plain numbers on a logarithmic axis; the names of the ways on the other."""
+def _set_scales(axes: Axes, rows: Sequence[str]) -> None:
+    """Plain numbers on the logarithmic x axis, the names of the methods on the other."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")

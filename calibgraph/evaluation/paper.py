@@ -1,4 +1,4 @@
-"""The paper's experiment over many draws: errors of every way, as medians with 90 % intervals."""
+"""The paper's experiment over many draws: each method's errors as medians with 90 % intervals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from calibgraph.evaluation.methods import STAGE1, Bench, run_all
+from calibgraph.evaluation.methods import STAGE1, PreparedDraw, run_methods
 from calibgraph.evaluation.sources import Source
 from calibgraph.model.config import Config
 from calibgraph.model.metrics import PoseError, evaluate
@@ -30,14 +30,14 @@ ROTATION, TRANSLATION = "rotation_error_deg", "translation_error_cm"
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One draw to be done, perhaps by another process.
+    """One draw to run, possibly in another process.
 
     Attributes:
-        source: where it comes from.
-        frames: how many.
-        seed: of everything in it.
+        source: of the draw.
+        frames: number of frames.
+        seed: of everything random in it.
         config: the paper's settings for it.
-        trf: whether SciPy's solver takes part.
+        trf: whether to run the paper's solver.
     """
 
     source: Source
@@ -48,11 +48,11 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """What all ways made of one draw.
+class DrawResult:
+    """The errors of all methods on one draw.
 
     Attributes:
-        numbers: per reference and row; None for a row that found no poses.
+        numbers: per reference and row; None for a row that failed.
         seconds: per row.
     """
 
@@ -62,7 +62,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Interval:
-    """A median over draws, and what 90 % of them lie between."""
+    """A median over draws with its 5 % and 95 % quantiles."""
 
     low: float
     median: float
@@ -71,11 +71,11 @@ class Interval:
 
 @dataclass(frozen=True)
 class Row:
-    """A way over all draws.
+    """One method over all draws.
 
     Attributes:
         numbers: per camera or pair, and metric.
-        failed: how many draws it found no poses in; they are not in the intervals.
+        failed: number of draws in which it failed; they are not in the intervals.
         seconds: median time of a draw.
     """
 
@@ -86,7 +86,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Block:
-    """All ways, for one number of frames and one reference."""
+    """All methods, for one number of frames and one reference."""
 
     frames: int
     reference: str
@@ -96,13 +96,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Report:
-    """The whole benchmark.
+    """The whole experiment.
 
     Attributes:
-        data: what was drawn from.
-        published_as: which of the paper's data it is to be compared with; may be none.
-        preset: the paper's settings that were used for its rows.
-        seed: of everything.
+        data: name of the source.
+        published_as: the paper's data set to compare with, or "".
+        preset: the paper's settings for its rows.
+        seed: of everything random.
         blocks: per number of frames and reference.
     """
 
@@ -114,11 +114,11 @@ class Report:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no way found poses in any draw."""
+        """Whether every method failed in every draw."""
         return all(row.failed == b.draws for b in self.blocks for row in b.rows.values())
 
 
-def bench_paper(
+def run_experiment(
     source: Source,
     *,
     frames: Sequence[int],
@@ -129,132 +129,140 @@ def bench_paper(
     trf: bool = True,
     progress: Progress = no_progress,
 ) -> Report:
-    """Run the paper's protocol: so many draws, each with a new guess, judged by its metrics.
+    """Run the paper's protocol: draws with a new guess each, evaluated by its metrics.
 
     Args:
-        source: what to draw from.
+        source: of the draws.
         frames: numbers of frames N.
         draws: of each N.
-        config: the paper's settings: for its solver and for what is solved camera by camera.
-        seed: of everything; the same gives the same numbers.
+        config: the paper's settings, for its solver and for the per-camera adjustment.
+        seed: of everything random; the same seed gives the same numbers.
         jobs: processes.
-        trf: whether the paper's own solver takes part, which takes minutes at N = 100.
-        progress: to be told.
+        trf: whether to run the paper's own solver, which takes minutes at N = 100.
+        progress: called with the number of draws done.
 
     Raises:
-        ValueError: if there is nothing to do.
+        ValueError: if there is no draw, no frame or no process.
     """
     if draws < 1 or jobs < 1 or not frames or min(frames) < 1:
         raise ValueError(f"nothing to do: {draws} draws of {list(frames)} frames in {jobs} jobs")
-    sizes = dict.fromkeys(source.frames_at(n) for n in frames)
+    sizes = dict.fromkeys(source.frame_count(n) for n in frames)
     tasks = [
         Task(source, n, seed=draw_seed(seed, n, index), config=config, trf=trf)
         for n in sizes
         for index in range(draws)
     ]
-    drawn = _run(tasks, jobs, progress)
+    results = _run(tasks, jobs, progress)
     blocks = [
         block
         for k, n in enumerate(sizes)
-        for block in _summaries(n, drawn[k * draws : (k + 1) * draws])
+        for block in _summarize(n, results[k * draws : (k + 1) * draws])
     ]
     return Report(source.name, source.published_as, config.preset, seed, tuple(blocks))
 
 
 def draw_seed(seed: int, frames: int, index: int) -> int:
-    """A seed of one draw."""
+    """The seed of one draw."""
     return int(np.random.SeedSequence([seed, frames, index]).generate_state(1)[0] >> 1)
 
 
-def _run(tasks: Sequence[Task], jobs: int, progress: Progress) -> list[Drawn]:
-    """All draws, in the order of the tasks."""
+def _run(tasks: Sequence[Task], jobs: int, progress: Progress) -> list[DrawResult]:
+    """The results of all draws, in the order of the tasks."""
     if jobs == 1:
         done = []
         for index, task in enumerate(tasks):
             progress(f"draws of {task.frames} frames", index, len(tasks))
-            done.append(one_draw(task))
+            done.append(run_draw(task))
         return done
     with ProcessPoolExecutor(min(jobs, len(tasks)), get_context("spawn")) as pool:
-        futures = [pool.submit(one_draw, task) for task in tasks]
+        futures = [pool.submit(run_draw, task) for task in tasks]
         for count, _ in enumerate(as_completed(futures), start=1):
             progress("draws", count, len(tasks))
         return [future.result() for future in futures]
 
 
-def one_draw(task: Task) -> Drawn:
-    """Draw, run every way, judge it."""
-    sample = task.source.draw(task.frames, task.seed)
-    bench = Bench.of(sample, task.config, task.seed)
-    matches = camera_blocks(sample.rig, bench.table, task.config)
-    numbers: dict[str, dict[str, Numbers | None]] = {name: {} for name in sample.references}
-    runs = list(run_all(bench, trf=task.trf))
-    medians_px = {
-        row: {} if poses is None else reprojection_px(matches, poses) for row, poses, _ in runs
+def run_draw(task: Task) -> DrawResult:
+    """Draw, run every method, compare it with every reference."""
+    draw = task.source.draw(task.frames, task.seed)
+    prepared = PreparedDraw.prepare(draw, task.config, task.seed)
+    blocks = camera_blocks(draw.rig, prepared.table, task.config)
+    runs = list(run_methods(prepared, trf=task.trf))
+    medians_px = {row: {} if T is None else reprojection_px(blocks, T) for row, T, _ in runs}
+    numbers: dict[str, dict[str, Numbers | None]] = {
+        name: {
+            row: None
+            if T is None
+            else absolute_errors(draw.rig, T, reference, medians_px[row], medians_px[STAGE1])
+            for row, T, _ in runs
+        }
+        for name, reference in draw.references.items()
     }
-    base, seconds = medians_px[STAGE1], {row: took for row, _, took in runs}
-    for row, poses, _ in runs:
-        medians = medians_px[row]
-        for name, reference in sample.references.items():
-            found = None if poses is None else judged(sample.rig, poses, reference, medians, base)
-            numbers[name][row] = found
-    return Drawn(numbers, seconds)
+    return DrawResult(numbers, {row: seconds for row, _, seconds in runs})
 
 
-def reprojection_px(matches: Mapping[str, CameraBlock], poses: Transforms) -> dict[str, float]:
+def reprojection_px(
+    blocks: Mapping[str, CameraBlock], T_camera_lidar: Transforms
+) -> dict[str, float]:
     """Per camera the median reprojection error of its preprocessed correspondences."""
-    return {name: float(np.median(m.errors_px(poses[name])[0])) for name, m in matches.items()}
+    return {
+        name: float(np.median(block.errors_px(T_camera_lidar[name])[0]))
+        for name, block in blocks.items()
+    }
 
 
-def judged(
+def absolute_errors(
     rig: Rig,
-    poses: Transforms,
+    T_camera_lidar: Transforms,
     reference: Rig,
     medians_px: Mapping[str, float],
     stage1_px: Mapping[str, float],
 ) -> Numbers:
-    """The paper's metrics, without signs, of poses against a reference.
+    """The paper's metrics of extrinsics against a reference, without signs.
 
     Args:
-        rig: the order of the cameras: of neighbours in it the relative pose is judged.
-        poses: T_camera_lidar per camera.
-        reference: to judge by.
+        rig: the order of the cameras; the relative pose is evaluated for neighbours in it.
+        T_camera_lidar: (4, 4) per camera.
+        reference: to compare with.
         medians_px: median reprojection error per camera.
         stage1_px: the same of Stage 1; empty if there is none.
     """
-    errors = evaluate(rig.moved_to(poses), reference)
-    found = {name: _without_signs(error) for name, error in errors.cameras.items()}
+    errors = evaluate(rig.moved_to(T_camera_lidar), reference)
+    metrics = {name: _without_signs(error) for name, error in errors.cameras.items()}
     for name, median in medians_px.items():
-        found[name][REPROJECTION] = median
-        found[name][IMPROVEMENT] = stage1_px.get(name, np.nan) - median
+        metrics[name][REPROJECTION] = median
+        metrics[name][IMPROVEMENT] = stage1_px.get(name, np.nan) - median
     for a, b in pairwise(rig.cameras):
-        found[f"{a}->{b}"] = _without_signs(errors.pairs[f"{a}->{b}"])
-    return found
+        metrics[f"{a}->{b}"] = _without_signs(errors.pairs[f"{a}->{b}"])
+    return metrics
 
 
 def _without_signs(error: PoseError) -> dict[str, float]:
     return {metric: abs(value) for metric, value in asdict(error).items()}
 
 
-def _summaries(frames: int, drawn: Sequence[Drawn]) -> Iterator[Block]:
-    for reference in drawn[0].numbers:
+def _summarize(frames: int, results: Sequence[DrawResult]) -> Iterator[Block]:
+    """A block per reference."""
+    for reference in results[0].numbers:
         rows = {
-            row: _row([d.numbers[reference][row] for d in drawn], [d.seconds[row] for d in drawn])
-            for row in drawn[0].numbers[reference]
+            row: _row(
+                [r.numbers[reference][row] for r in results], [r.seconds[row] for r in results]
+            )
+            for row in results[0].numbers[reference]
         }
-        yield Block(frames, reference, len(drawn), rows)
+        yield Block(frames, reference, len(results), rows)
 
 
 def _row(numbers: Sequence[Numbers | None], seconds: Sequence[float]) -> Row:
-    good = [n for n in numbers if n is not None]
+    solved = [n for n in numbers if n is not None]
     summary = {
-        name: {m: interval([n[name][m] for n in good]) for m in metrics}
-        for name, metrics in (good[0].items() if good else ())
+        name: {m: interval([n[name][m] for n in solved]) for m in metrics}
+        for name, metrics in (solved[0].items() if solved else ())
     }
-    return Row(summary, len(numbers) - len(good), float(np.median(seconds)))
+    return Row(summary, len(numbers) - len(solved), float(np.median(seconds)))
 
 
 def interval(values: Sequence[float]) -> Interval:
-    """Median, 5 % and 95 % quantile of the values that are numbers; NaN without any."""
+    """Median, 5 % and 95 % quantile of the values that are not NaN; NaN without any."""
     known = [value for value in values if not np.isnan(value)]
     if not known:
         return Interval(np.nan, np.nan, np.nan)

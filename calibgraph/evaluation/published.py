@@ -1,4 +1,4 @@
-"""The paper's own numbers, to stand beside ours: its tables 2 to 4. Single runs, no intervals."""
+"""The paper's own numbers, its tables 2 to 4: single runs, without intervals."""
 
 from __future__ import annotations
 
@@ -93,26 +93,26 @@ _PIXELS: dict[tuple[str, str, int], tuple[float, float]] = {
     ("kitti", _PRIORS, 100): (2.19, 0.56),
     ("kitti", _FULL, 100): (0.71, 0.50),
 }
-"""Median reprojection errors of both cameras [px]; for Walkley there are none."""
+"""Median reprojection errors of both cameras [px]; the paper has none for Walkley."""
 
 
-def published(data: str, row: str, frames: int, place: int | str) -> dict[str, float]:
-    """What the paper reports, by metric; nothing where it reports nothing.
+def published(data: str, row: str, frames: int, camera: int | str) -> dict[str, float]:
+    """The paper's numbers by metric; empty where it has none.
 
     Args:
-        data: ``kitti`` or ``walkley``; for others there is nothing.
-        row: of the benchmark. The paper's own solver stands beside the same solver here.
+        data: ``kitti`` or ``walkley``.
+        row: of the experiment: Stage 1, or a row of the paper's solver.
         frames: N.
-        place: of the camera in the rig, or PAIR.
+        camera: position of the camera in the rig, or PAIR.
     """
     key = (data, row, frames)
-    if place == PAIR:
+    if camera == PAIR:
         return dict(zip(AXES, _PAIRS.get(key, ()), strict=False))
     if key not in _CAMERAS and key not in _PIXELS:
         return {}
-    if not isinstance(place, int) or place > 1:
+    if not isinstance(camera, int) or camera > 1:
         return {}
-    found = dict(zip(AXES, _CAMERAS[key][place], strict=True)) if key in _CAMERAS else {}
+    metrics = dict(zip(AXES, _CAMERAS[key][camera], strict=True)) if key in _CAMERAS else {}
     if key in _PIXELS:
-        found["reprojection_px"] = _PIXELS[key][place]
-    return found
+        metrics["reprojection_px"] = _PIXELS[key][camera]
+    return metrics

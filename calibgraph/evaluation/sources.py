@@ -1,4 +1,4 @@
-"""What a benchmark draws from: a simulated scenario, or recordings that are matched anew."""
+"""Where the draws of an experiment come from: a simulated scenario, or matched recordings."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ KITTI_PREFIX = "kitti:"
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far every camera's guess is from the truth: the paper's T_delta."""
+    """The displacement of every camera's guess from the truth: the paper's T_delta."""
 
     rotation_deg: float = 20.0
     translation_m: float = 1.5
 
     def guess(self, truth: Rig, seed: int) -> Rig:
-        """T_init = T_delta T_GT, exactly so far, in a random direction per camera."""
+        """T_init = T_delta T_GT: exactly this angle and length, random directions per camera."""
         return perturb(
             truth, rotation_deg=self.rotation_deg, translation_m=self.translation_m, seed=seed
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One draw: what the ways are given, and what they are judged by.
+@dataclass(eq=False)
+class Draw:
+    """One draw: the input of the methods, and the references that they are compared with.
 
     Attributes:
-        rig: lenses, and the guess; for what was matched, the estimate that its last round began
-            from.
+        rig: lenses, and the guess; for recordings the estimate that the last round of matching
+            started from.
         table: correspondences.
-        references: rigs to be judged by, by their names; never given to a way.
+        references: rigs by name; never an input of a method.
         simulated: whether the first reference is the truth of a simulation.
-        matched: whether the matcher has a pose estimate of its own, which then stands for Stage 1
-            in ours.
+        matched: whether the matcher estimates the extrinsics itself; our method then takes its
+            estimate in place of Stage 1.
     """
 
     rig: Rig
@@ -60,28 +60,28 @@ class Sample:
     references: Mapping[str, Rig]
     simulated: bool = True
     matched: bool = False
-    _stage1: dict[float, Stage1] = field(default_factory=dict)
+    _stage1: dict[float, Stage1] = field(default_factory=dict, init=False, repr=False)
 
     def stage1(self, config: Config) -> Stage1:
-        """Stage 1 of what these settings let through, computed once.
+        """Stage 1 on the correspondences that pass these settings' filters, computed once.
 
         Of the settings that are compared here it depends on ``confidence_min`` alone.
         """
-        least = config.confidence_min
-        if least not in self._stage1:
+        key = config.confidence_min
+        if key not in self._stage1:
             kept = preprocess(self.rig, self.table, config).table
-            self._stage1[least] = estimate_stage1(self.rig, kept, config)
-        return self._stage1[least]
+            self._stage1[key] = estimate_stage1(self.rig, kept, config)
+        return self._stage1[key]
 
 
 class Source(Protocol):
-    """Where draws come from. It travels to other processes.
+    """Where draws come from; it is pickled for other processes.
 
     Attributes:
         name: for headings.
-        preset: the paper's settings that go with it.
-        usual_draws: how many there are time for.
-        published_as: which of the paper's data it is like: kitti, walkley or none.
+        preset: the paper's settings for such data.
+        default_draws: number of draws that run in reasonable time.
+        published_as: the paper's data set that it resembles: kitti, walkley or "".
     """
 
     @property
@@ -91,17 +91,17 @@ class Source(Protocol):
     def preset(self) -> PresetName: ...  # noqa: D102
 
     @property
-    def usual_draws(self) -> int: ...  # noqa: D102
+    def default_draws(self) -> int: ...  # noqa: D102
 
     @property
     def published_as(self) -> str: ...  # noqa: D102
 
-    def frames_at(self, wanted: int) -> int:
-        """How many frames a draw of so many has: no more than there are."""
+    def frame_count(self, wanted: int) -> int:
+        """The number of frames of a draw: as many as wanted, or all."""
         ...
 
-    def draw(self, frames: int, seed: int) -> Sample:
-        """So many frames and a new guess."""
+    def draw(self, frames: int, seed: int) -> Draw:
+        """That many frames and a new guess."""
         ...
 
     def halves(self, seed: int) -> tuple[Source, Source]:
@@ -116,41 +116,41 @@ class Simulated:
     Attributes:
         name: of the scenario.
         displacement: of the guesses.
-        stream: part of all its seeds; drives of other streams are others.
+        stream: part of all seeds, so that streams share no drive.
     """
 
     name: str
     displacement: Displacement = Displacement()
     stream: int = 0
-    usual_draws: int = field(default=50, init=False)
+    default_draws: int = field(default=50, init=False)
 
     @property
     def preset(self) -> PresetName:
-        """Walkley's own, KITTI's for all others."""
+        """``walkley`` for its scenario, ``kitti`` for all others."""
         return "walkley" if self.name == "walkley" else "kitti"
 
     @property
     def published_as(self) -> str:
-        """As its name says."""
+        """The name of the scenario."""
         return self.name
 
-    def frames_at(self, wanted: int) -> int:
-        """As many as are wanted.
+    def frame_count(self, wanted: int) -> int:
+        """As many as wanted.
 
         Raises:
-            ValueError: if these are more than fit into memory.
+            ValueError: if they do not fit into memory.
         """
         if wanted > MAX_FRAMES:
             raise ValueError(f"{wanted} frames: at most {MAX_FRAMES} can be simulated")
         return wanted
 
-    def draw(self, frames: int, seed: int) -> Sample:
+    def draw(self, frames: int, seed: int) -> Draw:
         """A new drive and a new guess."""
         scenario = scenario_of(self.name)
-        drive, guess = _seeds(seed, self.stream)
-        rig = self.displacement.guess(scenario.rig, guess)
-        table = scenario.draw(self.frames_at(frames), drive)
-        return Sample(rig, table, {"truth": scenario.rig})
+        drive_seed, guess_seed = _seeds(seed, self.stream)
+        rig = self.displacement.guess(scenario.rig, guess_seed)
+        table = scenario.draw(self.frame_count(frames), drive_seed)
+        return Draw(rig, table, {"truth": scenario.rig})
 
     def halves(self, seed: int) -> tuple[Source, Source]:
         """Different drives."""
@@ -159,7 +159,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recordings with a reference: matched anew in every draw, from a new guess.
+    """Recordings with a reference: matched again in every draw, from a new guess.
 
     Attributes:
         folders: dataset folder, or KITTI odometry sequences of one rig.
@@ -171,21 +171,21 @@ class Recorded:
     displacement: Displacement = Displacement()
     positions: tuple[int, ...] | None = None
     preset: PresetName = field(default="kitti", init=False)
-    usual_draws: int = field(default=3, init=False)
+    default_draws: int = field(default=3, init=False)
 
     @property
     def name(self) -> str:
-        """The folders' names."""
+        """The names of the folders."""
         return "+".join(folder.name for folder in self.folders)
 
     @property
     def published_as(self) -> str:
-        """KITTI's, if it is of KITTI."""
+        """``kitti`` for a KITTI sequence."""
         return "kitti" if (self.folders[0] / CALIBRATION_NAME).is_file() else ""
 
     @property
     def references(self) -> dict[str, Rig]:
-        """What to judge by: for KITTI both readings of its ``calib.txt``, the right one first."""
+        """For KITTI both interpretations of its ``calib.txt``, the right one first."""
         folder = self.folders[0]
         if (folder / CALIBRATION_NAME).is_file():
             return {
@@ -196,34 +196,34 @@ class Recorded:
             raise FileError(folder / REFERENCE_FILE, "no such file; a benchmark needs a reference")
         return {"reference": load_rig(folder / REFERENCE_FILE)}
 
-    def frames_at(self, wanted: int) -> int:
-        """At most all there are."""
+    def frame_count(self, wanted: int) -> int:
+        """At most all frames."""
         return min(wanted, len(self._positions()))
 
-    def draw(self, frames: int, seed: int) -> Sample:
+    def draw(self, frames: int, seed: int) -> Draw:
         """A random subset of the frames, matched with ``structure`` from a new guess.
 
-        The table is empty where the matcher gave up.
+        The table is empty if the matcher finds nothing.
         """
-        draw, guess = _seeds(seed, 0)
+        draw_seed, guess_seed = _seeds(seed, 0)
         positions = self._positions()
-        chosen = np.random.default_rng(draw).permutation(positions)[: self.frames_at(frames)]
+        chosen = np.random.default_rng(draw_seed).permutation(positions)[: self.frame_count(frames)]
         references = self.references
-        rig = self.displacement.guess(next(iter(references.values())), guess)
+        rig = self.displacement.guess(next(iter(references.values())), guess_seed)
         data = load_dataset(self.folders, rig).select(",".join(map(str, np.sort(chosen))))
         try:
-            found = match_in_rounds(
+            run = match_in_rounds(
                 data,
                 rig,
-                StructureMatcher(seed=draw, most_frames=None),
-                Config(seed=draw),
+                StructureMatcher(seed=draw_seed, most_frames=None),
+                Config(seed=draw_seed),
                 progress=no_progress,
             )
         except CorrespondenceError:
-            nothing = concatenate([_no_matches(name) for name in rig.cameras])
-            return Sample(rig, nothing, references, simulated=False, matched=True)
-        return Sample(
-            found.solution.rig, found.correspondences, references, simulated=False, matched=True
+            empty = concatenate([_no_matches(name) for name in rig.cameras])
+            return Draw(rig, empty, references, simulated=False, matched=True)
+        return Draw(
+            run.solution.rig, run.correspondences, references, simulated=False, matched=True
         )
 
     def halves(self, seed: int) -> tuple[Source, Source]:
@@ -254,8 +254,8 @@ def _seeds(seed: int, stream: int) -> tuple[int, int]:
     return int(state[0] >> 1), int(state[1] >> 1)
 
 
-def source_of(data: str, displacement: Displacement | None = None) -> Source:
-    """A source by what the user said.
+def source_from(data: str, displacement: Displacement | None = None) -> Source:
+    """The source that a command-line argument names.
 
     Args:
         data: a scenario's name; a dataset folder with a ``reference.yaml``, or a KITTI odometry
@@ -275,5 +275,5 @@ def source_of(data: str, displacement: Displacement | None = None) -> Source:
             f"{data!r} is no scenario ({', '.join(SCENARIOS)}), no folder, and no kitti:DIR,DIR"
         )
     source = Recorded(folders, displacement)
-    _ = source.frames_at(1)  # whether it can be read, before anything is drawn
+    source.frame_count(1)  # raises before the first draw if the data cannot be read
     return source

@@ -1,4 +1,4 @@
-"""The paper's random search for lambda, mu, delta and tau, with a test that it has not seen."""
+"""The paper's random search for lambda, mu, delta and tau, tested on other draws."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.evaluation.paper import draw_seed
-from calibgraph.evaluation.sources import Sample, Source
+from calibgraph.evaluation.sources import Draw, Source
 from calibgraph.files import write_yaml
 from calibgraph.model.config import Config, preset
 from calibgraph.model.metrics import evaluate
@@ -21,12 +21,12 @@ from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.joint import solve_joint
 
 UNIT_DEG, UNIT_CM = 1.0, 10.0
-"""Errors that count as one in the score."""
+"""Errors that contribute 1 to the score."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """The discrete sets that are searched.
+    """The values to search, per setting.
 
     Attributes:
         prior_weight: lambda.
@@ -40,8 +40,8 @@ class Candidates:
     loss_scale_px: tuple[float, ...] = (1, 2, 4, 8, 16)
     gate_px: tuple[float, ...] = (2, 3, 5, 8, 16, 32)
 
-    def sampled(self, base: Config, count: int, seed: int) -> list[Config]:
-        """So many different combinations at random, or all if there are no more.
+    def sample(self, base: Config, count: int, seed: int) -> list[Config]:
+        """That many different combinations at random, or all if there are fewer.
 
         Raises:
             ValueError: if a set is empty or a value is out of range.
@@ -49,20 +49,22 @@ class Candidates:
         names = list(vars(self))
         combinations = list(product(*vars(self).values()))
         if not combinations or count < 1:
-            raise ValueError("nothing to search: a set of candidates is empty, or no sample asked")
+            raise ValueError(
+                "nothing to search: a set of candidates is empty, or the number of samples is 0"
+            )
         order = np.random.default_rng(seed).permutation(len(combinations))[:count]
         return [base.changed(**dict(zip(names, combinations[i], strict=True))) for i in order]
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredConfig:
     """Settings and their scores; infinite if a solve failed.
 
     Attributes:
-        name: what to call them.
+        name: for tables.
         config: the settings.
-        tuning: score on the draws that the search saw.
-        test: score on others; None if it was not measured.
+        tuning: score on the draws of the search.
+        test: score on other draws; None if it was not measured.
     """
 
     name: str
@@ -72,8 +74,8 @@ class Scored:
 
 
 @dataclass(frozen=True)
-class Tuned:
-    """What the search found.
+class TuningResult:
+    """The result of the search.
 
     Attributes:
         best: the best candidate.
@@ -81,25 +83,29 @@ class Tuned:
         tried: all candidates, best first.
     """
 
-    best: Scored
-    others: tuple[Scored, ...]
-    tried: tuple[Scored, ...]
+    best: ScoredConfig
+    others: tuple[ScoredConfig, ...]
+    tried: tuple[ScoredConfig, ...]
 
     def to_mapping(self) -> dict[str, Any]:
         """As plain values, for JSON."""
         rows = (self.best, *self.others)
         return {
-            "settings": _chosen(self.best.config),
+            "settings": _searched_settings(self.best.config),
             "scores": {row.name: {"tuning": row.tuning, "test": row.test} for row in rows},
-            "tried": [{**_chosen(row.config), "tuning": row.tuning} for row in self.tried],
+            "tried": [
+                {**_searched_settings(row.config), "tuning": row.tuning} for row in self.tried
+            ],
         }
 
     def save(self, path: Path) -> None:
-        """Write the best candidate as settings that ``--config`` reads."""
-        write_yaml(path, {"preset": self.best.config.preset, **_chosen(self.best.config)})
+        """Write the best candidate as a settings file for ``--config``."""
+        write_yaml(
+            path, {"preset": self.best.config.preset, **_searched_settings(self.best.config)}
+        )
 
 
-def _chosen(config: Config) -> dict[str, float]:
+def _searched_settings(config: Config) -> dict[str, float]:
     return {name: getattr(config, name) for name in vars(Candidates())}
 
 
@@ -113,61 +119,61 @@ def tune(
     candidates: Candidates | None = None,
     seed: int = 0,
     progress: Progress = no_progress,
-) -> Tuned:
-    """Search for settings at random on some draws, and judge the best on others.
+) -> TuningResult:
+    """Search for settings at random on some draws, and test the best on others.
 
     The paper minimizes "a combined rotation-and-translation error"; here that is :func:`score`.
-    The solver is ours, which ends at the same optimum as the paper's.
+    The solver is ours, which converges to the same optimum as the paper's.
 
     Args:
         source: its tuning and test draws share no frame.
         base: settings that are not searched.
-        frames: of a draw.
-        samples: how many candidates.
+        frames: per draw.
+        samples: number of candidates.
         draws: for tuning, and as many for the test.
-        candidates: what is searched.
-        seed: of everything.
-        progress: to be told.
+        candidates: the values to search.
+        seed: of everything random.
+        progress: called with the number of candidates done.
 
     Raises:
         ValueError: if there is nothing to search.
     """
-    found = (candidates or Candidates()).sampled(base, samples, seed)
-    halves = [_drawn(half, frames, draws, seed) for half in source.halves(seed)]
+    configs = (candidates or Candidates()).sample(base, samples, seed)
+    halves = [_draw_all(half, frames, draws, seed) for half in source.halves(seed)]
     tried = []
-    for index, config in enumerate(found):
-        progress("candidates", index, len(found))
-        tried.append(Scored("candidate", config, score(halves[0], config)))
+    for index, config in enumerate(configs):
+        progress("candidates", index, len(configs))
+        tried.append(ScoredConfig("candidate", config, score(halves[0], config)))
     tried.sort(key=lambda scored: scored.tuning)
     best = tried[0]
     others = {f"the paper's ({base.preset})": base, "auto": preset("auto").changed(seed=base.seed)}
-    return Tuned(
-        Scored("best", best.config, best.tuning, score(halves[1], best.config)),
+    return TuningResult(
+        ScoredConfig("best", best.config, best.tuning, score(halves[1], best.config)),
         tuple(
-            Scored(name, config, *(score(half, config) for half in halves))
+            ScoredConfig(name, config, *(score(half, config) for half in halves))
             for name, config in others.items()
         ),
         tuple(tried),
     )
 
 
-def score(draws: Sequence[Sample], config: Config) -> float:
+def score(draws: Sequence[Draw], config: Config) -> float:
     """E_R / 1 deg + E_t / 10 cm of the full method, the mean over cameras and draws."""
     return float(np.mean([_error(draw, config) for draw in draws]))
 
 
-def _error(draw: Sample, config: Config) -> float:
+def _error(draw: Draw, config: Config) -> float:
     """Score of one draw: the mean over its cameras; infinite if the solve failed."""
-    known = None
+    stage1 = None
     if draw.matched:
         config = config.changed(stage1="rig")
     else:
-        known = draw.stage1(config)
+        stage1 = draw.stage1(config)
     try:
-        found = solve_joint(draw.rig, draw.table, config, pairwise=known).solved_rig
+        solved = solve_joint(draw.rig, draw.table, config, pairwise=stage1).solved_rig
     except CorrespondenceError:
         return math.inf
-    errors = evaluate(found, next(iter(draw.references.values()))).cameras.values()
+    errors = evaluate(solved, next(iter(draw.references.values()))).cameras.values()
     return float(
         np.mean([
             e.rotation_error_deg / UNIT_DEG + e.translation_error_cm / UNIT_CM for e in errors
@@ -175,5 +181,5 @@ def _error(draw: Sample, config: Config) -> float:
     )  # fmt: skip
 
 
-def _drawn(source: Source, frames: int, draws: int, seed: int) -> list[Sample]:
+def _draw_all(source: Source, frames: int, draws: int, seed: int) -> list[Draw]:
     return [source.draw(frames, draw_seed(seed, frames, index)) for index in range(draws)]

@@ -1,4 +1,4 @@
-"""Results from disk: the YAML file of a calibration, with the table that lies beside it."""
+"""Results from disk: the YAML file of a calibration, and the table beside it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read a result, from its folder or its file, with the correspondences that lie beside it.
+    """Read a result, from its folder or its file, with the correspondences beside it.
 
     Raises:
         FileError: if it is missing or malformed.
@@ -67,16 +67,18 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def _require_consistent(path: Path, content: Mapping[str, Any], found: Calibration) -> None:
-    """The verdict is that of its checks, and all parts are of the same cameras.
+    """Check that the verdict is that of its checks, and all parts are of the same cameras.
 
     Raises:
-        FileError: if not: somebody has changed the file.
+        FileError: if not: the file was edited.
     """
-    said = content.get("verdict", {})
-    said = said.get("status") if isinstance(said, dict) else said
-    if said != found.verdict.status:
+    verdict = content.get("verdict", {})
+    status = verdict.get("status") if isinstance(verdict, dict) else verdict
+    if status != found.verdict.status:
         raise FileError(
-            path, f"says {said}, its checks {found.verdict.status}: it was edited; write it again"
+            path,
+            f"has the verdict {status}, its checks give {found.verdict.status}: it was edited; "
+            "write it again",
         )
     names = set(found.rig.cameras)
     parts = {

@@ -119,9 +119,9 @@ def _read_open3d(path: Path) -> NDArray[np.float32]:
 
 
 def _require_complete(path: Path) -> int:
-    """Number of points that the header claims, if the file is long enough to hold them.
+    """Number of points in the header, if the file is long enough to hold them.
 
-    Open3D fills what a truncated file lacks with whatever is in memory and does not say so.
+    Open3D silently fills the missing part of a truncated file with uninitialized memory.
     """
     data = path.read_bytes()
     header, body = _split_header(path, data)
@@ -142,7 +142,7 @@ def _require_complete(path: Path) -> int:
 
 
 def _require_numbers(path: Path, rows: list[bytes]) -> None:
-    """Open3D takes words for zeros, or leaves whatever is in memory in their place."""
+    """Check that rows are numbers: Open3D reads words as zeros or as uninitialized memory."""
     try:
         np.array(b" ".join(rows).split(), dtype=np.bytes_).astype(np.float64)
     except ValueError as error:

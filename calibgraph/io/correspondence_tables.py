@@ -50,8 +50,8 @@ def parts_of_file(path: Path) -> Iterator[Correspondences]:
     Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
 
     Raises:
-        FileError: as of :func:`load_correspondences`, once the wrong part is reached; the rows that
-            it names are counted from the beginning of the file.
+        FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
+            counted from the beginning of the file.
     """
     rows = 0
     for part in _arrow_parts(require_file(path)):
@@ -70,7 +70,7 @@ def _arrow_parts(path: Path) -> Iterator[pa.Table]:
     if path.suffix == ".csv":
         yield read_arrow(path)
         return
-    # One row group after the other: until it is done, a reader holds on to all that it has read.
+    # One row group after the other: a reader keeps in memory all that it has read of a group.
     with arrow_reads(path), parquet.ParquetFile(path) as file:
         metadata = file.schema_arrow.metadata
         for group in range(file.num_row_groups):
@@ -79,7 +79,7 @@ def _arrow_parts(path: Path) -> Iterator[pa.Table]:
 
 
 def read_arrow(path: Path) -> pa.Table:
-    """A whole Parquet or CSV file, whatever its columns.
+    """A whole Parquet or CSV file, with any columns.
 
     Raises:
         FileError: if it cannot be read.
@@ -97,7 +97,7 @@ def read_arrow(path: Path) -> pa.Table:
 
 @contextmanager
 def arrow_reads(path: Path) -> Iterator[None]:
-    """Whatever Arrow finds wrong with a file in here is a ``FileError``."""
+    """Turn Arrow's errors about a file into ``FileError``."""
     import pyarrow as pa
 
     try:
@@ -109,7 +109,7 @@ def arrow_reads(path: Path) -> Iterator[None]:
 
 
 def require_rows(path: Path, rows: int) -> None:
-    """Whether a file has any.
+    """Check that a file has rows.
 
     Raises:
         FileError: if not.
@@ -128,7 +128,7 @@ def from_arrow(table: pa.Table) -> Correspondences:
 
     check_schema(table.schema)
     try:
-        # As plain strings: a name that is null may hide in a dictionary.
+        # As plain strings: a dictionary may contain a null name.
         names = table["camera"].cast(pa.string())
         camera = table.column_names.index("camera")
         return _from_plain_columns(table.set_column(camera, "camera", names))

@@ -1,4 +1,4 @@
-"""Wherever a rig is asked for, several things serve: the one place that tells them apart."""
+"""Rigs from disk: a rig file, a result, a dataset folder or a KITTI sequence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 def load_rig(path: Path | str) -> Rig:
     """Read a rig from a rig file, a result (file or folder), a dataset or a KITTI sequence folder.
 
-    A result gives the calibrated poses, a KITTI sequence those of its own ``calib.txt``.
+    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``.
 
     Raises:
         FileError: if there is none, or it is malformed.
@@ -32,7 +32,7 @@ def load_rig(path: Path | str) -> Rig:
 
 
 def rig_file(path: Path | str) -> Path:
-    """The file that :func:`load_rig` reads: the path itself, or the one that a folder stands for.
+    """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder.
 
     Raises:
         FileError: if a folder holds none.

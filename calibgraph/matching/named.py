@@ -69,6 +69,7 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
 
 
 if TYPE_CHECKING:  # mypy checks that the matchers of this package have every member
+    from calibgraph.matching.cmrnext import CmrNextMatcher
     from calibgraph.matching.structure import StructureMatcher
 
-    _FULL_MATCHERS: tuple[type[FullMatcher], ...] = (StructureMatcher,)
+    _FULL_MATCHERS: tuple[type[FullMatcher], ...] = (StructureMatcher, CmrNextMatcher)

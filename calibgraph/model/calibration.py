@@ -1,4 +1,4 @@
-"""The result: one type for every solver, complete enough to judge it, use it and repeat it."""
+"""The result: one type for every solver, complete enough to check it, use it and repeat it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PAIR_TANGENT_SENTENCE = (
 
 
 def _versions() -> dict[str, str]:
-    """What made the result: this package and the libraries that matter."""
+    """Versions of this package and of the libraries that results depend on."""
     versions = {"python": platform.python_version()}
     for package in ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy"):
         try:
@@ -49,7 +49,7 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Residuals:
-    """How well the result explains one camera's correspondences.
+    """Residuals of one camera's correspondences at the result.
 
     Attributes:
         median_px: median unweighted error over the preprocessed correspondences; for a match that
@@ -72,23 +72,23 @@ class Calibration:
     """A calibrated rig.
 
     Attributes:
-        rig: the rig with the estimated poses.
+        rig: the rig with the estimated extrinsics.
         initial_rig: the rig that the solve started from.
-        covariance: clustered by frames, plus the error that the matcher says its frames share:
-            per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
-            [rad], translation [m]) in the camera's axes; None with too few frames to tell.
+        covariance: clustered by frames, plus the error that all frames share by the matcher's
+            findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+            [rad], translation [m]) in the camera's axes; None with too few frames.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
         camera_verdicts: per camera.
         residuals: per camera that had correspondences.
-        counts: per camera, what was left after each filter and gate, and the frames.
+        counts: per camera, correspondences left after each filter and the gate, and frames.
         timings_s: seconds per stage.
         terms: which terms of the objective were used.
         config: the resolved settings.
         stage1_T_camera_lidar: the pairwise estimates.
-        weaknesses: per camera, what the data leave loose, in words, the worst first.
-        prior_share: per camera, which share of its result comes from priors, not from data (0-1).
+        weaknesses: per camera, the least determined directions, in words, the worst first.
+        prior_share: per camera, the share of its result that comes from priors, not data (0-1).
         bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
-            frames drawn with replacement, like ``covariance``; the check of it.
+            frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
@@ -120,7 +120,7 @@ class Calibration:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the rig: all that was asked of its cameras."""
+        """Of the rig: the worst of its cameras, with the checks of all."""
         return rig_verdict(self.camera_verdicts)
 
     @property
@@ -132,7 +132,7 @@ class Calibration:
         """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
 
         Returns:
-            (3,) rotation [deg], (3,) translation [cm]; None with too few frames to tell.
+            (3,) rotation [deg], (3,) translation [cm]; None with too few frames.
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else degrees_and_centimetres(covariance)
@@ -149,7 +149,7 @@ class Calibration:
     def pair_covariance(self) -> dict[str, Array]:
         """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
 
-        Empty with too few frames to tell.
+        Empty with too few frames.
         """
         if self.joint_covariance is None:
             return {}
@@ -162,7 +162,7 @@ class Calibration:
         }
 
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
-        """The same result, knowing the hashes of the files it came from."""
+        """The same result with the SHA-256 of its input files, by path."""
         return replace(self, inputs=dict(inputs))
 
     def save(self, folder: Path | str) -> Path:

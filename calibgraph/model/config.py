@@ -26,14 +26,14 @@ class Tracking(BaseModel):
     Attributes:
         start_frames: frames with matches before a camera's first estimate.
         epoch_frames: frames that share one extrinsic.
-        live_epochs: closed epochs that are kept with all their matches, to be gated anew and
-            linearized anew; older ones are merged into a summary of constant size.
+        live_epochs: closed epochs that are kept with all their matches, for a new gate and a new
+            linearization; older ones are merged into a summary of constant size.
         walk_rotation_deg: standard deviation, per axis, of the random walk that a drifting camera
-            makes from one frame to the next. A camera stands still until the data say otherwise;
-            the walk is then this one, a fifth of it, or five times it, as the data say.
+            makes from one frame to the next. The model of a camera is constant until the residuals
+            favour a walk: this one, a fifth of it, or five times it.
         walk_translation_m: the same of its position.
-        step_frames: frames at a new place that agree with each other before it is believed.
-        blind_frames: frames without usable matches before a camera is called blind.
+        step_frames: frames that must agree on a new extrinsic before a step is reported.
+        blind_frames: frames without usable matches before a camera is reported as blind.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -60,13 +60,12 @@ class Config(BaseModel):
         gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
         confidence_min: c_min.
         confidence_weights: weigh residuals by sqrt(clip(c, 0.1, 1)), else uniformly.
-        learnt_weights: weigh frames and confidences by what the residuals say of them, and leave
-            out frames that are far from where frames are densest; where per-camera estimates come
-            from PnP.
+        learnt_weights: weigh frames and confidences by their residuals, and leave out frames far
+            from where frames are densest; only where per-camera estimates come from PnP.
         grid_columns, grid_rows: cells of the image in which only the best match is kept.
         matches_max: cap per camera and frame.
-        stage1: where the per-camera estimates T_hat come from: ``pnp``, one pose per frame,
-            aggregated; or ``rig``, the poses in the rig as they are.
+        stage1: source of the per-camera estimates T_hat: ``pnp``, one extrinsic per frame,
+            aggregated; or ``rig``, the extrinsics in the rig as they are.
         aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
         bootstrap: how many times to solve again with frames drawn with replacement, as a check

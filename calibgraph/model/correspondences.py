@@ -1,4 +1,4 @@
-"""The correspondence table: the waist of the program. Matchers write it, the graph reads it."""
+"""The correspondence table: matchers write it, the solver reads it."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-MAX_COORDINATE = 1e6  # px or m: nothing that is matched lies farther
+MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
-MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2
+MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,7 +48,7 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
-        metadata: where the table comes from: the matcher and its settings.
+        metadata: the matcher, its settings and its findings.
 
     Raises:
         CorrespondenceError: on wrong shapes or values, naming the first bad row, and if the
@@ -134,7 +134,7 @@ class Correspondences:
 
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The table with only some rows: a mask, an index array or a slice."""
-        kept = copy.copy(self)  # not checked again: rows of a good table are good
+        kept = copy.copy(self)  # not checked again: rows of a valid table are valid
         for name in _WIDTHS:
             column = getattr(self, name)
             object.__setattr__(kept, name, None if column is None else column[rows])
@@ -146,11 +146,11 @@ class Correspondences:
             return self.select(slice(0, 0))
         rows = np.flatnonzero(self.camera_index == self.cameras.index(name))
         adjacent = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
-        return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view, if it can
+        return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view if possible
 
     @property
     def findings(self) -> MatcherFindings:
-        """What the matcher reported, from the metadata.
+        """The matcher's findings, from the metadata.
 
         Raises:
             CorrespondenceError: if a value is not a number in its range.
@@ -211,7 +211,7 @@ class Correspondences:
         row = int(np.flatnonzero(~good)[0])
         camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
         raise CorrespondenceError(
-            f"{what} must {rule}, found {found[row].tolist()}; drop or mend the row",
+            f"{what} must {rule}, found {found[row].tolist()}; drop or correct the row",
             camera=camera,
             frame=frame,
             row=row,
@@ -226,7 +226,7 @@ assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "
 
 
 def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
-    """Confidences in single precision; one beyond it becomes infinite, which a table refuses."""
+    """Confidences in single precision; larger numbers become infinite, which is refused later."""
     with np.errstate(over="ignore"):
         return np.asarray(values, dtype=np.float32)
 

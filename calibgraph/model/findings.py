@@ -1,4 +1,4 @@
-"""What a matcher reports beside its correspondences, as a type; on disk, keys of the metadata."""
+"""The findings of a matcher beside its correspondences; on disk, keys of a table's metadata."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class MatcherFindings:
-    """What a matcher reports of its work. Mappings are by camera; all of it is optional.
+    """Quality and limits of a matcher's work. Mappings are by camera; all of it is optional.
 
     Attributes:
         z_score: agreement of image and cloud, in standard deviations of chance agreement.
@@ -69,7 +69,7 @@ class MatcherFindings:
         return MatcherFindings(**values)
 
     def to_metadata(self) -> dict[str, Any]:
-        """The keys of the metadata; findings that are not known have none."""
+        """As keys of the metadata; findings without a value have no key."""
         content: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)

@@ -88,3 +88,8 @@ def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
     jacobian[:, pose_rows(b)] = np.eye(6)
     covariance: Array = jacobian @ joint @ jacobian.T
     return covariance
+
+
+def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
+    """(6, 6) Ad(T_lidar_camera^-1): a twist in the LiDAR frame to the same in the camera's."""
+    return np.asarray(T_lidar_camera.inverse().AdjointMap(), dtype=np.float64)

@@ -60,7 +60,7 @@ class Evaluation:
 
 
 def evaluate(estimate: Rig, reference: Rig) -> Evaluation:
-    """Compare the camera poses of two rigs.
+    """Compare the extrinsics of two rigs.
 
     Raises:
         RigError: if a camera of the estimate is not in the reference.
@@ -75,7 +75,9 @@ def evaluate(estimate: Rig, reference: Rig) -> Evaluation:
     found, true = estimate.T_camera_lidar, reference.T_camera_lidar
     cameras = {name: pose_error(found[name], true[name]) for name in found}
     pairs = {
-        f"{a}->{b}": pose_error(_between(found, a, b), _between(true, a, b))
+        f"{a}->{b}": pose_error(
+            relative_transform(found[b], found[a]), relative_transform(true[b], true[a])
+        )
         for a, b in combinations(found, 2)
     }
     return Evaluation(cameras, pairs)
@@ -96,8 +98,3 @@ def pose_error(estimate: Array, reference: Array) -> PoseError:
         pitch_deg=float(about_x),
         yaw_deg=float(about_y),
     )
-
-
-def _between(T_camera_lidar: dict[str, Array], a: str, b: str) -> Array:
-    between: Array = relative_transform(T_camera_lidar[b], T_camera_lidar[a])
-    return between

@@ -19,7 +19,7 @@ def perturb(
     """Displace every camera independently: T_camera_lidar becomes T_delta T_camera_lidar.
 
     Args:
-        rig: its poses are displaced.
+        rig: its extrinsics are displaced.
         rotation_deg: the angle, about a random axis.
         translation_m: the length, in a random direction.
         seed: of the draws; cameras are drawn in the rig's order.
@@ -35,15 +35,16 @@ def perturb(
             f"and {translation_m} m"
         )
     rng = np.random.default_rng(seed)
-    draw = _uniform if uniform else _exact
-    poses = {
+    draw = _draw_uniform if uniform else _draw_exact
+    T_camera_lidar = {
         name: draw(rng, rotation_deg, translation_m) @ camera.T_camera_lidar
         for name, camera in rig.cameras.items()
     }
-    return rig.moved_to(poses)
+    return rig.moved_to(T_camera_lidar)
 
 
-def _exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+def _draw_exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    """(4, 4) T_delta of exactly this angle and length, about and along random directions."""
     axis, direction = rng.standard_normal((2, 3))
     T = np.eye(4)
     angle = np.radians(rotation_deg)
@@ -52,7 +53,8 @@ def _exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) 
     return T
 
 
-def _uniform(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+def _draw_uniform(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    """(4, 4) T_delta with six components uniform within these values."""
     angles, shift = rng.uniform(-1.0, 1.0, (2, 3))
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("xyz", rotation_deg * angles, degrees=True).as_matrix()

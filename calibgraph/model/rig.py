@@ -1,4 +1,4 @@
-"""The rig: one LiDAR, its cameras, their lenses, and what is known of where they are.
+"""The rig: one LiDAR, its cameras with lenses and extrinsics, and measured relative poses.
 
 ``T_a_b`` maps coordinates in b to coordinates in a: ``p_camera = T_camera_lidar * p_lidar``.
 """
@@ -30,7 +30,7 @@ from factors import Lens
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-3
-"""Largest deviation of R^T R from the identity that is taken for rounded digits, not an error."""
+"""Largest deviation of R^T R from the identity that counts as rounded digits, not as an error."""
 
 
 def rigid_transform(value: Any) -> Array:
@@ -84,7 +84,7 @@ def _checked_name(name: str) -> str:
 
 
 CameraName = Annotated[str, AfterValidator(_checked_name)]
-Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # stiffer ones hold solves still
+Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -104,7 +104,7 @@ class Intrinsics(_Model):
 
 
 class Camera(_Model):
-    """One camera: its lens, its image size, and its pose guess (or truth, in a reference)."""
+    """One camera: its lens, its image size, and its extrinsic: a guess, or the reference."""
 
     model: Literal["pinhole", "fisheye"] = "pinhole"
     width_px: Size
@@ -131,12 +131,12 @@ class Camera(_Model):
         return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
 
     def moved_to(self, T_camera_lidar: Array) -> Camera:
-        """The same camera with another pose."""
+        """The same camera with another (4, 4) T_camera_lidar."""
         T = rigid_transform(T_camera_lidar)
         return self.model_copy(update={"T_camera_lidar": T})
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with some fields changed, not checked; its lens is that of its own intrinsics."""
+        """A copy with some fields changed, not checked; the lens follows the intrinsics."""
         copy = super().model_copy(update=update, deep=deep)
         if update and update.keys() - {"T_camera_lidar"}:
             copy.__dict__.pop("lens", None)
@@ -150,7 +150,7 @@ class Camera(_Model):
 
 
 class RelativePose(_Model):
-    """Independent knowledge of camera b in camera a: stereo calibration, CAD, Kalibr."""
+    """A measurement of camera b in camera a: stereo calibration, CAD, Kalibr."""
 
     a: str
     b: str
@@ -186,7 +186,7 @@ class Rig(_Model):
         return {name: camera.T_camera_lidar for name, camera in self.cameras.items()}
 
     def moved_to(self, T_camera_lidar: Mapping[str, Array]) -> Rig:
-        """The same rig with other camera poses.
+        """The same rig with other T_camera_lidar, (4, 4), of some cameras or all.
 
         Raises:
             RigError: if a camera is not of this rig.

@@ -35,7 +35,7 @@ def write_table(arrow: pa.Table, path: Path) -> None:
 
 
 def check_schema(schema: pa.Schema) -> None:
-    """Whether a table has the columns and the format of the file, each column of a right type.
+    """Check that a table has the columns and the format of the file, each of a right type.
 
     Raises:
         CorrespondenceError: with the first thing that is wrong.
@@ -64,9 +64,9 @@ def check_schema(schema: pa.Schema) -> None:
 
 
 def _check_type(field: pa.Field) -> None:
-    """Whether a column's type is a plain one, whose size in memory is that of the data.
+    """Check that a column has a plain type, whose size in memory is that of the data.
 
-    Of run-end encoded values, say, a few bytes could stand for any number of rows.
+    A few bytes of run-end encoded values, for example, could expand to any number of rows.
     """
     from pyarrow import types
 

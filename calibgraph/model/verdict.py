@@ -1,4 +1,4 @@
-"""Questions asked of a result, with what was found and the thresholds it met; their verdict."""
+"""Checks: a number or finding, its limits, and PASS, WARN or FAIL; the verdict is the worst."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
+Direction = Literal["at most", "at least"]
 
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
 
 
 @dataclass(frozen=True)
 class Check:
-    """One question asked of one camera's result.
+    """One check of one camera's result.
 
     Attributes:
-        name: what was measured or looked for.
+        name: what was measured or searched for.
         status: PASS, WARN or FAIL.
-        text: a sentence that says what was found and, if that is not PASS, what to do.
-        value: what was found, where it is a number.
-        warn: the threshold from which on it is WARN, where there is one.
-        fail: the threshold from which on it is FAIL, where there is one.
-        unit: of the three.
+        text: one sentence: what was found and, if that is not PASS, what to do.
+        value: the number that was found, if it is one.
+        warn: the last value that is PASS, if there is such a limit.
+        fail: the last value that is not FAIL, if there is such a limit.
+        unit: of value, warn and fail.
     """
 
     name: str
@@ -39,26 +40,22 @@ class Verdict:
     """Whether a result can be used.
 
     Attributes:
-        checks: everything that was asked, in order.
+        checks: all checks, in order.
     """
 
     checks: tuple[Check, ...] = ()
 
     @property
     def status(self) -> Status:
-        """The worst of the checks."""
+        """The worst status of the checks; PASS without any."""
         return max((check.status for check in self.checks), key=_ORDER.index, default="PASS")
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What was found wanting, the worst first, a sentence each; empty for PASS."""
-        wanting = [check for check in self.checks if check.status != "PASS"]
-        wanting.sort(key=lambda check: -_ORDER.index(check.status))
-        return tuple(check.text for check in wanting)
-
-    def and_first(self, checks: Iterable[Check]) -> Verdict:
-        """The verdict with checks that name a cause, which come before the others."""
-        return Verdict((*checks, *self.checks))
+        """The sentences of the checks that are not PASS, the worst first."""
+        failing = [check for check in self.checks if check.status != "PASS"]
+        failing.sort(key=lambda check: -_ORDER.index(check.status))
+        return tuple(check.text for check in failing)
 
     def and_also(self, checks: Iterable[Check]) -> Verdict:
         """The verdict with more checks."""
@@ -66,7 +63,7 @@ class Verdict:
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: the checks of all its cameras, with their names."""
+    """The verdict of a rig: the checks of all its cameras, with the cameras' names."""
     return Verdict(
         tuple(
             replace(check, text=f"{name}: {check.text}")
@@ -76,27 +73,75 @@ def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
     )
 
 
-def above(  # noqa: PLR0913, PLR0917 - a line of a table
+@dataclass(frozen=True)
+class Threshold:
+    """The limits of one measured number: a row of the table in ``trust.thresholds``.
+
+    Attributes:
+        key: by which checks look the row up.
+        name: what is measured; the name of the check.
+        direction: "at most" or "at least": on which side of the limits PASS lies.
+        warn: the last value that is PASS.
+        fail: the last value that is not FAIL.
+        unit: of the values; "share" is printed in percent.
+        question: what the check answers, in words.
+        reason: why these limits: what they mean, or the data that they were read from.
+        advice: what to do if it is not PASS.
+    """
+
+    key: str
+    name: str
+    direction: Direction
+    warn: float
+    fail: float
+    unit: str
+    question: str
+    reason: str
+    advice: str = ""
+
+    def grade(self, value: float) -> Status:
+        """PASS, WARN or FAIL of a value; NaN fails."""
+        return self.check(value).status
+
+    def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
+        """The check of a value.
+
+        Args:
+            value: in the row's unit.
+            name: in place of the row's, where it depends on the data.
+            advice: likewise.
+        """
+        build = at_most if self.direction == "at most" else at_least
+        return build(
+            name or self.name, value, self.warn, self.fail, self.unit, advice or self.advice
+        )
+
+    def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
+        """A check whose sentence, and perhaps status, depend on more than the value."""
+        return Check(name or self.name, status, text, value, self.warn, self.fail, self.unit)
+
+
+def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
     name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
 ) -> Check:
-    """A check that a number is not above two thresholds; NaN fails.
+    """A check that a number is at most its limits; NaN fails.
 
     Args:
         name: what was measured.
         value: what was found.
         warn: the largest value that is PASS.
         fail: the largest value that is not FAIL.
-        unit: of the values; "share" prints percents.
+        unit: of the values; "share" is printed in percent.
         advice: what to do if it is above.
     """
     status = grade(not value <= warn, not value <= fail)
     return _measured(name, status, "above", value, warn, fail, unit, advice)
 
 
-def below(  # noqa: PLR0913, PLR0917 - a line of a table
+def at_least(  # noqa: PLR0913, PLR0917 - a line of a table
     name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
 ) -> Check:
-    """A check that a number is not below two thresholds; NaN fails. Arguments as of `above`."""
+    """A check that a number is at least its limits; NaN fails. Arguments as of `at_most`."""
     status = grade(not value >= warn, not value >= fail)
     return _measured(name, status, "below", value, warn, fail, unit, advice)
 
@@ -126,7 +171,7 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
 
 
 def in_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit, as people read it."""
+    """A number with its unit, for display."""
     if unit == "share":
         return f"{100 * value:.{digits}g}%"
     return f"{value:.{digits}g} {unit}".rstrip()

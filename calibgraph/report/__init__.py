@@ -1,6 +1,6 @@
-"""The report: everything that is known of a result, on one page that needs no network."""
+"""The report: a result on one HTML page that needs no network."""
 
-from calibgraph.report.frame_errors import with_files_of as with_files_of
+from calibgraph.report.frames import relocate_frames as relocate_frames
 from calibgraph.report.html import write_report as write_report
 
-__all__ = ["with_files_of", "write_report"]
+__all__ = ["relocate_frames", "write_report"]

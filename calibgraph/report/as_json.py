@@ -1,4 +1,4 @@
-"""What ``--json`` prints: results as plain values on stdout, for programs."""
+"""Results as JSON on stdout, for programs: ``--json``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from calibgraph.model.calibration import Calibration
 
 
 def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
-    """A result as plain values: degrees, centimetres and pixels, named in every key."""
+    """A result as plain values; every key names its unit.
+
+    Args:
+        result: the calibration.
+        written: the files that were written.
+    """
     cameras = {}
     for name, T in result.T_camera_lidar.items():
         residuals = result.residuals.get(name)
@@ -36,7 +41,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
 
 
 def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | None]:
-    """Of a camera or a pair: about and along x, y, z."""
+    """Standard deviations of a camera or a pair, about and along x, y, z."""
     sigmas = result.sigmas(name)
     return {
         "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
@@ -50,7 +55,7 @@ def print_json(content: dict[str, Any]) -> None:
 
 
 def finite(value: Any) -> Any:
-    """Replace numbers that JSON does not have by null."""
+    """Replace NaN and infinity, which JSON does not have, by None, inside dicts and lists too."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):

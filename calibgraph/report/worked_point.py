@@ -1,4 +1,4 @@
-"""One point, worked through by the conventions, step by step."""
+"""One point projected step by step, to show the conventions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.geometry import invert, point_in_lidar
 from calibgraph.model.rig import Camera
-from calibgraph.report.frame_errors import Errors
+from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 Array = NDArray[np.float64]
 
@@ -18,8 +18,8 @@ _DISTANCE_M = 10.0
 
 
 @dataclass(frozen=True)
-class Worked:
-    """One point from the LiDAR to the pixel, in lines of text.
+class WorkedPoint:
+    """One point from the LiDAR frame to the pixel, as text.
 
     Attributes:
         matrix: the rows of T_camera_lidar.
@@ -34,15 +34,15 @@ class Worked:
     origin: str
 
 
-def worked_point(camera: Camera, errors: Errors | None) -> Worked:
-    """Work through the used correspondence nearest to 10 m, or a point on the optical axis.
+def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoint:
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis.
 
     Args:
-        camera: lens and pose.
-        errors: of its correspondences at that pose.
+        camera: lens and extrinsic.
+        errors: of its correspondences there; None if there are none.
     """
     T = camera.T_camera_lidar
-    used = None if errors is None else errors.select(errors.inside)
+    used = None if errors is None else errors.select(errors.is_inlier)
     if used is None or not len(used.frame):
         point = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M]))
         origin, matched = "a point 10 m ahead on the optical axis", ""
@@ -54,28 +54,28 @@ def worked_point(camera: Camera, errors: Errors | None) -> Worked:
             f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
             f"residual {used.sizes_px[row]:.2f} px"
         )
-    return Worked(_matrix(T), _steps(camera, point) + matched, _inverse(T), origin)
+    return WorkedPoint(_matrix(T), _steps(camera, point) + matched, _inverse(T), origin)
 
 
 def _steps(camera: Camera, point: Array) -> str:
     T = camera.T_camera_lidar
-    turned = T[:3, :3] @ point
-    seen = turned + T[:3, 3]
-    pixel = camera.lens.project(seen[None])[0][0]
+    rotated = T[:3, :3] @ point
+    p_camera = rotated + T[:3, 3]
+    pixel = camera.lens.project(p_camera[None])[0][0]
     return (
         f"p_lidar                  = {_vector(point)} m\n"
-        f"R p_lidar                = {_vector(turned)} m\n"
-        f"p_camera = R p_lidar + t  = {_vector(seen)} m\n"
-        f"{_through_the_lens(camera, seen)}\n"
+        f"R p_lidar                = {_vector(rotated)} m\n"
+        f"p_camera = R p_lidar + t  = {_vector(p_camera)} m\n"
+        f"{_lens_steps(camera, p_camera)}\n"
         f"projected pixel (u, v)   = ({pixel[0]:.2f}, {pixel[1]:.2f}) px"
     )
 
 
-def _through_the_lens(camera: Camera, seen: Array) -> str:
-    """How p_camera becomes a pixel: the formula, for the lens that has a short one."""
+def _lens_steps(camera: Camera, p_camera: Array) -> str:
+    """From p_camera to the pixel: the formula if the lens has no distortion, else its name."""
     k = camera.intrinsics_px
     if camera.model == "pinhole" and not any(camera.distortion):
-        x, y, z = seen
+        x, y, z = p_camera
         return (
             f"u = fx x/z + cx          = {k.fx:.3f} * {x:.3f} / {z:.3f} + {k.cx:.3f}\n"
             f"v = fy y/z + cy          = {k.fy:.3f} * {y:.3f} / {z:.3f} + {k.cy:.3f}"
@@ -92,11 +92,11 @@ def _matrix(T: Array) -> str:
     return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
 
 
-def _inverse(T: Array) -> str:
+def _inverse(T_camera_lidar: Array) -> str:
     """Translation and quaternion of T_lidar_camera."""
-    inverse = invert(T)
-    x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+    T_lidar_camera = invert(T_camera_lidar)
+    x, y, z, w = Rotation.from_matrix(T_lidar_camera[:3, :3]).as_quat()
     return (
-        f"translation x y z   = {' '.join(f'{v:.6f}' for v in inverse[:3, 3])} m\n"
+        f"translation x y z   = {' '.join(f'{v:.6f}' for v in T_lidar_camera[:3, 3])} m\n"
         f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
     )

@@ -1,1 +1,1 @@
-"""Simulated rigs with known truth: correspondences with a matcher's errors, and sensor data."""
+"""Simulated rigs with a known truth: sensor data, and correspondences with a matcher's errors."""

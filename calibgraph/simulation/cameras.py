@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
-from calibgraph.simulation.world import World, cast, colours
+from calibgraph.simulation.world import World, cast, shade
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 SAMPLES_PX = np.array([[-0.375, 0.125], [-0.125, -0.375], [0.125, 0.375], [0.375, -0.125]])
-"""Where a pixel is sampled, from its centre: no two in one row or column, so edges are smooth."""
+"""Sample positions from a pixel's centre: no two in one row or column, so that edges are smooth."""
 MAX_FIELD_RAD = math.radians(95.0)
 _GAMMA = 1 / 2.2
 _BLOCK_PX = 2**17
@@ -28,11 +28,11 @@ _MISS_PX = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Imaging:
-    """What happens to light behind a lens.
+    """Blur, noise and exposure of an image.
 
     Attributes:
         blur_px: standard deviation of the optical blur.
-        noise: standard deviation per pixel and channel, as a share of the range.
+        noise: standard deviation per pixel and channel, as a share of the value range.
         exposure_spread: standard deviation of the logarithm of the exposure, per image.
     """
 
@@ -43,13 +43,13 @@ class Imaging:
 
 @dataclass(frozen=True, eq=False)
 class CameraRays:
-    """The rays of a camera, which its pictures share.
+    """The rays of a camera.
 
     Attributes:
-        directions: (height, width, samples, 3) unit vectors in the camera's frame; 0 where the
-            lens sees nothing.
-        blind: (height, width) pixels that the lens leaves black.
-        pixel_rad: the angle of a pixel, about.
+        directions: (height, width, samples, 3) unit vectors in the camera's frame; 0 outside
+            the field of view.
+        blind: (height, width) pixels outside the field of view, which stay black.
+        pixel_rad: approximate angular width of a pixel.
     """
 
     directions: Floats
@@ -58,7 +58,7 @@ class CameraRays:
 
 
 def camera_rays(camera: Camera) -> CameraRays:
-    """The rays through the samples of every pixel."""
+    """Cast rays through the samples of every pixel."""
     v, u = np.indices((camera.height_px, camera.width_px), dtype=np.float64)
     pixels = np.stack([u, v], axis=-1)[:, :, None] + SAMPLES_PX
     rays = pixel_directions(camera, pixels.reshape(-1, 2)).astype(np.float32)
@@ -68,7 +68,7 @@ def camera_rays(camera: Camera) -> CameraRays:
 
 
 def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
-    """The directions in which a camera's pixels look.
+    """Viewing directions of pixels: the inverse of the lens's projection.
 
     Args:
         camera: its lens.
@@ -76,7 +76,7 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
 
     Returns:
         (n, 3) unit vectors in the camera's frame; 0 where the lens projects no direction to the
-        pixel, or one that is more than 95 degrees off its axis.
+        pixel, or one more than 95 degrees off its axis.
     """
     undistorted = _fisheye_directions if camera.model == "fisheye" else _pinhole_directions
     directions = undistorted(camera, pixels_px)
@@ -95,12 +95,12 @@ def render(
     rng: np.random.Generator,
     imaging: Imaging | None = None,
 ) -> Image:
-    """Take a picture.
+    """Render an image.
 
     Args:
-        world: what is seen.
+        world: surfaces and light.
         rays: of the camera.
-        T_world_camera: (4, 4) pose of the camera, whose x is right, y down, z forward.
+        T_world_camera: (4, 4); camera x is right, y down, z forward.
         rng: draws exposure and noise.
         imaging: blur and noise.
 
@@ -108,7 +108,7 @@ def render(
         (height, width, 3) BGR.
     """
     imaging = imaging or Imaging()
-    linear = light(world, rays, T_world_camera)
+    linear = trace_light(world, rays, T_world_camera)
     linear *= math.exp(rng.normal(0, imaging.exposure_spread))
     if imaging.blur_px > 0:
         linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), imaging.blur_px))
@@ -117,25 +117,29 @@ def render(
     return (255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
 
-def light(world: World, rays: CameraRays, T_world_camera: Array) -> Floats:
-    """(height, width, 3) the light on a camera's pixels, linear BGR; black beyond the lens."""
+def trace_light(world: World, rays: CameraRays, T_world_camera: Array) -> Floats:
+    """(height, width, 3) linear BGR light on the pixels; black outside the field of view."""
     height, width = rays.directions.shape[:2]
     rows = max(1, _BLOCK_PX // width)
     blocks = [rays.directions[row : row + rows] for row in range(0, height, rows)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        parts = pool.map(lambda block: _block(world, block, T_world_camera, rays.pixel_rad), blocks)
+        parts = pool.map(
+            lambda block: _trace_block(world, block, T_world_camera, rays.pixel_rad), blocks
+        )
         image = np.concatenate(list(parts))
     image[rays.blind] = 0
     return image
 
 
-def _block(world: World, directions: Floats, T_world_camera: Array, pixel_rad: float) -> Floats:
+def _trace_block(
+    world: World, directions: Floats, T_world_camera: Array, pixel_rad: float
+) -> Floats:
     """(rows, width, 3) light on some rows of pixels."""
     outwards = directions.reshape(-1, 3) @ T_world_camera[:3, :3].T.astype(np.float32)
     origin = T_world_camera[:3, 3]
     hits = cast(world, origin, outwards)
-    seen = colours(world, origin, outwards, hits, pixel_rad=pixel_rad).reshape(directions.shape)
-    total = seen[:, :, 0] + seen[:, :, 1] + seen[:, :, 2] + seen[:, :, 3]  # as mean() is slow
+    light = shade(world, origin, outwards, hits, pixel_rad=pixel_rad).reshape(directions.shape)
+    total = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3]  # as mean() is slow
     return np.asarray(total / len(SAMPLES_PX))
 
 
@@ -148,7 +152,7 @@ def _pinhole_directions(camera: Camera, pixels_px: Array) -> Array:
 
 
 def _fisheye_directions(camera: Camera, pixels_px: Array) -> Array:
-    """OpenCV's own inverse ends at 90 degrees; this one at the end of the lens."""
+    """OpenCV's inverse is limited to 90 degrees; this one to the monotonic range of the lens."""
     k = camera.intrinsics_px
     x, y = (pixels_px[:, 0] - k.cx) / k.fx, (pixels_px[:, 1] - k.cy) / k.fy
     distorted = np.hypot(x, y)
@@ -158,7 +162,7 @@ def _fisheye_directions(camera: Camera, pixels_px: Array) -> Array:
 
 
 def _undistorted_angle(distortion: Array, distorted: Array, limit_rad: float) -> Array:
-    """Angles [rad] off the axis, up to a limit below which their distorted ones rise."""
+    """Angles [rad] off the axis, up to the limit of the monotonic range."""
     powers = np.array([3, 5, 7, 9])
     table = np.linspace(0, min(limit_rad, MAX_FIELD_RAD + 0.1), 2000)
     bent = table + (table[:, None] ** powers) @ distortion

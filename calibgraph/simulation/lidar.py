@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.simulation.world import World, albedos, cast
+from calibgraph.simulation.world import World, cast, find_albedos
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -22,17 +23,19 @@ class Lidar:
     Attributes:
         elevations_deg: of the beams, evenly spaced.
         azimuth_step_deg: between two shots of a beam.
-        min_range_m: nearer returns are not given.
-        max_range_m: farther returns are not given.
+        azimuths_deg: first and last azimuth of the shots, from the x axis to the left.
+        min_range_m: nearer returns are dropped.
+        max_range_m: farther returns are dropped.
         range_noise_m: standard deviation.
         intensity_noise: standard deviation.
         ring_spread: standard deviation of the beams' gains, about 1.
-        dropout: share of shots that are lost by chance.
-        weakest: albedo, head on at 100 m, of which 1 - 1/e of the shots return.
+        dropout: share of shots that are lost at random.
+        weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
     """
 
     elevations_deg: tuple[float, ...]
     azimuth_step_deg: float = 0.2
+    azimuths_deg: tuple[float, float] = (-180.0, 180.0)
     min_range_m: float = 1.0
     max_range_m: float = 100.0
     range_noise_m: float = 0.02
@@ -42,47 +45,55 @@ class Lidar:
     weakest: float = 0.06
 
 
-_FIELD_DEG = {16: (15.0, -15.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
+_ELEVATIONS_DEG = {16: (15.0, -15.0), 32: (10.0, -25.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
+_SECTOR_BEAMS = 32
+_SECTOR = {"azimuths_deg": (-46.0, 114.0), "azimuth_step_deg": 0.4}  # small clouds: data/sample
 
 
 def lidar_of(beams: int) -> Lidar:
-    """A LiDAR by its number of beams: 16 (15 to -15 deg), 64 (2 to -24.8), 128 (15 to -25).
+    """A LiDAR by its number of beams.
+
+    Args:
+        beams: 16 (15 to -15 deg), 64 (2 to -24.8) or 128 (15 to -25), every 0.2 deg all round; or
+            32 (10 to -25), every 0.4 deg from 46 deg to the right to 114 deg to the left.
 
     Raises:
-        ValueError: if there is none of so many.
+        ValueError: for another number of beams.
     """
-    if beams not in _FIELD_DEG:
-        known = ", ".join(map(str, _FIELD_DEG))
+    if beams not in _ELEVATIONS_DEG:
+        known = ", ".join(map(str, _ELEVATIONS_DEG))
         raise ValueError(f"{beams} beams: a LiDAR has one of {known}")
-    return Lidar(elevations_deg=tuple(np.linspace(*_FIELD_DEG[beams], beams).tolist()))
+    elevations_deg = tuple(np.linspace(*_ELEVATIONS_DEG[beams], beams).tolist())
+    sector: dict[str, Any] = _SECTOR if beams == _SECTOR_BEAMS else {}
+    return Lidar(elevations_deg=elevations_deg, **sector)
 
 
 def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
-    """(beams,) the gain of each beam's intensity, which a LiDAR keeps."""
+    """(beams,) intensity gains, constant over a recording."""
     return 1 + lidar.ring_spread * rng.standard_normal(len(lidar.elevations_deg))
 
 
 def scan(
     world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, rng: np.random.Generator
 ) -> Points:
-    """Scan the world, all of one instant: the points of a moving sensor, motion taken out.
+    """Scan the world in one instant, as a moving sensor after motion compensation.
 
-    A shot has no width: points lie on one surface or another, never between.
+    A shot has no width: every point lies on a surface.
 
     Args:
-        world: what is scanned.
+        world: surfaces.
         lidar: the sensor.
         gains: (beams,) of the intensities.
-        T_world_lidar: (4, 4) pose of the LiDAR, whose x is ahead, y left, z up.
+        T_world_lidar: (4, 4); LiDAR x is forward, y left, z up.
         rng: draws noise, dropouts and the order.
 
     Returns:
-        (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in no order.
+        (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in random order.
     """
     shots = shot_directions(lidar)
     directions = (shots @ T_world_lidar[:3, :3].T).astype(np.float32)
     hits = cast(world, T_world_lidar[:3, 3], directions)
-    albedo, incidence = albedos(world, directions, hits)
+    albedo, incidence = find_albedos(world, directions, hits)
     gain = np.repeat(gains, len(shots) // len(gains))
     intensity = albedo[:, 3] * (0.55 + 0.45 * incidence) * gain
     intensity += rng.normal(0, lidar.intensity_noise, len(shots))
@@ -96,7 +107,7 @@ def scan(
 
 def shot_directions(lidar: Lidar) -> Array:
     """(beams * steps, 3) unit vectors in the LiDAR's frame, beam by beam."""
-    azimuth_deg = np.arange(-180, 180, lidar.azimuth_step_deg)
+    azimuth_deg = np.arange(*lidar.azimuths_deg, lidar.azimuth_step_deg)
     azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(lidar.elevations_deg))
     flat = np.cos(elevation)
     shots = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
@@ -104,7 +115,7 @@ def shot_directions(lidar: Lidar) -> Array:
 
 
 def return_chance(lidar: Lidar, brightness: Array, distance_m: Array) -> Array:
-    """(n,) chance that a shot comes back: of weak light, from dark, far or slanted surfaces, less.
+    """(n,) probability that a shot returns: lower from dark, far and slanted surfaces.
 
     Args:
         lidar: the sensor.

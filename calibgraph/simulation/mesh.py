@@ -1,4 +1,4 @@
-"""Triangles with paint on them: the solids of a street, and ribbons of ground along a line."""
+"""Painted triangles: the solids of a street, and ribbons of ground along a line."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Mesh:
 
     Attributes:
         corners_m: (t, 3, 3) in the world.
-        uv_m: (t, 3, 2) the corners' places on the paint.
+        uv_m: (t, 3, 2) the corners' coordinates on the paint.
         albedo: (t, 4) under the paint.
         paint: (t,) index of the paint in ``paints``.
-        paints: what is painted with.
+        paints: distinct paints.
     """
 
     corners_m: Array
@@ -38,8 +38,8 @@ class Mesh:
     paints: tuple[Paint, ...]
 
 
-def mesh_of(parts: Iterable[Mesh]) -> Mesh:
-    """Several meshes as one; each paint is kept once."""
+def join_meshes(parts: Iterable[Mesh]) -> Mesh:
+    """Join several meshes; each paint is kept once."""
     parts = list(parts)
     index = {paint: i for i, paint in enumerate(dict.fromkeys(p for m in parts for p in m.paints))}
     new = [np.array([index[paint] for paint in part.paints])[part.paint] for part in parts]
@@ -53,7 +53,7 @@ def mesh_of(parts: Iterable[Mesh]) -> Mesh:
 
 
 def mesh_of_solid(solid: Solid) -> Mesh:
-    """A solid's surface; round ones become many-sided."""
+    """The surface of a solid; round ones become many-sided."""
     unit = _unit_shape(solid.round_axes, bool(solid.bumps)).copy()
     if solid.bumps:
         unit *= 1 + solid.bumps * _lumps(unit, np.asarray(solid.base_m))[..., None]
@@ -130,7 +130,7 @@ def _unit_cylinder() -> Array:
 
 
 def _unit_sphere(splits: int) -> Array:
-    """An octahedron, each triangle split into four so many times, on the unit sphere."""
+    """An octahedron whose triangles are repeatedly split into four, on the unit sphere."""
     axes = np.eye(3)
     triangles = np.array([
         [x * axes[0], y * axes[1], z * axes[2]] for x in (1, -1) for y in (1, -1) for z in (1, -1)
@@ -145,7 +145,7 @@ def _unit_sphere(splits: int) -> Array:
 
 
 def _lumps(unit: Array, seed: Array) -> Array:
-    """Smooth noise of about unit deviation on a sphere (t, 3, 3), other for every seed (3,)."""
+    """Smooth noise of about unit deviation on a sphere (t, 3, 3), by a seed (3,)."""
     waves = np.array([[3, 1, 2], [-2, 4, 1], [1, -3, 4], [5, 2, -3], [-4, -5, 6], [7, -6, 3]])
     phases = unit @ waves.T * 1.7 + waves @ (seed * [1.3, 2.1, 0.7])
     return np.asarray(np.sin(phases).sum(axis=-1) / np.sqrt(len(waves) / 2))

@@ -13,7 +13,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Texture = NDArray[np.float64]
 Albedo = tuple[float, ...]
 
 KERB_Y_M, LANE_M = 5.8, 3.5
@@ -36,15 +35,15 @@ _NOTHING = (-1.0, -1.0, -1.0, -1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Paint:
-    """Grained cells between lines of ink, or one of the patterns that are built upon them.
+    """Grained cells between lines of ink, and a pattern over them.
 
     Attributes:
         cell_m: size of a cell along u and v.
         line_m: width of the lines at each cell's lower edges.
         ink: albedo of the lines.
         roughness: standard deviation of the logarithm of the grain.
-        pattern: what is painted over the cells: nothing, a facade, or a road.
-        origin_m: u and v where the pattern starts.
+        pattern: over the cells: none, a facade, or a road.
+        origin_m: (u, v) of the pattern's origin.
     """
 
     cell_m: tuple[float, float] = (9.0, 9.0)
@@ -55,7 +54,7 @@ class Paint:
     origin_m: tuple[float, float] = (0.0, 0.0)
 
     def packed(self) -> Array:
-        """(11,) as the kernels take it."""
+        """(11,) all numbers, for the kernels."""
         return np.array(
             [self.pattern, *self.cell_m, self.line_m, *self.ink, self.roughness, *self.origin_m]
         )
@@ -72,34 +71,17 @@ FACADE = Paint(cell_m=(9.0, 0.375), line_m=0.03, ink=BARK, pattern=_FACADE)
 ROAD = Paint(roughness=0.2, pattern=_ROAD)
 
 
-def painted(paint: Paint, uv_m: Array, grain: Array, base: Albedo) -> Array:
-    """Albedos of a surface's points.
-
-    Args:
-        paint: on the surface.
-        uv_m: (n, 2) coordinates on the surface; of a facade across and up, of a road along and
-            to the left.
-        grain: (n,) noise of unit deviation.
-        base: albedo under the pattern.
-
-    Returns:
-        (n, 4) blue, green, red, near infrared.
-    """
-    return np.asarray(_painted(paint.packed(), uv_m, grain, np.array(base)))
-
-
-@njit(cache=True)
-def _painted(packed, uv, grain, base):  # type: ignore[no-untyped-def]
-    albedo = np.empty((len(uv), 4))
-    under = (base[0], base[1], base[2], base[3])
-    for i in range(len(uv)):
-        albedo[i] = paint_one(packed, uv[i, 0], uv[i, 1], grain[i], under)
-    return albedo
-
-
 @njit(cache=True)
 def paint_one(packed, u, v, grain, base):  # type: ignore[no-untyped-def]
-    """The albedo, four numbers, of one point: see :func:`painted`; ``packed`` is the paint's."""
+    """The albedo of one point: blue, green, red, near infrared.
+
+    Args:
+        packed: (11,) the paint, see :meth:`Paint.packed`.
+        u: coordinate on the surface; of a facade across, of a road along it.
+        v: coordinate; of a facade up, of a road to the left.
+        grain: noise of unit deviation.
+        base: albedo under the pattern.
+    """
     x, y = u - packed[9], v - packed[10]
     over = _NOTHING
     if packed[0] == _ROAD:
@@ -134,7 +116,7 @@ def _in_facade(x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _on_road(x, y, grain):  # type: ignore[no-untyped-def]
-    """Markings where they are not worn off, the lids of shafts, repairs."""
+    """Markings that are not worn off, manhole covers, repairs."""
     if abs(y) < KERB_Y_M and grain < _WORN and _is_marked(x, y):
         return MARKING
     if math.hypot(x % 13 - 6, abs(y) - 2.4) < 0.32:
@@ -147,7 +129,7 @@ def _on_road(x, y, grain):  # type: ignore[no-untyped-def]
 def _is_marked(x, y):  # type: ignore[no-untyped-def]
     """Lane lines, parking bays, stop lines, crossings and arrows."""
     off_lane, block, arrow = abs(abs(y) - LANE_M / 2), x % 34, x % 17
-    if abs(block - 16) < 1.5:  # a crossing, and nothing else
+    if abs(block - 16) < 1.5:  # a crossing has no other markings
         return abs(y % 1 - 0.25) < 0.25
     lane_line = (abs(y) < 0.07 and abs(x % 6 - 1.5) < 1.5) or abs(abs(y) - LANE_M) < 0.07
     bay = abs(abs(y) - 4.6) < 1.1 and abs(x % 6 - 0.06) < 0.06
@@ -159,5 +141,5 @@ def _is_marked(x, y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _scramble(i, j):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) for every cell."""
+    """A pseudo-random number in [0, 1) for a cell."""
     return math.sin(i * 12.9898 + j * 78.233) * 43758.5453 % 1

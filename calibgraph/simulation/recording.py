@@ -1,4 +1,4 @@
-"""A simulated recording: a rig drives along a street, and its sensors' data become a dataset."""
+"""A simulated recording: the dataset of a rig that drives along a street."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
-from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, pose
+from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
 from calibgraph.simulation.street import LANE_Y_M, Centreline, build_street, winding_line
 from calibgraph.simulation.world import World, build_world
 
 Array = NDArray[np.float64]
 
 MAX_STREET_M = 2000
-"""Longer ones take gigabytes of memory."""
+"""Longer streets take gigabytes of memory."""
 MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE = range(5)  # each draws from a stream of its own
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE = range(5)  # each has its own random stream
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A world, and where the LiDAR stands in it when each frame is taken.
+    """A world, and the LiDAR's pose in every frame.
 
     Attributes:
         world: the street.
-        T_world_lidar: per frame (4, 4).
+        T_world_lidar: (4, 4) per frame.
     """
 
     world: World
@@ -64,29 +64,29 @@ def simulate_street(
     translation_m: float = 0.3,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Drive a rig along a procedural street and write what its sensors see as a dataset.
+    """Simulate a drive along a procedural street and write it as a dataset.
 
-    All sensors of a frame see one instant: there is no rolling shutter, and scans are free of the
-    motion. The same arguments give the same files.
+    All data of a frame are of one instant: no rolling shutter, no motion during a scan. The same
+    arguments give the same files.
 
     Args:
         out: folder to write: ``rig.yaml`` (the guess), ``reference.yaml`` (the truth), ``lidar``
             and ``cameras``.
-        rig: its poses are the truth. The LiDAR is 1.8 m above a road; its x is ahead, z up.
-        beams: of the LiDAR: 16, 64 or 128.
+        rig: its extrinsics are the truth. The LiDAR is 1.8 m above the road, x forward, z up.
+        beams: of the LiDAR: 16, 32 (a sector ahead and to the left), 64 or 128.
         frames: stops of the drive.
-        step_m: distance between stops, on average; all steps are at most 2 km.
+        step_m: mean distance between stops; 2 km in all at most.
         seed: of the street, the drive, the noise and the guess.
-        rotation_deg: how far the guess is off; see :func:`calibgraph.perturb`.
-        translation_m: the same.
-        progress: called with what is done, how much of it, and of how much.
+        rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
+        translation_m: its translation error.
+        progress: called with the stage, its steps done, and their number.
 
     Returns:
         The rig files and the folders.
 
     Raises:
         ValueError: if an argument is out of range.
-        FileError: if there is a recording already.
+        FileError: if the folder holds a recording.
         CalibrationError: if Open3D is missing.
     """
     out, lidar = Path(out), lidar_of(beams)
@@ -94,69 +94,74 @@ def simulate_street(
     _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
-    tell = progress or no_progress
-    tell("building the street", 0, frames)
-    drive = street_drive(frames=frames, step_m=step_m, seed=seed)
+    progress = progress or no_progress
+    progress("building the street", 0, frames)
+    drive = build_drive(frames=frames, step_m=step_m, seed=seed)
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
-        _take_scans(made / "lidar", lidar, drive, seed, tell)
-        _take_pictures(made / "cameras", rig, drive, seed, tell)
+        _write_scans(made / "lidar", lidar, drive, seed, progress)
+        _write_images(made / "cameras", rig, drive, seed, progress)
         rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
-        names = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # last what makes it a dataset
+        names = (
+            "lidar",
+            "cameras",
+            REFERENCE_FILE,
+            RIG_FILE,
+        )  # rig.yaml last: it makes the folder a dataset
         for name in names:
             (made / name).rename(out / name)
     sync_folder(out)
     return [out / name for name in reversed(names)]
 
 
-def street_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
+def build_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
     """Build a street and drive along it; see :func:`simulate_street`."""
     rng = np.random.default_rng([seed, _WORLD])
     length_m = (frames - 1) * step_m * (1 + _SWAY_STEP)
     line = winding_line(length_m, rng)
-    world = build_world(build_street(line, length_m, rng), _sun(rng), rng)
-    return Drive(world, _stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
+    world = build_world(build_street(line, length_m, rng), _draw_sun(rng), rng)
+    return Drive(world, _draw_stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
 
 
-def _sun(rng: np.random.Generator) -> Array:
-    """Unit vector towards the sun, which is neither low nor overhead."""
+def _draw_sun(rng: np.random.Generator) -> Array:
+    """Unit vector towards the sun, 35 to 60 degrees above the horizon."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
     flat = np.cos(elevation)
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
-def _stops(
+def _draw_stops(
     line: Centreline, frames: int, step_m: float, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Transforms of the LiDAR, swaying in its lane."""
+    """T_world_lidar of every stop, with random offsets within the lane."""
     stops, s = [], 0.0
     for _ in range(frames):
         (x, y), heading_deg = line.at(s, LANE_Y_M + rng.normal(0, _SWAY_Y_M))
         yaw, pitch, roll = rng.normal(0, _SWAY_DEG)
         turns = (heading_deg + yaw) * UNIT_Z, pitch * UNIT_Y, roll * UNIT_X
-        stops.append(pose((x, y, _LIDAR_Z_M), *turns))
+        stops.append(to_transform((x, y, _LIDAR_Z_M), *turns))
         s += step_m * rng.uniform(1 - _SWAY_STEP, 1 + _SWAY_STEP)
     return tuple(stops)
 
 
-def _take_scans(folder: Path, lidar: Lidar, drive: Drive, seed: int, tell: Progress) -> None:
+def _write_scans(folder: Path, lidar: Lidar, drive: Drive, seed: int, progress: Progress) -> None:
     gains = ring_gains(lidar, np.random.default_rng([seed, _GAINS]))
     for frame, T_world_lidar in enumerate(drive.T_world_lidar):
-        tell("scanning", frame, len(drive.T_world_lidar))
+        progress("scanning", frame, len(drive.T_world_lidar))
         rng = np.random.default_rng([seed, _SCAN, frame])
         cloud = scan(drive.world, lidar, gains, T_world_lidar, rng)
         _write_cloud(folder / f"{frame:06d}.npy", cloud)
 
 
-def _take_pictures(folder: Path, rig: Rig, drive: Drive, seed: int, tell: Progress) -> None:
-    """All pictures, camera by camera: the rays of one are much to keep."""
+def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, progress: Progress) -> None:
+    """All images, camera by camera: the rays of a camera take much memory."""
     frames = len(drive.T_world_lidar)
     for index, (name, camera) in enumerate(rig.cameras.items()):
         rays = camera_rays(camera)
         for frame, T_world_lidar in enumerate(drive.T_world_lidar):
-            tell(f"taking pictures, {name}", index * frames + frame, frames * len(rig.cameras))
+            progress(f"rendering {name}", index * frames + frame, frames * len(rig.cameras))
             rng = np.random.default_rng([seed, _IMAGE, index, frame])
             T_world_camera = relative_transform(T_world_lidar, camera.T_camera_lidar)
             image = render(drive.world, rays, T_world_camera, rng)

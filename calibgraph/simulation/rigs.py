@@ -1,4 +1,4 @@
-"""Rigs to simulate with, by name; their poses are the truth."""
+"""Rigs to simulate with, by name; their extrinsics are the truth."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ def rig_of(name: str) -> Rig:
     Args:
         name: ``kitti``: a stereo pair 54 cm apart, 1241 x 376, as in KITTI's odometry sequences;
             ``walkley``: a pair 60 cm apart, 1920 x 1200, wider and distorted; ``surround``: six
-            cameras all round, 1280 x 800, distorted, their images hardly overlap; ``fisheye``: four
-            fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle.
+            cameras all round, 1280 x 800, distorted, with little overlap; ``fisheye``: four
+            fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle; ``sample``: two
+            cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
 
     Raises:
         ValueError: if there is no such rig.
@@ -46,8 +47,28 @@ def _kitti() -> dict[str, Camera]:
     }
 
 
+def _sample() -> dict[str, Camera]:
+    """Small images: two cameras ahead, and a distorted one to the left."""
+    wide = (-0.14, 0.035, 0.0006, -0.0004, -0.003)
+    views = {
+        "front_left": ((481.3, 480.6, 318.9, 181.2), (), (0.42, 0.26, -0.34), (6, 4, 0.5)),
+        "front_right": ((478.2, 478.9, 321.4, 178.6), (), (0.41, -0.25, -0.35), (-7, 3.5, -0.7)),
+        "left": ((476.5, 477.1, 320.7, 180.9), wide, (0.08, 0.40, -0.30), (75, 5, 0.9)),
+    }
+    return {
+        name: Camera(
+            width_px=640,
+            height_px=360,
+            intrinsics_px=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
+            distortion=distortion,
+            T_camera_lidar=_mounted(xyz_m, turns_deg),
+        )
+        for name, ((fx, fy, cx, cy), distortion, xyz_m, turns_deg) in views.items()
+    }
+
+
 def _walkley() -> dict[str, Camera]:
-    """The paper gives the images' size; lenses and places are ours."""
+    """The image size is the paper's; lenses and placement are ours."""
     lens = (-0.11, 0.07, 0.0004, -0.0003)
     views = {"primary": (0.3, (1.2, 2.1, 0.3)), "secondary": (-0.3, (-0.8, 1.6, -0.5))}
     return {
@@ -100,16 +121,17 @@ _FISHEYE_YAW_DEG = {"front": 0.0, "left": 91.0, "back": 180.0, "right": -89.0}
 
 _RIGS: dict[str, Callable[[], dict[str, Camera]]] = {
     "kitti": _kitti, "walkley": _walkley, "surround": _surround, "fisheye": _fisheye,
+    "sample": _sample,
 }  # fmt: skip
 RIG_NAMES = tuple(_RIGS)
 
 
 def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, ...]) -> Array:
-    """(4, 4) T_camera_lidar of a camera by its place and turns in the LiDAR's frame.
+    """(4, 4) T_camera_lidar of a camera, from its placement in the LiDAR's frame.
 
     Args:
-        xyz_m: (3,) place; x is forward, y left, z up.
-        yaw_pitch_roll_deg: turns about z, then y (down is positive), then x.
+        xyz_m: (3,) position; x is forward, y left, z up.
+        yaw_pitch_roll_deg: rotations about z, then y (down is positive), then x.
     """
     T = np.eye(4)
     turned = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix()

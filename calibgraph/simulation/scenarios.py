@@ -1,4 +1,4 @@
-"""Named scenarios of correspondences: a rig, and how its matcher errs."""
+"""Named scenarios of correspondences: a rig, and the errors of its matcher."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ from calibgraph.files import require_place_for_folder
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
-from calibgraph.simulation.correspondences import (
-    MatcherErrors,
-    PoseSpread,
-    simulate_correspondences,
-)
+from calibgraph.simulation.correspondences import simulate_correspondences
+from calibgraph.simulation.matcher_errors import MatcherErrors, PoseSpread
 from calibgraph.simulation.rigs import rig_of
 
 MAX_FRAMES = 10_000
@@ -27,7 +24,7 @@ class Scenario:
     """A rig in a street, and a matcher.
 
     Attributes:
-        rig: its poses are the truth.
+        rig: its extrinsics are the truth.
         errors: of the matcher, per camera.
     """
 
@@ -35,7 +32,7 @@ class Scenario:
     errors: Mapping[str, MatcherErrors]
 
     def draw(self, frames: int, seed: int) -> Correspondences:
-        """The correspondences of a drive."""
+        """Draw the correspondences of a drive."""
         return simulate_correspondences(
             self.rig, frames=frames, matches=MATCHES, errors=self.errors, depth_m=None, seed=seed
         )
@@ -49,17 +46,17 @@ def simulate_table(
     Args:
         out: folder to write: ``correspondences.parquet``, ``reference.yaml`` and ``rig.yaml``.
         name: of the scenario.
-        frames: how many.
-        rotation_deg: how far the guess is off; see :func:`calibgraph.perturb`.
-        translation_m: the same.
-        seed: of every draw.
+        frames: number of frames.
+        rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
+        translation_m: its translation error.
+        seed: of all draws.
 
     Returns:
-        What was written.
+        The files.
 
     Raises:
         ValueError: if there is no such scenario, or an argument is out of range.
-        FileError: if there is something already.
+        FileError: if one of the files exists.
     """
     scenario = scenario_of(name)
     if not 1 <= frames <= MAX_FRAMES:
@@ -79,8 +76,8 @@ def simulate_table(
 def scenario_of(name: str) -> Scenario:
     """A scenario by name.
 
-    Two are made to resemble what the paper reports of its Stage 1, and nothing else of the paper.
-    Ours below are medians of 30 draws of 10 frames; 10 draws of 100 frames.
+    Two resemble the paper's Stage-1 results, and nothing else of the paper. Ours below are medians
+    of 30 draws of 10 frames; 10 draws of 100 frames.
 
     * ``kitti``: left 1.1; 2.6 cm, right 6.0; 6.2 cm, of which 6 cm to the side in both rows, so in
       all frames; about 0.1 deg, between cameras 0.2 deg; confidences "high and uniform". (E_R of
@@ -88,7 +85,7 @@ def scenario_of(name: str) -> Scenario:
       left 2.1 cm, 0.13 deg; 1.8 cm, 0.09 deg; right 5.8 cm, 0.12 deg; 4.6 cm, 0.19 deg; between
       0.23; 0.24 deg.
     * ``walkley``: 151 and 42 cm, 0.9 and 0.6 deg; 87 and 109 cm, 1.1 and 1.7 deg, mostly along
-      the axis, no better with hundred frames than with ten: so most frames err alike. Ours:
+      the axis, no better with 100 frames than with 10: so most frames share their error. Ours:
       85 and 69 cm, 1.0 and 0.8 deg; 51 and 87 cm, 0.8 and 1.4 deg.
 
     ``surround`` and ``fisheye`` have six and four cameras and a matcher in between.

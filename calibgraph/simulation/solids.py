@@ -1,4 +1,4 @@
-"""The things that stand in a simulated street, put together from a few simple solids.
+"""The objects of a simulated street, composed of a few simple solids.
 
 Frames: x along the street, y to the left of it, z up.
 """
@@ -38,11 +38,11 @@ UNIT_X, UNIT_Y, UNIT_Z = np.eye(3)
 UV_AXES = np.array([[1, 2], [0, 2], [0, 1]])
 """Which two axes are a surface's u and v, by the dominant axis of its normal."""
 UNPAINTED: Albedo = ()
-"""Takes its colour where it is placed."""
+"""The colour is chosen by :func:`place`."""
 
 
-def pose(xyz_m: Array | tuple[float, ...], *turns_deg: Array) -> Array:
-    """(4, 4) transform from a position and rotation vectors in degrees, the last turned first."""
+def to_transform(xyz_m: Array | tuple[float, ...], *turns_deg: Array) -> Array:
+    """(4, 4) transform of a position and rotation vectors in degrees; the last is applied first."""
     T = np.eye(4)
     for turn_deg in turns_deg:
         T[:3, :3] @= cv2.Rodrigues(np.deg2rad(turn_deg))[0]
@@ -55,15 +55,15 @@ class Solid:
     """A box, an upright cylinder or an ellipsoid.
 
     Attributes:
-        round_axes: how many of its leading axes are round: 0, 2 or 3.
+        round_axes: number of leading axes that are round: 0, 2 or 3.
         base_m: (3,) centre of the underside.
         size_m: extents along its own axes.
         albedo: its colour.
-        paint: what is on it.
-        yaw_deg: its turn about z.
+        paint: over the albedo.
+        yaw_deg: rotation about z.
         taper: extents of its top along x and y, as shares of those of the underside.
         bumps: standard deviation of the radius of its surface, as a share, for leaves.
-        uv_from_m: where on the paint it starts.
+        uv_from_m: (u, v) of the surface's corner on the paint.
     """
 
     round_axes: int
@@ -80,7 +80,9 @@ class Solid:
     def frame(self) -> Array:
         """(4, 4) from the shape of half extents 1 at the origin to the world."""
         half = np.divide(self.size_m, 2)
-        return pose(np.add(self.base_m, half * UNIT_Z), self.yaw_deg * UNIT_Z) @ np.diag((*half, 1))
+        return to_transform(np.add(self.base_m, half * UNIT_Z), self.yaw_deg * UNIT_Z) @ np.diag(
+            (*half, 1)
+        )
 
 
 _Three = tuple[float, float, float]
@@ -158,19 +160,19 @@ HEDGE = (
 def place(
     parts: Iterable[Solid], xy_m: tuple[float, float], *, yaw_deg: float, body: Albedo
 ) -> list[Solid]:
-    """Stand parts somewhere.
+    """Place an object in the world.
 
     Args:
-        parts: with their own origin.
-        xy_m: where it comes to stand.
-        yaw_deg: its turn about z.
-        body: colour of the unpainted ones.
+        parts: in a common frame.
+        xy_m: position of its origin.
+        yaw_deg: rotation about z.
+        body: albedo of the unpainted parts.
     """
-    stand = pose((*xy_m, 0), yaw_deg * UNIT_Z)
+    T_world_parts = to_transform((*xy_m, 0), yaw_deg * UNIT_Z)
     return [
         replace(
             part,
-            base_m=tuple(stand[:3, :3] @ np.asarray(part.base_m) + stand[:3, 3]),
+            base_m=tuple(T_world_parts[:3, :3] @ np.asarray(part.base_m) + T_world_parts[:3, 3]),
             albedo=part.albedo or body,
             yaw_deg=yaw_deg + part.yaw_deg,
         )

@@ -1,7 +1,7 @@
 """A procedural street that winds: ground with markings, houses, trees, poles, cars, people.
 
-Frames: the world is x ahead on the whole, y left, z up; a place in the street is its distance s
-along the centreline and its distance y to the left of it.
+Frames: world x is ahead on average, y left, z up; a place in the street is its distance s along the
+centreline and its distance y to the left of it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.simulation.mesh import Mesh, mesh_of, mesh_of_solid, ribbon
+from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
 from calibgraph.simulation.paints import (
     ASPHALT,
     BARK,
@@ -57,7 +57,7 @@ Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 MARGIN_M = 70.0
-"""How far the street goes on behind the first stop and beyond the last."""
+"""Length of the street behind the first stop and beyond the last."""
 LANE_Y_M = -LANE_M / 2
 _PAVEMENT_Y_M, _GROUND_Y_M = 9.36, 24.0
 _WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wavelength [m]
@@ -69,11 +69,11 @@ _KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 @dataclass(frozen=True, eq=False)
 class Centreline:
-    """The line that a street follows.
+    """The centreline of a street.
 
     Attributes:
         along_m: (k,) distances s along it, rising.
-        xy_m: (k, 2) places.
+        xy_m: (k, 2) in the world.
         heading_rad: (k,) directions, unwrapped.
     """
 
@@ -114,7 +114,7 @@ def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     solids = [*_cars(line, length_m, rng), *_backdrop(line, rng)]
     for side in (1, -1):
         solids += [*_houses(line, side, rng), *_roadside(line, side, rng)]
-    return mesh_of([*_ground(line), *map(mesh_of_solid, solids)])
+    return join_meshes([*_ground(line), *map(mesh_of_solid, solids)])
 
 
 def _ground(line: Centreline) -> Iterator[Mesh]:
@@ -142,16 +142,16 @@ def _band(
     return ribbon(line.with_left, line.along_m, edges_m, albedo, paint)
 
 
-def _stand(
+def _place(
     line: Centreline, parts: Iterable[Solid], s_m: float, y_m: float, *, yaw_deg: float,
     body: Albedo,
 ) -> list[Solid]:  # fmt: skip
-    """Stand parts in the street, turned with it."""
+    """Place an object in the street, turned with it."""
     xy, heading_deg = line.at(s_m, y_m)
     return place(parts, xy, yaw_deg=heading_deg + yaw_deg, body=body)
 
 
-def _any_colour(rng: Rng) -> Albedo:
+def _draw_colour(rng: Rng) -> Albedo:
     return COLOURS[rng.integers(len(COLOURS))]
 
 
@@ -169,22 +169,22 @@ def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
     for s, y, yaw_deg in places:
         kind = _KINDS[rng.choice(len(_KINDS), p=_KIND_SHARES)]
         turned = yaw_deg + rng.normal(0, 2) + 180 * rng.integers(2)
-        yield from _stand(line, kind, s, y, yaw_deg=turned, body=_any_colour(rng))
+        yield from _place(line, kind, s, y, yaw_deg=turned, body=_draw_colour(rng))
 
 
 def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
-    """Rows of houses with gaps, in which there are fences and hedges."""
+    """Rows of houses; in the gaps there are fences and hedges."""
     s, turned = line.along_m[0], 0.0 if side > 0 else 180.0
     while s < line.along_m[-1]:
         bays, storeys = int(rng.integers(3, 6)), int(rng.integers(2, 5))
         front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * BAY_M / 2
         if rng.random() < _GAP:
-            yield from _stand(line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK)
-            yield from _stand(line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK)
+            yield from _place(line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK)
+            yield from _place(line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK)
             s += 11
             continue
-        parts, body = list(_house(bays, storeys, rng)), _any_colour(rng)
-        yield from _stand(line, parts, middle, side * front, yaw_deg=turned, body=body)
+        parts, body = list(_house(bays, storeys, rng)), _draw_colour(rng)
+        yield from _place(line, parts, middle, side * front, yaw_deg=turned, body=body)
         s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < _GAP else 0)
 
 
@@ -214,16 +214,16 @@ def _balconies(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
 
 
 def _roadside(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
-    """What stands on the pavements, and the people on them."""
+    """Furniture of the pavements, and people on them."""
     turned = 0.0 if side > 0 else 180.0
     for s in np.arange(line.along_m[0], line.along_m[-1], STRETCH_M) + rng.uniform(-1, 1):
-        colour, body = _any_colour(rng), _any_colour(rng)
-        yield from _stand(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
+        colour, body = _draw_colour(rng), _draw_colour(rng)
+        yield from _place(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
         person, person_y = s + rng.uniform(-5, 5), side * (KERB_Y_M + rng.uniform(1.2, 2.8))
-        yield from _stand(line, PERSON, person, person_y, yaw_deg=0, body=body)
+        yield from _place(line, PERSON, person, person_y, yaw_deg=0, body=body)
         if rng.random() < _ROADSIDE_TREE:
             yaw, tree_y = rng.uniform(0, 360), side * (_PAVEMENT_Y_M - 0.5)
-            yield from _stand(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
+            yield from _place(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
 
 
 def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
@@ -233,11 +233,11 @@ def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
         while x < line.xy_m[-1, 0] + 40:
             bays, storeys = int(rng.integers(4, 8)), int(rng.integers(3, 7))
             xy = x + bays * BAY_M / 2, side * (48 + rng.uniform(-4, 4))
-            body = _any_colour(rng)
+            body = _draw_colour(rng)
             yield from place(_block(bays, 4, storeys), xy, yaw_deg=rng.normal(0, 4), body=body)
             x += bays * BAY_M + rng.uniform(0, 8)
     for s in line.along_m[[0, -1]]:
-        yield from _stand(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=_any_colour(rng))
+        yield from _place(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=_draw_colour(rng))
 
 
 def _block(bays_along: int, bays_across: int, storeys: int) -> list[Solid]:

@@ -1,4 +1,4 @@
-"""A world of painted triangles that rays can be cast into, with its sun and its sky.
+"""A world of painted triangles with sun and sky, and the rays cast into it.
 
 Frame: z is up. Colours are linear, blue, green, red.
 """
@@ -28,15 +28,15 @@ _TEXELS, _TEXEL_M, _NOISE_SLOPE, _GRAIN_M = 1024, 0.02, 1.1, 0.15
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What rays meet.
+    """Triangles, paints and the sun.
 
     Attributes:
-        scene: Open3D's.
+        scene: Open3D's ``RaycastingScene``.
         surfaces: (t, 14) per triangle: normal, (u, v) of a corner, their change to the other two,
             albedo, row of ``paints``.
         paints: (p, 11) see :class:`calibgraph.simulation.paints.Paint`.
         grain: (n, n) periodic noise of unit deviation.
-        sun: (3,) unit vector towards it.
+        sun: (3,) unit vector towards the sun.
     """
 
     scene: Any
@@ -52,8 +52,8 @@ class Hits:
 
     Attributes:
         distance_m: (n,) along the unit ray; infinite where it meets nothing.
-        triangle: (n,) which; -1 for none.
-        within: (n, 2) the place on it, as shares of its second and third corner.
+        triangle: (n,) index; -1 for none.
+        within: (n, 2) barycentric coordinates of its second and third corner.
     """
 
     distance_m: Floats
@@ -62,11 +62,11 @@ class Hits:
 
 
 def build_world(mesh: Mesh, sun: Array, rng: np.random.Generator) -> World:
-    """Make a mesh ready for rays.
+    """Prepare a mesh for rays.
 
     Args:
-        mesh: all there is.
-        sun: (3,) unit vector towards it.
+        mesh: all triangles.
+        sun: (3,) unit vector towards the sun.
         rng: draws the grain of the paints.
 
     Raises:
@@ -92,18 +92,18 @@ def cast(world: World, origin_m: Array, directions: Floats) -> Hits:
     """Cast rays from one place.
 
     Args:
-        world: what they meet.
+        world: triangles that they may meet.
         origin_m: (3,) in the world.
         directions: (n, 3) unit vectors in the world.
     """
     origins = np.broadcast_to(origin_m.astype(np.float32), directions.shape)
-    answer = world.scene.cast_rays(_rays(origins, directions))
-    triangle = answer["primitive_ids"].numpy().view(np.int32)  # none is all ones, so -1
-    return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
+    found = world.scene.cast_rays(_to_rays(origins, directions))
+    triangle = found["primitive_ids"].numpy().view(np.int32)  # none is all ones, so -1
+    return Hits(found["t_hit"].numpy(), triangle, found["primitive_uvs"].numpy())
 
 
-def albedos(world: World, directions: Floats, hits: Hits) -> tuple[Array, Array]:
-    """What the surfaces are like that rays meet.
+def find_albedos(world: World, directions: Floats, hits: Hits) -> tuple[Array, Array]:
+    """The painted surfaces that rays meet.
 
     Returns:
         (n, 4) albedos: blue, green, red, near infrared, and (n,) cosines of the angles of
@@ -114,22 +114,22 @@ def albedos(world: World, directions: Floats, hits: Hits) -> tuple[Array, Array]
     )
 
 
-def colours(
+def shade(
     world: World, origin_m: Array, directions: Floats, hits: Hits, *, pixel_rad: float
 ) -> Floats:
-    """The light that comes back along rays: sun with shadows, sky light, haze, or the sky.
+    """The light along rays: sun with shadows, sky light and haze on surfaces, or the sky.
 
     Args:
-        world: what is lit.
-        origin_m: (3,) where the rays come from.
+        world: surfaces and sun.
+        origin_m: (3,) of the rays.
         directions: (n, 3) unit vectors.
-        hits: what they meet.
-        pixel_rad: angle that a ray stands for; grain finer than that is not seen.
+        hits: where the rays meet the world.
+        pixel_rad: angular width of a ray; finer grain is averaged out.
 
     Returns:
         (n, 3) linear blue, green, red.
     """
-    lit = _lit(world, origin_m, directions, hits)
+    lit = _find_lit(world, origin_m, directions, hits)
     colour = np.empty((len(directions), 3), np.float32)
     _fill_sky(colour, directions)
     _fill_surfaces(
@@ -140,18 +140,18 @@ def colours(
     return colour
 
 
-def _lit(world: World, origin_m: Array, directions: Floats, hits: Hits) -> NDArray[np.bool_]:
-    """Which hits the sun shines on."""
+def _find_lit(world: World, origin_m: Array, directions: Floats, hits: Hits) -> NDArray[np.bool_]:
+    """(n,) which hits are in direct sunlight."""
     starts, facing = _shadow_starts(
         origin_m, directions, hits.distance_m, hits.triangle, world.surfaces, world.sun
     )
     to_sun = np.broadcast_to(world.sun.astype(np.float32), starts.shape)
     lit = np.zeros(len(directions), np.bool_)
-    lit[facing] = ~world.scene.test_occlusions(_rays(starts, to_sun)).numpy()
+    lit[facing] = ~world.scene.test_occlusions(_to_rays(starts, to_sun)).numpy()
     return lit
 
 
-def _rays(origins: Floats, directions: Floats) -> Any:
+def _to_rays(origins: Floats, directions: Floats) -> Any:
     rays = np.concatenate([origins, directions], axis=1)
     return _open3d().core.Tensor.from_numpy(rays)
 
@@ -182,7 +182,7 @@ def _noise_texture(rng: np.random.Generator) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _shadow_starts(origin, directions, distance, triangle, surfaces, sun):  # type: ignore[no-untyped-def]
-    """Places just off the surfaces that face the sun, and whose they are."""
+    """Points just off the surfaces that face the sun, and the indices of their hits."""
     starts = np.empty((len(triangle), 3), np.float32)
     facing = np.empty(len(triangle), np.int64)
     count = 0
@@ -224,7 +224,7 @@ def _fill_sky(colour, directions):  # type: ignore[no-untyped-def]
 def _fill_surfaces(  # type: ignore[no-untyped-def]
     colour, directions, width, triangle, within, lit, surfaces, paints, grain, sun
 ):
-    """Lit surfaces over the sky; ``width`` is that of each ray where it meets one."""
+    """Lit surfaces; ``width`` is that of each ray at its hit."""
     for i in range(len(triangle)):
         if triangle[i] < 0:
             continue
@@ -239,7 +239,7 @@ def _fill_surfaces(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _add_haze(colour, distance):  # type: ignore[no-untyped-def]
-    """Far surfaces fade into the horizon."""
+    """Blend far surfaces into the colour of the horizon."""
     for i in range(len(colour)):
         if distance[i] < math.inf:
             clear = math.exp(-distance[i] / _HAZE_M)
@@ -249,7 +249,7 @@ def _add_haze(colour, distance):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _facing_normal(row, direction):  # type: ignore[no-untyped-def]
-    """The normal on the side that is seen, and the cosine of the angle of incidence."""
+    """The normal on the side of the ray's origin, and the cosine of the angle of incidence."""
     along = row[0] * direction[0] + row[1] * direction[1] + row[2] * direction[2]
     sign = -1.0 if along > 0 else 1.0
     return sign * row[0], sign * row[1], sign * row[2], abs(along)
@@ -257,7 +257,7 @@ def _facing_normal(row, direction):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _albedo(row, paints, within, grain, clear):  # type: ignore[no-untyped-def]
-    """The painted albedo at a place on a triangle; ``clear`` is the share of the grain seen."""
+    """The painted albedo at a place on a triangle; ``clear`` scales the grain."""
     u = row[3] + within[0] * row[5] + within[1] * row[7]
     v = row[4] + within[0] * row[6] + within[1] * row[8]
     base = (float(row[9]), float(row[10]), float(row[11]), float(row[12]))

@@ -1,5 +1,6 @@
 """The paper's method, from correspondences to the optimum; start at ``joint.solve_joint``.
 
-In the order of use: ``preprocess`` (section 3.4), ``pnp`` and ``stage1`` (3.3), ``frame_weights``
-(ours), ``factor_graph`` (all of Eq. 5), ``objective`` (its minimum, the gate), ``covariance``.
+In the order of use: ``preprocess``, ``pnp`` and ``stage1``, ``camera_block`` with ``whitening`` and
+``residual_scale``, ``frame_weights`` (not in the paper) with ``frame_fits``, ``factor_graph`` (all
+of Eq. 5), ``objective`` (its minimum, the gate), ``covariance``.
 """

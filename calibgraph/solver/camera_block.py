@@ -1,4 +1,4 @@
-"""One camera's correspondences ready for the graph, and how large their residuals are."""
+"""One camera's correspondences, ready for the graph, and their residuals at an extrinsic."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,19 +17,25 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.preprocess import constrained_error_px, sqrt_information
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
+from calibgraph.solver.whitening import (
+    IDENTITY,
+    constrained_error_px,
+    largest_eigenvalue,
+    median_norm,
+    sqrt_information,
+    whitened_norm,
+)
 from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
 
 MIN_MATCHES = 6
-"""Fewer correspondences than this do not determine a pose with anything to check it by."""
+"""Of fewer correspondences a pose (three determine it) leaves too few residuals to check it by."""
 
-_GATE_BAND = 0.1  # of the gate, on either side of it
-_JUDGED = 5000  # matches, to tell which pose explains them
-_IDENTITY = np.array([1.0, 0.0, 1.0])  # entries (0,0), (0,1), (1,1)
-_MEDIAN_NORM = np.array([0.67449, 1.17741])  # of a standard Gaussian error in 1 and 2 dimensions
+_GATE_BAND = 0.1  # relative half width of the band about the gate whose density is measured
+_MAX_SAMPLE = 5000  # correspondences for a choice of candidates: a mean loss is known to 1 or 2 %
+_FIRST = 1000  # correspondences: if one of them is projectable, the others need not be evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +44,7 @@ class CameraBlock:
 
     Attributes:
         block: whitened by their weights and information; its scale is left at the default.
-        information: (n, 3) or None: as given, for judging errors in pixels.
+        information: (n, 3) or None: as given, without weights, for errors in pixels.
         frame: (n,) sorted frame numbers.
     """
 
@@ -51,20 +58,24 @@ class CameraBlock:
         new = np.flatnonzero(np.diff(self.frame)) + 1
         return np.concatenate([[0], new, [len(self.frame)]])
 
-    def weighted(self, weights: Array) -> CameraBlock:
-        """The matches with their information times (n,) weights."""
+    def with_weights(self, weights: Array) -> CameraBlock:
+        """The same correspondences, their information times (n,) weights."""
         root = self.block.sqrt_information
-        ones = np.tile(_IDENTITY, (len(self.frame), 1)) if root is None else root
+        ones = np.tile(IDENTITY, (len(self.frame), 1)) if root is None else root
         root = ones * np.sqrt(weights)[:, None]
         return replace(self, block=replace(self.block, sqrt_information=root))
 
+    def with_scale(self, scale: ResidualScale) -> ProjectionBlock:
+        """The projection block with its loss, in units of the residuals' sigma."""
+        return self.block.rescale(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
+
     def select(self, rows: NDArray[Any]) -> CameraBlock:
-        """Only some rows."""
+        """Some rows: a mask or an index array."""
         information = None if self.information is None else self.information[rows]
         return CameraBlock(self.block.select(rows), information, self.frame[rows])
 
     def as_table(self, *, camera: str) -> Correspondences:
-        """The matches as a table of correspondences, their weights as information."""
+        """As a table of correspondences, their weights as information."""
         root, information = self.block.sqrt_information, None
         if root is not None:  # upper triangular, [[a, b], [0, c]]
             a, b, c = root.T
@@ -77,100 +88,50 @@ class CameraBlock:
             information_px=information,
         )
 
-    def scaled(self, scale: ResidualScale) -> ProjectionBlock:
-        """The block with its loss, in units of the residuals' sigma."""
-        return self.block.rescaled(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
+    def at(self, T_camera_lidar: Array) -> BlockResiduals:
+        """The residuals at a (4, 4) T_camera_lidar, for callers that use them more than once."""
+        T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
+        residuals, projectable = self.block.residuals(T_lidar_camera)
+        return BlockResiduals(self, T_lidar_camera, residuals, projectable)
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] where constrained; (n,) whether projectable."""
-        residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-        return constrained_error_px(residuals, self.information), valid
+        at = self.at(T_camera_lidar)
+        return at.errors_px, at.projectable
+
+    def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
+        """As :attr:`BlockResiduals.sizes`."""
+        return self.at(T_camera_lidar).sizes
+
+    def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
+        """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
+        return self.select(self.at(T_camera_lidar).inliers(scale))
+
+    def gate_hessian(self, T_camera_lidar: Array, scale: ResidualScale) -> Array:
+        """As :meth:`BlockResiduals.gate_hessian`."""
+        return self.at(T_camera_lidar).gate_hessian(scale)
 
     def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
         """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
-        every = -(-len(self.frame) // _JUDGED)
-        judged = self.select(np.arange(0, len(self.frame), every))
-        errors = [judged.errors_px(T)[0] / scale_px for T in candidates]
+        step = -(-len(self.frame) // _MAX_SAMPLE)
+        sample = self.select(np.arange(0, len(self.frame), step))
+        errors = [sample.errors_px(T)[0] / scale_px for T in candidates]
         return int(np.argmin([np.mean(np.log1p(e**2)) for e in errors]))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
-        """The configured scales, or those of the residuals' own spread at a pose."""
+        """The configured scales, or those of the residuals' own spread at a T_camera_lidar."""
         if config.loss_scale_px is not None and config.gate_px is not None:
-            _, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-            unmeasured = math.nan if valid.any() else math.inf
+            unmeasured = math.nan if self._any_projectable(T_camera_lidar) else math.inf
             return ResidualScale(1.0, config.loss_scale_px, config.gate_px, unmeasured)
         sizes_px, sizes = self.sizes(T_camera_lidar)
         spread_px = robust_spread(sizes_px)
         spread = spread_px if sizes is sizes_px else robust_spread(sizes)
         return scale_from(spread_px, max(spread, self.least_spread), config)
 
-    def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
-        """How large the residuals of projectable matches are, in medians of a standard Gaussian.
-
-        Returns:
-            (m,) unweighted errors [px]; (m,) whitened errors. The median of Gaussian ones of one
-            standard deviation per axis is that standard deviation.
-        """
-        residuals, valid = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-        medians = self._median_norms[valid] if self._median_norms.ndim else self._median_norms
-        sizes_px = constrained_error_px(residuals, self.information)[valid] / medians
-        if self.information is None and self.block.sqrt_information is None:
-            return sizes_px, sizes_px
-        return sizes_px, self._whitened_norm(residuals)[valid] / medians
-
-    def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
-        """Without what lies beyond the gate, or behind the camera (paper, two-pass solver, 2)."""
-        errors, valid = self.errors_px(T_camera_lidar)
-        return self.select(valid & (errors <= scale.gate_px))
-
-    def gate_hessian(self, T_camera_lidar: Array, scale: ResidualScale) -> Array:
-        """(6, 6) what the gate's moving with the pose adds to the Hessian of the gated matches.
-
-        A step of the pose takes matches over the edge of the gate, out on one side and in on the
-        other, and their pull with them. It is some percent of the Hessian, and negative. Known
-        from the matches near the edge, so this must be called before they are gated.
-        """
-        pose = to_T_lidar_camera(T_camera_lidar)
-        residuals, valid = self.block.residuals(pose)
-        errors = constrained_error_px(residuals, self.information)
-        band = valid & (np.abs(errors - scale.gate_px) < _GATE_BAND * scale.gate_px)
-        across = self._error_gradient(residuals, errors)[band]
-        across *= (self._whitened_norm(residuals)[band] / errors[band])[:, None]
-        root = np.column_stack([across, np.zeros(len(across))])
-        edge = replace(self.block.select(band), sqrt_information=root).rescaled(
-            scale=scale.loss_scale / scale.sigma, sigma=scale.sigma
-        )
-        added: Array = -edge.sums(pose).hessian / (2 * _GATE_BAND)
-        return added
-
-    def _error_gradient(self, residuals: Array, errors: Array) -> Array:
-        """(n, 2) derivative of the error [px] by the residual."""
-        safe = np.maximum(errors, np.finfo(float).tiny)[:, None]
-        if self.information is None:
-            return np.asarray(residuals / safe)
-        uu, uv, vv = self.information.T
-        largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
-        x, y = residuals.T
-        pulled = np.column_stack([uu * x + uv * y, uv * x + vv * y])
-        return np.asarray(pulled / (largest[:, None] * safe))
-
-    def summary(self, T_camera_lidar: Array, scale: ResidualScale) -> Residuals:
-        """The residuals of all these correspondences at a pose."""
-        errors, valid = self.errors_px(T_camera_lidar)
-        return Residuals(
-            median_px=float(np.median(errors)),
-            inlier_share=float(np.mean(valid & (errors <= scale.gate_px))),
-            sigma_px=robust_spread(self.sizes(T_camera_lidar)[0]),
-            loss_scale_px=scale.loss_scale,
-            gate_px=scale.gate_px,
-        )
-
-    def _whitened_norm(self, residuals: Array) -> Array:
-        root = self.block.sqrt_information
-        if root is None:
-            return constrained_error_px(residuals, None)
-        first = root[:, 0] * residuals[:, 0] + root[:, 1] * residuals[:, 1]
-        return np.hypot(first, root[:, 2] * residuals[:, 1])
+    def _any_projectable(self, T_camera_lidar: Array) -> bool:
+        """Whether any correspondence is in front of the camera: mostly, one of the first is."""
+        first = self.select(np.arange(min(_FIRST, len(self.frame))))
+        return any(some.at(T_camera_lidar).projectable.any() for some in (first, self))
 
     @cached_property
     def least_spread(self) -> float:
@@ -179,42 +140,114 @@ class CameraBlock:
         typical = 1.0 if root is None else float(np.median(np.hypot(root[:, 0], root[:, 2])))
         return MIN_SIGMA_PX * typical
 
+
+@dataclass(frozen=True, eq=False)
+class BlockResiduals:
+    """The residuals of a block at one extrinsic, evaluated once.
+
+    Attributes:
+        block: the correspondences.
+        T_lidar_camera: where.
+        residuals_px: (n, 2) predicted minus observed pixel, unweighted.
+        projectable: (n,) whether the point is in front of the camera and inside the lens' domain.
+    """
+
+    block: CameraBlock
+    T_lidar_camera: gtsam.Pose3
+    residuals_px: Array
+    projectable: NDArray[np.bool_]
+
     @cached_property
-    def _median_norms(self) -> Array:
-        """() or (n,) medians of a standard Gaussian error, of as many axes as are constrained."""
-        if self.information is None:
-            return np.asarray(_MEDIAN_NORM[1])
-        uu, uv, vv = self.information.T
-        rank_one = uu * vv - uv**2 <= 1e-3 * (uu + vv) ** 2
-        return _MEDIAN_NORM[np.where(rank_one, 0, 1)]
+    def errors_px(self) -> Array:
+        """(n,) unweighted errors [px], along the directions that each match constrains."""
+        return constrained_error_px(self.residuals_px, self.block.information)
+
+    @cached_property
+    def sizes(self) -> tuple[Array, Array]:
+        """Norms of the residuals of projectable points, over the median of a standard Gaussian's.
+
+        Returns:
+            (m,) unweighted errors [px]; (m,) whitened errors. The median of Gaussian ones of one
+            standard deviation per axis is that standard deviation.
+        """
+        medians = median_norm(self.block.information)
+        medians = medians[self.projectable] if medians.ndim else medians
+        sizes_px = self.errors_px[self.projectable] / medians
+        root = self.block.block.sqrt_information
+        if self.block.information is None and root is None:
+            return sizes_px, sizes_px
+        return sizes_px, whitened_norm(root, self.residuals_px)[self.projectable] / medians
+
+    def inliers(self, scale: ResidualScale) -> NDArray[np.bool_]:
+        """(n,) which lie within the gate, in front of the camera."""
+        return np.asarray(self.projectable & (self.errors_px <= scale.gate_px))
+
+    def gate_hessian(self, scale: ResidualScale) -> Array:
+        """(6, 6) what the gate's moving with the extrinsic adds to the Hessian of the inliers.
+
+        A step of the extrinsic takes matches over the edge of the gate, out on one side and in on
+        the other, and their gradients with them. The term is some percent of the Hessian, and
+        negative. It is measured on the matches near the edge, on both sides of it.
+        """
+        near = np.abs(self.errors_px - scale.gate_px) < _GATE_BAND * scale.gate_px
+        band = np.flatnonzero(self.projectable & near)
+        edge = self.block.select(band)
+        residuals, errors = self.residuals_px[band], self.errors_px[band]
+        across = _error_gradient(residuals, errors, edge.information)
+        across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
+        root = np.column_stack([across, np.zeros(len(across))])
+        weighted = replace(edge, block=replace(edge.block, sqrt_information=root))
+        added: Array = -weighted.with_scale(scale).sums(self.T_lidar_camera).hessian
+        return added / (2 * _GATE_BAND)
+
+    def summary(self, scale: ResidualScale) -> Residuals:
+        """What the result reports of them."""
+        return Residuals(
+            median_px=float(np.median(self.errors_px)),
+            inlier_share=float(np.mean(self.inliers(scale))),
+            sigma_px=robust_spread(self.sizes[0]),
+            loss_scale_px=scale.loss_scale,
+            gate_px=scale.gate_px,
+        )
 
 
-def merged(parts: Sequence[CameraBlock]) -> CameraBlock:
-    """The matches of one camera's frames under each other, in the order given."""
-    first = parts[0].block
+def _error_gradient(residuals: Array, errors: Array, information: Array | None) -> Array:
+    """(n, 2) derivative of the error [px] by the residual."""
+    safe = np.maximum(errors, np.finfo(float).tiny)[:, None]
+    if information is None:
+        return np.asarray(residuals / safe)
+    uu, uv, vv = information.T
+    x, y = residuals.T
+    along = np.column_stack([uu * x + uv * y, uv * x + vv * y])
+    return np.asarray(along / (largest_eigenvalue(information)[:, None] * safe))
 
-    def joined(columns: Sequence[Array | None], ones: Array) -> Array | None:
+
+def merge(parts: Sequence[CameraBlock]) -> CameraBlock:
+    """The correspondences of one camera's frames under each other, in the order given."""
+
+    def stack(columns: Sequence[Array | None]) -> Array | None:
+        """Rows of 2x2 matrices; the identity where a part has none."""
         if all(column is None for column in columns):
             return None
         filled = [
-            np.tile(ones, (len(part.frame), 1)) if column is None else column
+            np.tile(IDENTITY, (len(part.frame), 1)) if column is None else column
             for column, part in zip(columns, parts, strict=True)
         ]
         return np.concatenate(filled)
 
     block = replace(
-        first,
+        parts[0].block,
         points_lidar_m=np.concatenate([part.block.points_lidar_m for part in parts]),
         pixels_px=np.concatenate([part.block.pixels_px for part in parts]),
-        sqrt_information=joined([p.block.sqrt_information for p in parts], _IDENTITY),
+        sqrt_information=stack([part.block.sqrt_information for part in parts]),
     )
-    information = joined([part.information for part in parts], _IDENTITY)
+    information = stack([part.information for part in parts])
     return CameraBlock(block, information, np.concatenate([part.frame for part in parts]))
 
 
 def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str, CameraBlock]:
     """The preprocessed correspondences of every camera that has enough to be solved from."""
-    matches = {}
+    blocks = {}
     for name, camera in rig.cameras.items():
         rows = table.of_camera(name)
         if len(rows) >= MIN_MATCHES:
@@ -222,5 +255,5 @@ def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str,
             block = ProjectionBlock(
                 camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss
             )
-            matches[name] = CameraBlock(block, rows.information_px, rows.frame)
-    return matches
+            blocks[name] = CameraBlock(block, rows.information_px, rows.frame)
+    return blocks

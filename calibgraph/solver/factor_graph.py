@@ -1,6 +1,6 @@
-"""The factor graph: one small graph per kind of factor; ``objective_graph`` is all of Eq. 5.
+"""The factor graph: one small graph per kind of factor; :func:`objective_graph` is all of Eq. 5.
 
-Its variables are ``T_lidar_camera``, one ``Pose3`` per camera: with this direction GTSAM's stock
+The variables are ``T_lidar_camera``, one ``Pose3`` per camera: in this direction GTSAM's stock
 prior and between factors are the paper's terms.
 """
 
@@ -31,7 +31,7 @@ __all__ = [  # with the factors that calibgraph re-exports
     "Optimum",
     "block_factor",
     "camera_prior_factor",
-    "joined",
+    "join",
     "objective_graph",
     "optimize",
     "pose_key",
@@ -42,18 +42,21 @@ __all__ = [  # with the factors that calibgraph re-exports
     "relative_pose_graph",
     "relative_prior_factor",
     "relative_prior_graph",
-    "values_of",
+    "to_values",
 ]
 
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 200
+"""Of Levenberg-Marquardt, which mostly takes 4 to 20."""
+
 RELATIVE_TOLERANCE = 1e-10
+"""Change of the error at which it stops: far below one standard deviation of the result."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where Levenberg-Marquardt stopped.
+    """The result of Levenberg-Marquardt.
 
     Attributes:
         T_camera_lidar: per camera, (4, 4).
@@ -83,7 +86,7 @@ def projection_graph(
 def prior_graph(
     cameras: Sequence[str], T_hat_camera_lidar: Mapping[str, Array], *, weight: float
 ) -> gtsam.NonlinearFactorGraph:
-    """The per-camera priors, lambda |log(T_hat^-1 T)|^2; empty if the weight is zero."""
+    """The per-camera priors, lambda |log(T_hat_i^-1 T_i)|^2; empty if the weight is zero."""
     return _graph(
         camera_prior_factor(pose_key(cameras, name), T, weight=weight)
         for name, T in T_hat_camera_lidar.items()
@@ -100,9 +103,11 @@ def relative_prior_graph(
 ) -> gtsam.NonlinearFactorGraph:
     """The relative-pose priors, mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, of Stage-1 estimates.
 
-    Over each camera with the next one (a spanning set), or over all pairs.
+    Over each camera and the next one (a spanning set), or over all pairs; empty if the weight is
+    zero.
     """
-    choose = pairwise if pairs == "spanning" else _all_pairs
+    names = list(T_hat_camera_lidar)
+    chosen = pairwise(names) if pairs == "spanning" else combinations(names, 2)
     return _graph(
         relative_prior_factor(
             pose_key(cameras, one),
@@ -110,13 +115,9 @@ def relative_prior_graph(
             relative_transform(T_hat_camera_lidar[two], T_hat_camera_lidar[one]),
             weight=weight,
         )
-        for one, two in choose(T_hat_camera_lidar)
+        for one, two in chosen
         if weight > 0
     )
-
-
-def _all_pairs(names: Iterable[str]) -> Iterable[tuple[str, str]]:
-    return combinations(names, 2)
 
 
 def relative_pose_graph(
@@ -135,6 +136,7 @@ def relative_pose_graph(
     )
 
 
+# fmt: off
 def objective_graph(
     rig: Rig,
     blocks: Mapping[str, ProjectionBlock],
@@ -144,15 +146,16 @@ def objective_graph(
 ) -> gtsam.NonlinearFactorGraph:
     """The whole objective (paper, Eq. 5), and the measured relative poses of the rig.
 
-    Its error is half of the paper's cost. ``print(graph)`` lists every factor.
+    ``print(graph)`` lists every factor; variable ``x0`` is the first camera of the rig, ``x1`` the
+    second. ``2 * graph.error(values)`` is the paper's cost, since GTSAM halves squared errors.
 
     Args:
-        rig: its cameras are the variables; its ``relative_poses`` are measurements, not a term of
-            the paper.
+        rig: its cameras are the variables; its ``relative_poses`` are measurements, no term of the
+            paper.
         blocks: per camera with correspondences; its scale and sigma are those of the loss.
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar.
         config: lambda, mu and the pairs of the relative prior.
-        terms: which terms of Eq. 5 take part; ``stage1`` has none but the priors.
+        terms: which terms of Eq. 5 take part; with ``priors`` and ``stage1``, the priors alone.
     """
     cameras = list(rig.cameras)
     lambda_, mu = config.prior_weight, config.relative_prior_weight
@@ -160,16 +163,14 @@ def objective_graph(
         lambda_ = mu = 0.0
     if terms in ("priors", "stage1"):
         blocks = {}
-    return joined(
-        # sum_i sum_k rho(|w_ik (u_ik - pi_i(T_i, p_k))|^2)
-        projection_graph(cameras, blocks),
-        # measured relative poses, each with its own sigmas
-        relative_pose_graph(cameras, rig.relative_poses),
-        # lambda sum_i |log(T_hat_i^-1 T_i)|^2
-        prior_graph(cameras, T_hat, weight=lambda_),
-        # mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, over pairs of cameras
-        relative_prior_graph(cameras, T_hat, weight=mu, pairs=config.relative_prior_pairs),
+    return join(                                           # minimize over T_1 ... T_N:
+        projection_graph(cameras, blocks),                 # sum rho(|w (u - pi(T_i, p))|^2)
+        relative_pose_graph(cameras, rig.relative_poses),  # + measured relative poses (ours)
+        prior_graph(cameras, T_hat, weight=lambda_),       # + lambda sum_i |log(T_hat_i^-1 T_i)|^2
+        relative_prior_graph(cameras, T_hat, weight=mu,    # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
+                             pairs=config.relative_prior_pairs),
     )
+# fmt: on
 
 
 def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
@@ -179,7 +180,7 @@ def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGra
     return graph
 
 
-def joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+def join(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
     """One graph with the factors of all."""
     graph = gtsam.NonlinearFactorGraph()
     for part in graphs:
@@ -187,8 +188,8 @@ def joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def values_of(cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
-    """GTSAM values of the extrinsics."""
+def to_values(cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
+    """GTSAM values of the extrinsics, (4, 4) T_camera_lidar of every camera."""
     values = gtsam.Values()
     for name in cameras:
         values.insert(pose_key(cameras, name), to_T_lidar_camera(T_camera_lidar[name]))
@@ -200,16 +201,20 @@ def optimize(
     cameras: Sequence[str],
     T_camera_lidar: Mapping[str, Array],
 ) -> Optimum:
-    """Minimize a graph by Levenberg-Marquardt from the given extrinsics."""
+    """Minimize a graph by Levenberg-Marquardt.
+
+    Args:
+        graph: over the variables of the cameras.
+        cameras: their names, in the order of the variables.
+        T_camera_lidar: (4, 4) per camera, the start.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(MAX_ITERATIONS)
     parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
     parameters.setAbsoluteErrorTol(0.0)
-    start = values_of(cameras, T_camera_lidar)
+    start = to_values(cameras, T_camera_lidar)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    found = optimizer.optimize()
-    transforms = {
-        name: to_T_camera_lidar(found.atPose3(pose_key(cameras, name))) for name in cameras
-    }
+    values = optimizer.optimize()
+    found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
     iterations = int(optimizer.iterations())
-    return Optimum(transforms, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
+    return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)

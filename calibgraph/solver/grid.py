@@ -18,17 +18,17 @@ def best_in_cell(
 ) -> NDArray[np.bool_]:
     """The most confident match of each cell of the image grid, per camera and frame.
 
-    Of equally confident ones the first in the table is kept. So the best of two tables under each
-    other are the best of what is best in each.
+    Of equally confident ones the first in the table is kept. So the best of two tables, one after
+    the other, are the best among the best of each.
 
     Args:
         rig: for the sizes of the images.
         table: correspondences.
-        camera: (n,) the place of each one's camera in the rig.
+        camera: (n,) index of each match's camera in the rig.
         config: ``grid_columns``, ``grid_rows``.
 
     Returns:
-        (n,) whether each is kept.
+        (n,) which are kept.
     """
     cell = _cells(rig, table.pixels_px, camera, config)
     keep: NDArray[np.bool_] = _best_of_equal_keys(camera, table.frame, cell, table.confidence)
@@ -38,7 +38,7 @@ def best_in_cell(
 def _cells(
     rig: Rig, pixels_px: Array, camera: NDArray[np.int64], config: Config
 ) -> NDArray[np.int64]:
-    """(n,) number of the cell that each pixel lies in; what is outside counts to the edge."""
+    """(n,) number of the cell that each pixel lies in; pixels outside belong to the edge cells."""
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
     shape = np.array([config.grid_columns, config.grid_rows])
     places = np.clip(np.floor((pixels_px + 0.5) / sizes[camera] * shape), 0, shape - 1)

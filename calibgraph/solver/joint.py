@@ -1,4 +1,4 @@
-"""The joint multi-camera solve: section 3 of the paper in one function."""
+"""The method: section 3 of the paper in one function, :func:`solve_joint`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.frame_weights import WeighedCamera, weigh_all_frames
+from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.solution import Solution
@@ -20,6 +20,7 @@ from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined
 
 
+# fmt: off
 def solve_joint(
     rig: Rig,
     table: Correspondences | Path | str,
@@ -28,43 +29,56 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
 ) -> Solution:
-    """The paper's method, from correspondences to the optimum. Nothing is judged.
+    """The paper's method, from correspondences to the optimum.
 
-    Arguments and errors as of :func:`calibgraph.solve`. The pairwise estimates may be given, to
-    compare solves of the same correspondences without the PnP of every frame again.
+    The margin names the paper's sections. Whether the solution can be trusted is computed
+    elsewhere, in ``calibgraph.trust``.
+
+    Args:
+        rig: cameras with their initial guess, and measured relative poses.
+        table: correspondences, or the file that holds them.
+        config: settings; the preset ``auto`` if None.
+        terms: which terms of Eq. 5 are used.
+        pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
+
+    Raises:
+        FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
     """
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
-    with watch("preprocess"):  # 3.4: depth, confidence, grid, cap
-        kept = preprocess(rig, table, config)
-        require_determined(rig, kept.counts)
-    with watch("stage1"):  # 3.3: PnP per frame, median over frames
-        pairwise = pairwise or estimate_stage1(rig, kept.table, config)
-        blocks = camera_blocks(rig, kept.table, config)
-        start = best_start(rig, blocks, pairwise, config, terms)
-    weighed: dict[str, WeighedCamera] = {}
-    if config.learnt_weights and config.stage1 == "pnp" and terms in ("full", "reprojection"):
-        with watch("weights"):  # ours: frames and confidences weighed
-            weighed = weigh_all_frames(kept.table, blocks, pairwise, start)
-        blocks = {name: camera.block for name, camera in weighed.items()}
-        start |= {name: camera.T_camera_lidar for name, camera in weighed.items()}
-    objective = Objective(rig, blocks, T_hat(pairwise), config, terms)  # 3.4: Eq. 5
-    with watch("pass1"):  # 3.4: two passes: fit,
-        rough, scales = objective.minimize_with_scale(start)
-    with watch("pass2"):  # drop outliers, fit again
-        inliers = objective.without_outliers(rough, scales)
-        optimum = inliers.minimize(rough, scales)
-    counts = _counts(kept.counts, objective, inliers, pairwise, weighed)
-    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch)
+
+    with watch("preprocess"):
+        kept = preprocess(rig, table, config)                              # Correspondence
+        require_determined(rig, kept.counts)                               # Preprocessing
+
+    with watch("stage1"):
+        pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
+        blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
+        start = best_start(rig, blocks, pairwise, config, terms)           # x_0
+
+    with watch("weights"):                                                 # ours: frame weights
+        frames = weigh_all_frames(kept.table, blocks, pairwise, start, config, terms)
+
+    objective = Objective(rig, frames.blocks, T_hat(pairwise), config, terms)  # Eq. 5
+
+    with watch("pass1"):                                                   # Two-Pass Solver
+        rough, scales = objective.minimize_with_scale(frames.T_camera_lidar)   # 1. fit
+    with watch("pass2"):
+        inliers = objective.without_outliers(rough, scales)                # 2. gate tau
+        optimum = inliers.minimize(rough, scales)                          # 3. fit again
+
+    counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
+    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+# fmt: on
 
 
-def _counts(
+def count_correspondences(
     filters: Mapping[str, Mapping[str, int]],
     objective: Objective,
     inliers: Objective,
     pairwise: Stage1,
-    weighed: Mapping[str, WeighedCamera],
+    outlier_frames: Mapping[str, int],
 ) -> dict[str, dict[str, int]]:
     """Per camera: correspondences left after each filter and the gate, and its frames."""
     counts = {}
@@ -73,7 +87,7 @@ def _counts(
             part.blocks[name].frame if name in part.blocks else np.empty(0, np.int64)
             for part in (objective, inliers)
         )
-        outliers = weighed[name].outlier_frames if name in weighed else 0
+        outliers = outlier_frames.get(name, 0)
         counts[name] = {
             **before,
             "used": len(used),

@@ -17,34 +17,34 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.factor_graph import Optimum, objective_graph, optimize
 from calibgraph.solver.residual_scale import ResidualScale
-from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
 Transforms = dict[str, Array]
 """Per camera, (4, 4) T_camera_lidar."""
 Scales = dict[str, ResidualScale]
 
-_MAX_RESCALINGS = 10
-_CONVERGED = 0.01  # relative change of the spread
-_NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px to 1 px
+_MAX_RESCALINGS = 10  # mostly 3 are enough
+_CONVERGED = 0.01  # relative change of the spread: far below its own uncertainty
+_NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px, half an image, to 1 px
 
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Everything that Eq. 5 sums over.
+    """Everything that Eq. 5 sums over. Its cached property is a pure function of the fields.
 
     Attributes:
         rig: its cameras are the unknowns; its ``relative_poses`` are measurements.
         blocks: per camera that has enough correspondences.
-        T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: what the priors pull to.
+        T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: the mean of the priors.
         config: the weights lambda and mu, the loss and its scales.
         terms: which terms of Eq. 5 are used.
-        gate_hessian: of blocks without outliers, see ``CameraBlock.gate_hessian``; else empty.
+        gate_hessian: after the gate, (6, 6) per camera, see ``BlockResiduals.gate_hessian``; before
+            it, empty.
     """
 
     rig: Rig
-    blocks: dict[str, CameraBlock]
-    T_hat: Transforms
+    blocks: Mapping[str, CameraBlock]
+    T_hat: Mapping[str, Array]
     config: Config
     terms: Terms
     gate_hessian: Mapping[str, Array] = field(default_factory=dict)
@@ -63,20 +63,15 @@ class Objective:
         """Eq. 5 as a GTSAM graph that can be printed.
 
         Args:
-            scales: of the residuals; the reprojection term has the cameras that are named.
+            scales: of the residuals; only cameras that have one get a reprojection term.
         """
-        return objective_graph(
-            self.rig, self.scaled_blocks(scales), self.T_hat, self.config, self.terms
-        )
+        blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
+        return objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms)
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
         """All terms but the reprojection term: priors and measured relative poses."""
         return self.graph({})
-
-    def scaled_blocks(self, scales: Scales) -> dict[str, ProjectionBlock]:
-        """The correspondences with their loss, in units of the residuals' sigma."""
-        return {name: self.blocks[name].scaled(scale) for name, scale in scales.items()}
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences."""
@@ -88,7 +83,7 @@ class Objective:
         return replace(self, rig=rig, T_hat={})
 
     def minimize(self, start: Transforms, scales: Scales) -> Optimum:
-        """The minimum by Levenberg-Marquardt, with the residuals' scales held."""
+        """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
             return Optimum(start, math.nan, 0, True)
         return optimize(self.graph(scales), self.cameras, start)
@@ -100,35 +95,37 @@ class Objective:
         either far from the minimum or has few good matches. Its scale is narrowed step by step
         (graduated non-convexity), which leads to where matches are densest, until a core appears.
         """
-        T, scales = self._alternate(start)
+        rough, scales = self._alternate(start)
         limit_px = self.config.pnp_threshold_px
         left = {name for name, scale in scales.items() if scale.sigma_px > limit_px}
         if not left or not self.uses_correspondences or self.config.loss_scale_px is not None:
-            return T, scales
-        narrowed, tried, found = scales, T, set[str]()
+            return rough, scales
+        narrow, T_camera_lidar, found = scales, rough, set[str]()
         for _ in range(_NARROWINGS):
-            narrowed = narrowed | {name: narrowed[name].narrowed(_NARROWING) for name in left}
-            tried = self.minimize(tried, narrowed).T_camera_lidar
-            measured = {name: self.blocks[name].scale(tried[name], self.config) for name in left}
-            cores = {name for name in left if measured[name].sigma < narrowed[name].sigma}
-            narrowed = narrowed | {name: measured[name] for name in cores}
+            narrow = narrow | {name: narrow[name].narrow(_NARROWING) for name in left}
+            T_camera_lidar = self.minimize(T_camera_lidar, narrow).T_camera_lidar
+            measured = {
+                name: self.blocks[name].scale(T_camera_lidar[name], self.config) for name in left
+            }
+            cores = {name for name in left if measured[name].sigma < narrow[name].sigma}
+            narrow = narrow | {name: measured[name] for name in cores}
             left, found = left - cores, found | cores
             if not left:
                 break
         if not found:
-            return T, scales
-        return self._alternate(tried | {name: T[name] for name in left})
+            return rough, scales
+        return self._alternate(T_camera_lidar | {name: rough[name] for name in left})
 
     def _alternate(self, start: Transforms) -> tuple[Transforms, Scales]:
         """Minimize and measure the scales in turn until these are constant."""
-        T, scales = start, self.scales_at(start)
+        T_camera_lidar, scales = start, self.scales_at(start)
         for _ in range(_MAX_RESCALINGS):
-            T = self.minimize(T, scales).T_camera_lidar
-            before, scales = scales, self.scales_at(T)
+            T_camera_lidar = self.minimize(T_camera_lidar, scales).T_camera_lidar
+            before, scales = scales, self.scales_at(T_camera_lidar)
             ratios = [scales[name].sigma / before[name].sigma for name in scales]
             if all(abs(ratio - 1.0) < _CONVERGED for ratio in ratios):
                 break
-        return T, scales
+        return T_camera_lidar, scales
 
     def scales_at(self, T_camera_lidar: Transforms) -> Scales:
         """The configured scales, or those of the residuals' own spread at some extrinsics.
@@ -156,21 +153,19 @@ class Objective:
         Raises:
             CorrespondenceError: if a camera is left with too few.
         """
+        at = {name: block.at(T_camera_lidar[name]) for name, block in self.blocks.items()}
         inliers = {
-            name: block.without_outliers(T_camera_lidar[name], scales[name])
+            name: block.select(at[name].inliers(scales[name]))
             for name, block in self.blocks.items()
         }
-        for name, left in inliers.items():
-            if len(left.frame) < MIN_MATCHES:
+        for name, kept in inliers.items():
+            if len(kept.frame) < MIN_MATCHES:
                 raise CorrespondenceError(
-                    f"camera {name!r}: only {len(left.frame)} of {len(self.blocks[name].frame)} "
+                    f"camera {name!r}: only {len(kept.frame)} of {len(self.blocks[name].frame)} "
                     f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at "
                     f"least {MIN_MATCHES} are needed; the matches do not agree on a pose, or the "
                     "gate is too narrow",
                     camera=name,
                 )
-        at_edge = {
-            name: block.gate_hessian(T_camera_lidar[name], scales[name])
-            for name, block in self.blocks.items()
-        }
-        return replace(self.with_blocks(inliers), gate_hessian=at_edge)
+        gate_hessian = {name: at[name].gate_hessian(scales[name]) for name in at}
+        return replace(self.with_blocks(inliers), gate_hessian=gate_hessian)

@@ -12,26 +12,28 @@ from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.factor_graph import optimize, projection_graph
-from factors import ProjectionBlock
+from factors import ProjectionBlock, smallest_scaled_eigenvalue
 
 Array = NDArray[np.float64]
 
-_REFINEMENTS = 2
-_ENOUGH_MATCHES = 4000
-_RANSAC_ITERATIONS = 2000
+_REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
+_MAX_SAMPLE = 4000  # matches: more do not make the pose of one frame better than its shared errors
+_RANSAC_ITERATIONS = 2000  # samples of 4: with 80 % outliers, one is clean in 19 of 20 runs
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
-_MIN_INLIER_SHARE = 0.1
-_MIN_SCALED_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
+_MIN_INLIER_SHARE = 0.1  # fewer are as likely inliers of a wrong pose
+_MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
 def frame_pose(camera: Camera, matches: Correspondences, config: Config) -> Array | None:
-    """(4, 4) T_camera_lidar from one camera's matches in one frame, None if they give none.
+    """(4, 4) T_camera_lidar from one camera's matches in one frame.
 
     MAGSAC on the undistorted plane, then inliers re-selected and refined with the full lens model.
-    No pose, if too few matches agree on one, or if they leave a direction free. Of many matches
-    an even selection is used: it is enough for one frame's pose.
+    Of many matches an even selection is used.
+
+    Returns:
+        None if too few matches agree on an extrinsic, or if they leave a direction of it free.
     """
-    matches = matches.select(slice(None, None, -(-len(matches) // _ENOUGH_MATCHES) or None))
+    matches = matches.select(slice(None, None, -(-len(matches) // _MAX_SAMPLE) or None))
     start = _ransac_pnp(camera, matches, config)
     return None if start is None else _refine(camera, matches, start, config)
 
@@ -87,9 +89,9 @@ def _refine(
     """Re-select inliers with the full lens model and refine on them, a few times."""
     for _ in range(_REFINEMENTS):
         T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
-        everything = ProjectionBlock(camera.lens, frame.points_lidar_m, frame.pixels_px)
-        residuals, valid = everything.residuals(T_lidar_camera)
-        inlier = valid & (np.hypot(*residuals.T) < config.pnp_threshold_px)
+        every_match = ProjectionBlock(camera.lens, frame.points_lidar_m, frame.pixels_px)
+        residuals, projectable = every_match.residuals(T_lidar_camera)
+        inlier = projectable & (np.hypot(*residuals.T) < config.pnp_threshold_px)
         if np.count_nonzero(inlier) < max(MIN_MATCHES, _MIN_INLIER_SHARE * len(frame)):
             return None
         block = ProjectionBlock(
@@ -101,14 +103,7 @@ def _refine(
         graph = projection_graph(["camera"], {"camera": block})
         optimum = optimize(graph, ["camera"], {"camera": T_camera_lidar})
         T_camera_lidar = optimum.T_camera_lidar["camera"]
-        if _is_degenerate(block.sums(to_T_lidar_camera(T_camera_lidar)).hessian):
+        hessian = block.sums(to_T_lidar_camera(T_camera_lidar)).hessian
+        if smallest_scaled_eigenvalue(hessian) < _MIN_SCALED_EIGENVALUE:
             return None
     return T_camera_lidar
-
-
-def _is_degenerate(hessian: Array) -> bool:
-    """Whether some direction of the pose is free: points on one line, or in one place."""
-    units = np.sqrt(np.diag(hessian))
-    if not units.all():
-        return True
-    return bool(np.linalg.eigvalsh(hessian / np.outer(units, units))[0] < _MIN_SCALED_EIGENVALUE)

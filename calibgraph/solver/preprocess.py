@@ -1,4 +1,4 @@
-"""The paper's correspondence preprocessing (section 3.4), with a count at every filter."""
+"""The paper's correspondence preprocessing, with a count at every filter."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
 
-_MERGED_ROWS = 250_000  # rows of parts that may wait to be merged, about 15 to 25 MB
+_MERGED_ROWS = 250_000  # rows of parts before they are merged, about 15 to 25 MB
 
 
 @dataclass(frozen=True)
 class Preprocessed:
-    """Correspondences fit for the graph, sorted by camera and frame.
+    """Preprocessed correspondences, sorted by camera and frame.
 
     Attributes:
         table: the kept correspondences.
@@ -53,21 +53,21 @@ def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) ->
 
 
 def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config) -> Preprocessed:
-    """The same of a table that comes in parts, at least one."""
+    """As :func:`preprocess`, of a table in parts, at least one."""
     kept: list[Correspondences] = []
     counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
-    settled = 0
+    merged_rows = 0
     for part in parts:
-        best, passed = _filtered(rig, part, config)
+        best, passed = _filter(rig, part, config)
         counts[:3] += passed
         kept.append(best)
-        if sum(map(len, kept)) > 2 * settled + _MERGED_ROWS:
-            kept = [_merged(rig, kept, config)]
-            settled = len(kept[0])
-    table = _merged(rig, kept, config)
-    camera = _places(rig, table)
+        if sum(map(len, kept)) > 2 * merged_rows + _MERGED_ROWS:
+            kept = [_merge(rig, kept, config)]
+            merged_rows = len(kept[0])
+    table = _merge(rig, kept, config)
+    camera = _camera_numbers(rig, table)
     counts[3] = np.bincount(camera, minlength=len(rig.cameras))
-    rows = np.flatnonzero(_capped(table, camera, config))
+    rows = np.flatnonzero(_within_cap(table, camera, config))
     counts[4] = np.bincount(camera[rows], minlength=len(rig.cameras))
     order = rows[np.lexsort((table.frame[rows], camera[rows]))]
     named = {
@@ -77,11 +77,11 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     return Preprocessed(table.select(order), named)
 
 
-def _filtered(
+def _filter(
     rig: Rig, table: Correspondences, config: Config
 ) -> tuple[Correspondences, NDArray[np.int64]]:
-    """What of a part may be kept; (3, N) per camera its rows: given, projectable, confident."""
-    camera = _places(rig, table)
+    """The best rows of a part; (3, N) per camera, how many are given, projectable, confident."""
+    camera = _camera_numbers(rig, table)
     projectable = _projectable(rig, table, camera)
     rows = np.flatnonzero(projectable & (table.confidence >= config.confidence_min))
     passed = [np.bincount(c, minlength=len(rig.cameras))
@@ -91,16 +91,16 @@ def _filtered(
     return best, np.array(passed)
 
 
-def _merged(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
-    """The best of what is best in the parts, in the order of the table."""
+def _merge(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
+    """The best matches of the parts' best matches, in the order of the table."""
     if len(kept) == 1:
         return kept[0]
     table = concatenate(kept)
-    return table.select(best_in_cell(rig, table, _places(rig, table), config))
+    return table.select(best_in_cell(rig, table, _camera_numbers(rig, table), config))
 
 
-def _places(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
-    """(n,) the place of each row's camera in the rig."""
+def _camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
+    """(n,) index of each row's camera in the rig."""
     for name in table.cameras:
         if name not in rig.cameras:
             raise CorrespondenceError(
@@ -113,16 +113,18 @@ def _places(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
 
 
 def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
+    """(n,) depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
     keep = np.empty(len(table), dtype=np.bool_)
-    for place, model in enumerate(rig.cameras.values()):
-        rows, T = np.flatnonzero(camera == place), model.T_camera_lidar
+    for number, model in enumerate(rig.cameras.values()):
+        rows, T = np.flatnonzero(camera == number), model.T_camera_lidar
         keep[rows] = model.lens.project(table.points_lidar_m[rows] @ T[:3, :3].T + T[:3, 3])[1]
     return keep
 
 
-def _capped(table: Correspondences, camera: NDArray[np.int64], config: Config) -> NDArray[np.bool_]:
-    """The most confident ``matches_max`` of each camera and frame."""
+def _within_cap(
+    table: Correspondences, camera: NDArray[np.int64], config: Config
+) -> NDArray[np.bool_]:
+    """(n,) which rows are the most confident ``matches_max`` of their camera and frame."""
     order = np.lexsort((-table.confidence, table.frame, camera))
     starts = np.ones(len(order), dtype=np.bool_)
     starts[1:] = (np.diff(camera[order]) != 0) | (np.diff(table.frame[order]) != 0)
@@ -130,45 +132,3 @@ def _capped(table: Correspondences, camera: NDArray[np.int64], config: Config) -
     keep = np.empty(len(order), dtype=np.bool_)
     keep[order] = np.arange(len(order)) - first < config.matches_max
     return keep
-
-
-def sqrt_information(table: Correspondences, config: Config) -> Array | None:
-    """Whitening matrices of the residuals, w_k times the root of the information.
-
-    Returns:
-        (n, 3) entries (0,0), (0,1), (1,1) of upper triangular S with S^T S = w^2 I; None if every
-        weight is one and no information is given.
-    """
-    if table.information_px is None and not config.confidence_weights:
-        return None
-    if table.information_px is None:
-        root = np.tile([1.0, 0.0, 1.0], (len(table), 1))
-    else:
-        root = _upper_root(table.information_px)
-    if config.confidence_weights:  # the paper's w = sqrt(clip(c, 0.1, 1))
-        root *= np.sqrt(np.clip(table.confidence, 0.1, 1.0))[:, None]
-    return root
-
-
-def _upper_root(information: Array) -> Array:
-    """Upper triangular S with S^T S = I, row-wise; rank one gives s11 = 0 (or s00 = s01 = 0)."""
-    uu, uv, vv = information.T
-    s00 = np.sqrt(uu)
-    s01 = np.where(uu > 0, uv / np.where(uu > 0, s00, 1.0), 0.0)
-    s11 = np.sqrt(np.maximum(vv - s01**2, 0.0))
-    return np.stack([s00, s01, s11], axis=1)
-
-
-def constrained_error_px(residuals: Array, information: Array | None) -> Array:
-    """(n,) length of the residual along the directions that the match constrains [px].
-
-    The plain reprojection error where no information is given; for an edge, the distance from it.
-    """
-    if information is None:
-        x, y = residuals.T
-        return np.asarray(np.sqrt(x * x + y * y))  # hypot takes ten times as long
-    uu, uv, vv = information.T
-    largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
-    x, y = residuals.T
-    squared = uu * x**2 + 2 * uv * x * y + vv * y**2
-    return np.asarray(np.sqrt(np.maximum(squared, 0.0) / largest))

@@ -1,4 +1,4 @@
-"""How large residuals are: the robust spread, and the scales of loss and gate read from it."""
+"""The robust spread of residuals, and the scales of loss and gate derived from it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ GATE_SIGMAS = 3.035
 """Gate in standard deviations: 99 % of two-dimensional Gaussian errors lie inside."""
 
 MIN_SIGMA_PX = 0.05
-"""Spread below which `auto` does not shrink: noise-free data would have none."""
+"""Least spread of the scale `auto`: noise-free data would have none, and a loss of zero width."""
 
-_START_QUANTILE, _START_FACTOR = 0.2, 1.762  # that quantile of a Rayleigh law, to its median
+_START_QUANTILE, _START_FACTOR = 0.2, 1.762  # median of a Rayleigh distribution over that quantile
 _HALF = 0.5
-_CUT = 4.0  # medians: inliers lie below, in one and in two dimensions
+_CUT = 4.0  # medians, 4.7 sigma in two dimensions: inliers lie below
 
 
 @dataclass(frozen=True)
 class ResidualScale:
-    """How large the residuals of one camera are taken to be.
+    """The scales of one camera's residuals.
 
     Attributes:
         sigma: what whitened residuals are divided by, so that they have unit variance: 1 with a
@@ -45,8 +45,8 @@ class ResidualScale:
     gate_px: float
     sigma_px: float
 
-    def narrowed(self, factor: float) -> ResidualScale:
-        """With a smaller loss: so many times the sigma and the loss's scale."""
+    def narrow(self, factor: float) -> ResidualScale:
+        """With sigma and the loss's scale multiplied by a factor below one."""
         return replace(self, sigma=factor * self.sigma, loss_scale=factor * self.loss_scale)
 
 
@@ -68,11 +68,11 @@ def scale_from(sigma_px: float, spread: float, config: Config) -> ResidualScale:
 
 
 def robust_spread(values: Array) -> float:
-    """The median of the values that belong together, among others that may be the majority.
+    """The median of the inliers among values of which outliers may be the majority.
 
-    Starts from a low quantile and takes the median of what lies within _CUT of it until it stands
-    still: clean values give their median; a broad background, up to three quarters of all, hardly
-    moves it; and values without a core give a large spread, since their median then grows.
+    Starts from a low quantile and takes the median of what lies within _CUT times the spread, until
+    it is constant: clean values give their median; a broad background, up to three quarters of all,
+    hardly changes it; and values without a core give a large spread, since their median then grows.
     """
     if not len(values):
         return math.inf
@@ -87,10 +87,10 @@ def robust_spread(values: Array) -> float:
         below, above = ordered[low], ordered[min(low + 1, last)]
         return float(below + (place - low) * (above - below))
 
-    return settled_spread(quantile_below)
+    return iterate_spread(quantile_below)
 
 
-def settled_spread(quantile_below: Callable[[float, float], float]) -> float:
+def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
     """The iteration of :func:`robust_spread`.
 
     Args:

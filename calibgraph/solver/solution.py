@@ -1,4 +1,4 @@
-"""What the joint solve returns: the optimum, and everything that is needed to judge it."""
+"""What the joint solve returns: the optimum, and everything that checks of it need."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.progress import Stopwatch
 from calibgraph.solver.factor_graph import Optimum
 from calibgraph.solver.objective import Objective, Scales, Transforms
 
@@ -28,9 +27,9 @@ class Solution:
         objective: with all usable correspondences.
         inliers: with those within the gate, which the solution was fitted to.
         scales: per camera, of the residuals.
-        optimum: where the last pass stopped.
+        optimum: of the last pass.
         counts: per camera, correspondences left after each filter and gate, and frames.
-        watch: seconds per stage.
+        timings_s: seconds per stage.
     """
 
     rig: Rig
@@ -40,17 +39,17 @@ class Solution:
     scales: Scales
     optimum: Optimum
     counts: Mapping[str, Mapping[str, int]]
-    watch: Stopwatch
+    timings_s: Mapping[str, float]
 
     @property
     def T_camera_lidar(self) -> Transforms:
         """Per camera, the (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
-        return self.optimum.T_camera_lidar
+        return dict(self.optimum.T_camera_lidar)
 
     @property
     def T_hat(self) -> Transforms:
         """Per camera that has one, the (4, 4) Stage-1 estimate."""
-        return self.objective.T_hat
+        return dict(self.objective.T_hat)
 
     @property
     def config(self) -> Config:

@@ -1,4 +1,4 @@
-"""Stage 1 (paper, section 3.3): one pose per camera and frame by PnP, then one per camera."""
+"""Stage 1 of the paper: one extrinsic per camera and frame by PnP, then one per camera."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from calibgraph.solver.pnp import frame_pose
 
 Array = NDArray[np.float64]
 
-_MEDOID_OF = 500  # rotations at most: it is a start, and its cost is quadratic
-_STRAY = 6.0  # median distances from the median: farther frames do not count
-_STRAY_RAD, _STRAY_M = np.radians(0.05), 0.01  # nearer ones always do
+_MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
+_OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
+_ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +31,13 @@ class CameraStage1:
 
     Attributes:
         T_camera_lidar: (4, 4) T_hat of the paper; None if no frame was solved.
-        solved: (4, 4) T_camera_lidar from PnP, by frame number.
-        per_frame: (f, 4, 4) those that are not far from all others.
-        failed_frames: how many frames gave no pose, or one far from all others.
+        by_frame: (4, 4) T_camera_lidar from PnP, by frame number.
+        per_frame: (f, 4, 4) the same without outliers.
+        failed_frames: frames of which PnP gave none, or an outlier.
     """
 
     T_camera_lidar: Array | None
-    solved: Mapping[int, Array] = field(default_factory=lambda: MappingProxyType({}))
+    by_frame: Mapping[int, Array] = field(default_factory=lambda: MappingProxyType({}))
     per_frame: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
     failed_frames: int = 0
 
@@ -59,7 +59,7 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
     with ThreadPoolExecutor() as pool:
         return {
-            name: _of_camera(camera, table.of_camera(name), config, pool)
+            name: _estimate_camera(camera, table.of_camera(name), config, pool)
             for name, camera in rig.cameras.items()
         }
 
@@ -73,54 +73,54 @@ def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
     }
 
 
-def _of_camera(
+def _estimate_camera(
     camera: Camera, rows: Correspondences, config: Config, pool: ThreadPoolExecutor
 ) -> CameraStage1:
-    """PnP in every frame, then one pose over the frames."""
+    """PnP in every frame, then one extrinsic over the frames."""
     numbers, starts = np.unique(rows.frame, return_index=True)
     edges = np.append(starts, len(rows))
     frames = [rows.select(slice(*edge)) for edge in pairwise(edges)]
     found = pool.map(partial(frame_pose, camera, config=config), frames)
-    solved = {int(n): T for n, T in zip(numbers, found, strict=True) if T is not None}
-    stacked = np.array([*solved.values()]).reshape(-1, 4, 4)
-    kept = stacked[agreeing(stacked)]
+    by_frame = {int(n): T for n, T in zip(numbers, found, strict=True) if T is not None}
+    T_camera_lidar = np.array([*by_frame.values()]).reshape(-1, 4, 4)
+    kept = T_camera_lidar[are_near_median(T_camera_lidar)]
     return CameraStage1(
-        T_camera_lidar=aggregate(kept, config.aggregate) if len(stacked) else None,
-        solved=MappingProxyType(solved),
+        T_camera_lidar=aggregate(kept, config.aggregate) if by_frame else None,
+        by_frame=MappingProxyType(by_frame),
         per_frame=kept,
         failed_frames=len(frames) - len(kept),
     )
 
 
-def agreeing(poses: Array) -> NDArray[np.bool_]:
-    """Which of (f, 4, 4) poses are not far from all others, judged by the poses alone.
+def are_near_median(T_camera_lidar: Array) -> NDArray[np.bool_]:
+    """(f,) which of (f, 4, 4) per-frame estimates are no outliers among them.
 
-    Far is more than 6 times the median distance from their median, in rotation or translation;
-    up to 0.05 degrees and 1 cm never are. Fewer than 3 poses cannot be judged.
+    An outlier is more than 6 times the median distance from their median, in rotation or
+    translation, and more than 0.05 degrees or 1 cm. Of fewer than 3, none is one.
     """
-    if len(poses) < 3:  # noqa: PLR2004
-        return np.ones(len(poses), dtype=np.bool_)
-    rotations, translations = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    if len(T_camera_lidar) < 3:  # noqa: PLR2004
+        return np.ones(len(T_camera_lidar), dtype=np.bool_)
+    rotations, translations = _parts(T_camera_lidar)
     angles = (rotations * geodesic_median(rotations).inv()).magnitude()
     lengths = np.linalg.norm(translations - np.median(translations, axis=0), axis=1)
     near = [
-        distances <= max(least, _STRAY * float(np.median(distances)))
-        for distances, least in ((angles, _STRAY_RAD), (lengths, _STRAY_M))
+        distances <= max(least, _OUTLIER * float(np.median(distances)))
+        for distances, least in ((angles, _ALIKE_RAD), (lengths, _ALIKE_M))
     ]
     return np.asarray(near[0] & near[1])
 
 
-def aggregate(poses: Array, how: str) -> Array:
-    """One pose from several.
+def aggregate(T_camera_lidar: Array, how: str) -> Array:
+    """(4, 4) one extrinsic from those of several frames.
 
     Args:
-        poses: (f, 4, 4), f >= 1.
+        T_camera_lidar: (f, 4, 4), f >= 1.
         how: ``median``: component-wise for the translation, geodesic L1 for the rotation;
             ``mean``: arithmetic and chordal; ``mode``: half-sample mode of each component, the
             rotation's in the tangent at its median.
     """
     T = np.eye(4)
-    rotations, translations = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    rotations, translations = _parts(T_camera_lidar)
     median = geodesic_median(rotations)
     if how == "median":
         rotation, T[:3, 3] = median, np.median(translations, axis=0)
@@ -135,6 +135,11 @@ def aggregate(poses: Array, how: str) -> Array:
         raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
     T[:3, :3] = rotation.as_matrix()
     return T
+
+
+def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:
+    """The rotations and (f, 3) translations of (f, 4, 4)."""
+    return Rotation.from_matrix(T_camera_lidar[:, :3, :3]), T_camera_lidar[:, :3, 3]
 
 
 def geodesic_median(rotations: Rotation) -> Rotation:
@@ -152,11 +157,11 @@ def geodesic_median(rotations: Rotation) -> Rotation:
 
 
 def _medoid(rotations: Rotation) -> int:
-    """Which of the rotations has the least sum of angles to the others; of many, to some."""
+    """Index of the rotation with the least sum of angles to the others; of many, to a selection."""
     quaternions = rotations.as_quat()
     places = np.unique(np.linspace(0, len(quaternions) - 1, _MEDOID_OF).round().astype(int))
-    some = quaternions[places]
-    cosines = np.abs(some @ some.T).clip(max=1.0)
+    selection = quaternions[places]
+    cosines = np.abs(selection @ selection.T).clip(max=1.0)
     return int(places[np.argmin(np.arccos(cosines).sum(axis=0))])
 
 

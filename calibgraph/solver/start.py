@@ -1,4 +1,4 @@
-"""Where the joint solve starts, and whether every camera can be determined at all."""
+"""The start of the joint solve, and whether every camera can be determined at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import FILTERS
-from calibgraph.solver.stage1 import Stage1
+from calibgraph.solver.stage1 import CameraStage1, Stage1
 
 Array = NDArray[np.float64]
 
@@ -28,35 +28,42 @@ def best_start(
 ) -> Transforms:
     """Per camera, (4, 4) T_camera_lidar from which the first pass starts.
 
-    The best of Stage 1, the poses of single frames and the rig's guess, by the mean Cauchy loss of
+    The best of Stage 1, the PnP of single frames and the rig's guess, by the mean Cauchy loss of
     all frames' correspondences at half the PnP threshold; with the terms ``stage1``, Stage 1
-    itself. Cameras without correspondences start where a relative pose puts them.
+    itself. Cameras without correspondences start from a relative pose to one that has them.
 
     Raises:
         CorrespondenceError: with the terms ``stage1``, if PnP failed in every frame of a camera.
     """
     start = {}
     for name, block in blocks.items():
-        estimate = stage1.get(name)
-        T_hat = estimate.T_camera_lidar if estimate else None
-        if terms == "stage1" and T_hat is None:
-            raise CorrespondenceError(
-                f"camera {name!r}: PnP failed in every frame, so there is no Stage-1 estimate; "
-                "solve with other terms, or give more matches per frame",
-                camera=name,
-            )
-        candidates = [] if T_hat is None else [T_hat]
-        if terms != "stage1":
-            candidates.append(rig.cameras[name].T_camera_lidar)
-            candidates += estimate.solved.values() if estimate else ()
+        candidates = _candidates(name, rig, stage1.get(name), terms)
         start[name] = candidates[block.best_candidate(candidates, config.pnp_threshold_px / 2)]
-    for _ in rig.cameras:
+    for _ in rig.cameras:  # the longest chain of relative poses
         for pair in rig.relative_poses:
             if pair.b in start:
                 start.setdefault(pair.a, pair.T_a_b @ start[pair.b])
             if pair.a in start:
                 start.setdefault(pair.b, invert(pair.T_a_b) @ start[pair.a])
     return {name: start[name] for name in rig.cameras}
+
+
+def _candidates(
+    name: str, rig: Rig, estimate: CameraStage1 | None, terms: Terms
+) -> list[NDArray[np.float64]]:
+    """(4, 4) each: T_camera_lidar of Stage 1, of the rig, and of single frames."""
+    T_hat = estimate.T_camera_lidar if estimate else None
+    if terms == "stage1":
+        if T_hat is None:
+            raise CorrespondenceError(
+                f"camera {name!r}: PnP failed in every frame, so there is no Stage-1 estimate; "
+                "solve with other terms, or give more matches per frame",
+                camera=name,
+            )
+        return [T_hat]
+    stage1 = [] if T_hat is None else [T_hat]
+    single = estimate.by_frame.values() if estimate else ()
+    return [*stage1, rig.cameras[name].T_camera_lidar, *single]
 
 
 def require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> None:
@@ -79,20 +86,20 @@ def require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> Non
             raise CorrespondenceError(
                 f"camera {name!r} has {count['capped']} usable correspondences, at least "
                 f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
-                f"(left after each filter: {left}): {_why_few(count)}{_of_others(tied)}",
+                f"(left after each filter: {left}): {_advice(count)}{_advice_for_others(tied)}",
                 camera=name,
             )
 
 
-def _of_others(tied: set[str]) -> str:
-    """What to do for the cameras that have enough."""
+def _advice_for_others(tied: set[str]) -> str:
+    """How to calibrate the cameras that have enough."""
     if not tied:
         return ""
     return f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file"
 
 
-def _why_few(count: Mapping[str, int]) -> str:
-    """What to do about too few correspondences, by the filter that took them."""
+def _advice(count: Mapping[str, int]) -> str:
+    """What to do about too few correspondences, by the filter that removed them."""
     if count["given"] < MIN_MATCHES:
         return (
             "none or few were found; check that its images show something, that the cloud lies "

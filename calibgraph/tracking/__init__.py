@@ -2,6 +2,7 @@
 
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.tracker import IncrementalCalibrator, Update
+from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.tracking.update import Update
 
 __all__ = ["DurableCalibrator", "Event", "IncrementalCalibrator", "Update"]

@@ -1,4 +1,4 @@
-"""What the estimate is worth right now: covariance, verdict, and the result as a calibration."""
+"""Assessment of the present estimate: covariance, verdicts, and the result as a calibration."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.model.verdict import Check, Verdict, above
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
-from calibgraph.tracking.window import known_of_poses
-from calibgraph.trust.assess import relative_pose_conflict
-from calibgraph.trust.solution_checks import Conflict, Evidence, camera_verdict
+from calibgraph.tracking.window import pose_priors
+from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
+from calibgraph.trust.solution_checks import check_estimate
+from calibgraph.trust.thresholds import threshold
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
-_PRIOR_FRAMES = 10.0  # that the usual scatter counts for, while a camera has few frames
-_LEFT_OUT_WARN = 0.5
+_PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a camera has few
 
 
 @dataclass(frozen=True, eq=False)
-class Health:
-    """What all estimates are worth.
+class Assessment:
+    """Covariance and verdicts of all estimates.
 
     Attributes:
         joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
@@ -38,20 +38,20 @@ class Health:
     verdicts: dict[str, Verdict]
 
 
-def joint_covariance(state: State, sums: Posterior, known: Array) -> Array:
+def joint_covariance(state: State, sums: Posterior, prior: Array) -> Array:
     """(6 n, 6 n) cluster-robust covariance; NaN for cameras with too few frames.
 
-    While a camera has few frames, the scatter that its frames usually have counts too.
+    While a camera has few frames, its scatter is shrunk towards that of all its frames so far.
     """
     share = np.array([
-        0.0 if one.memory.walk else _PRIOR_FRAMES / (frames + _PRIOR_FRAMES)
+        0.0 if one.summary.walk else _PRIOR_FRAMES / (frames + _PRIOR_FRAMES)
         for one, frames in zip(state.cameras, sums.frames, strict=True)
     ])  # fmt: skip
     usual = np.sqrt(share * sums.frames / np.maximum(state.total_frames, 1.0))
     scatter = _scaled(sums.scatter, np.sqrt(1 - share)) + _scaled(state.total, usual)
-    hessian = block_diagonal(sums.hessian) + known
-    scatter = with_pseudo_frames(state.widened(scatter), hessian, np.repeat(sums.frames, 6))
-    covariance = replace(sums, scatter=scatter).covariance(known)
+    hessian = block_diagonal(sums.hessian) + prior
+    scatter = with_pseudo_frames(state.widen(scatter), hessian, np.repeat(sums.frames, 6))
+    covariance = replace(sums, scatter=scatter).covariance(prior)
     rotation, translation = state.systematic_sigmas
     shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
     covariance += np.diag(np.tile(shared**2, len(state.cameras)))
@@ -66,20 +66,20 @@ def _scaled(scatter: Array, factors: Array) -> Array:
     return scatter * np.outer(each, each)
 
 
-def health_of(state: State, sums: Posterior, known: Array) -> Health:
-    """Judge the present estimates.
+def assess(state: State, sums: Posterior, prior: Array) -> Assessment:
+    """Assess the present estimates.
 
     Args:
         state: the tracker's.
-        sums: over everything it remembers.
-        known: (6 n, 6 n) Hessian of what is known of poses apart from correspondences.
+        sums: over its summaries and live frames.
+        prior: (6 n, 6 n) Hessian of priors and relative poses.
     """
-    covariance = joint_covariance(state, sums, known)
+    covariance = joint_covariance(state, sums, prior)
     conflicts = _conflicts(state, sums, covariance)
     verdicts = {}
     for camera, name in enumerate(state.names):
         verdicts[name] = _verdict(state, sums, camera, covariance, conflicts)
-    return Health(covariance, verdicts)
+    return Assessment(covariance, verdicts)
 
 
 def _verdict(
@@ -87,26 +87,26 @@ def _verdict(
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
-        return _not_started(state, one)
-    rows = slice(6 * camera, 6 * camera + 6)
+        return _start_check(state, one)
+    rows = pose_rows(camera)
     own = covariance[rows, rows]
-    evidence = Evidence(
-        residuals=residuals_of(one),
+    estimate = Estimate(
+        camera=state.rig.cameras[name],
+        residuals=recent_residuals(one),
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=_data_sigmas(sums.hessian[camera]),
         halves=_halves(state, camera),
         conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
-        pulled=None,
+        pull=None,
         converged=True,
         terms="full",
     )
-    verdict = camera_verdict(state.rig.cameras[name], evidence)
-    return verdict.and_also(_now(state, one))
+    return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
 
 
-def _not_started(state: State, one: CameraState) -> Verdict:
+def _start_check(state: State, one: CameraState) -> Verdict:
     needed = state.config.tracking.start_frames
     waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
     return Verdict(
@@ -117,25 +117,25 @@ def _not_started(state: State, one: CameraState) -> Verdict:
     )
 
 
-def _now(state: State, one: CameraState) -> list[Check]:
-    """What the last frames say of a camera."""
+def _recent_checks(state: State, one: CameraState) -> list[Check]:
+    """Checks of a camera's last frames."""
     checks = []
     if one.absent >= state.config.tracking.blind_frames:
         text = f"no usable matches in the last {one.absent} frames"
         checks.append(Check("blind frames", "WARN", text, one.absent))
-    if one.memory.walk:
+    if one.summary.walk:
         text = "drifts: the estimate follows, over fewer frames"
         checks.append(Check("drift", "WARN", text))
-    agreed = [good for _, good in one.verdicts]
-    if agreed:
-        share = 1 - float(np.mean(agreed))
-        name = f"share of the last {len(agreed)} frames that disagree with the estimate"
-        checks.append(above(name, share, _LEFT_OUT_WARN, 1.0, "share"))
+    agreements = [good for _, good in one.agreements]
+    if agreements:
+        share = 1 - float(np.mean(agreements))
+        name = f"share of the last {len(agreements)} frames that disagree with the estimate"
+        checks.append(threshold("disagreeing_frames").check(share, name=name))
     return checks
 
 
-def residuals_of(one: CameraState) -> Residuals:
-    """How well the estimate explains the recent frames."""
+def recent_residuals(one: CameraState) -> Residuals:
+    """Residuals of the recent frames."""
     return Residuals(
         median_px=float(np.median(one.recent[:, 1])),
         inlier_share=one.inlier_share,
@@ -146,17 +146,17 @@ def residuals_of(one: CameraState) -> Residuals:
 
 
 def _data_sigmas(hessian: Array) -> Array:
-    """(6,) what the matches could tell at best, if each were independent."""
+    """(6,) standard deviations if every match were independent: a lower bound."""
     if not is_determined(hessian):
         return np.full(6, np.inf)
     return np.sqrt(np.diag(np.linalg.inv(hessian)))
 
 
 def _halves(state: State, camera: int) -> tuple[Array, Array] | None:
-    """(4, 4) T_camera_lidar twice: from every other epoch, and from the epochs between."""
-    memory = state.cameras[camera].memory
-    hessian, gradient = memory.halves_hessian.copy(), memory.halves_gradient.copy()
-    half = memory.next_half
+    """Two (4, 4) T_camera_lidar, from the even and from the odd epochs."""
+    summary = state.cameras[camera].summary
+    hessian, gradient = summary.halves_hessian.copy(), summary.halves_gradient.copy()
+    half = summary.next_half
     for epoch in state.epochs:
         for frame in epoch.frames:
             hessian[half] += frame.hessian[camera]
@@ -165,12 +165,12 @@ def _halves(state: State, camera: int) -> tuple[Array, Array] | None:
     if not all(map(is_determined, hessian)):
         return None
     steps = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
-    poses = [to_T_camera_lidar(state.references[camera].retract(step)) for step in steps]
-    return poses[0], poses[1]
+    first, second = (to_T_camera_lidar(state.references[camera].retract(step)) for step in steps)
+    return first, second
 
 
 def _conflicts(state: State, sums: Posterior, covariance: Array) -> list[Conflict]:
-    """How the relative poses of the rig fit what the correspondences alone say."""
+    """Conflicts between the rig's relative poses and the correspondences alone."""
     places = {name: camera for camera, name in enumerate(state.names)}
     conflicts = []
     for place, pair in enumerate(state.rig.relative_poses):
@@ -196,18 +196,21 @@ def _conflicts(state: State, sums: Posterior, covariance: Array) -> list[Conflic
     return conflicts
 
 
-def known_hessian(state: State) -> Array:
-    """(6 n, 6 n) Hessian of what is known of poses apart from correspondences."""
-    T = {name: to_T_camera_lidar(p) for name, p in zip(state.names, state.poses, strict=True)}
-    return pose_hessian(known_of_poses(state), state.names, T)
+def prior_hessian(state: State) -> Array:
+    """(6 n, 6 n) Hessian of priors and relative poses, without correspondences."""
+    T = {
+        name: to_T_camera_lidar(p)
+        for name, p in zip(state.names, state.T_lidar_camera, strict=True)
+    }
+    return pose_hessian(pose_priors(state), state.names, T)
 
 
-def covariance_of(health: Health, names: tuple[str, ...]) -> dict[str, Array | None]:
-    """Per camera (6, 6), None where there are too few frames."""
+def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:
+    """Per camera (6, 6); None with too few frames."""
     covariance: dict[str, Array | None] = {}
     for camera, name in enumerate(names):
-        rows = slice(6 * camera, 6 * camera + 6)
-        own = health.joint_covariance[rows, rows]
+        rows = pose_rows(camera)
+        own = assessment.joint_covariance[rows, rows]
         covariance[name] = None if np.isnan(own).any() else own
     return covariance
 
@@ -220,20 +223,20 @@ def _counts(one: CameraState) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
-def calibration_of(state: State) -> Calibration:
-    """The present estimate as a result, like that of a batch."""
+def to_calibration(state: State) -> Calibration:
+    """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
-    health = health_of(state, sums, known_hessian(state))
-    poses = zip(state.names, state.poses, strict=True)
-    joint = health.joint_covariance
+    assessment = assess(state, sums, prior_hessian(state))
+    estimates = zip(state.names, state.T_lidar_camera, strict=True)
+    joint = assessment.joint_covariance
     return Calibration(
-        rig=state.rig.moved_to({name: to_T_camera_lidar(pose) for name, pose in poses}),
+        rig=state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates}),
         initial_rig=state.rig,
-        covariance=covariance_of(health, state.names),
+        covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=None if np.isnan(joint).any() else joint,
-        camera_verdicts=health.verdicts,
+        camera_verdicts=assessment.verdicts,
         residuals={
-            name: residuals_of(one)
+            name: recent_residuals(one)
             for name, one in zip(state.names, state.cameras, strict=True)
             if one.started
         },

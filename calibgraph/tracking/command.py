@@ -1,4 +1,4 @@
-"""What ``calibgraph track`` does: a source, a durable tracker, and the files at the end."""
+"""The command ``calibgraph track``: a source, a durable tracker, and the files at the end."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from calibgraph.model.rig import Rig
 from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
-from calibgraph.tracking.run import Say, follow
-from calibgraph.tracking.stream import Item, frames_of
+from calibgraph.tracking.run import Notify, follow
+from calibgraph.tracking.streams import Item, frames_of
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """What is wanted of ``calibgraph track``.
+    """The arguments of ``calibgraph track``.
 
     Attributes:
         rig: the initial guess.
@@ -48,73 +48,85 @@ class Tracking:
     matcher: Matcher | None = None
 
 
-def track(wanted: Tracking, source: Sequence[Path], *, tell: Say) -> tuple[Calibration, list[Path]]:
+def track(
+    settings: Tracking, source: Sequence[Path], *, notify: Notify
+) -> tuple[Calibration, list[Path]]:
     """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
 
     Args:
-        wanted: see there.
+        settings: see there.
         source: a table, a folder, or -; with a matcher, dataset folders.
-        tell: given warnings and events.
+        notify: called with warnings and events as sentences.
 
     Returns:
         The last estimate; the files written.
 
     Raises:
-        CalibrationError: if the source, the rig or the state cannot be used, or nothing came.
+        CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
     """
     if sys.stdout is None:
         raise FileError("standard output", "is closed; give the updates somewhere to go")
+    history = History()
     with _stopped_by_signals() as stop:
-        items, calibrator = _opened(wanted, source, stop, tell)
-        history = History()
+        items, calibrator = _opened(settings, source, stop, notify)
         with calibrator:
-            done = follow(
+            counts = follow(
                 items,
                 calibrator,
                 history,
-                every=wanted.every if wanted.matcher is None else 1,
+                every=settings.every if settings.matcher is None else 1,
                 stop=stop,
                 write=_write_line,
-                tell=tell,
+                notify=notify,
             )
             if calibrator.tracker.frame is None and not stop():
-                held = f"held no frame that could be used ({done.refused} left out); check it"
+                held = f"held no frame that could be used ({counts.refused} left out); check it"
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
             result = calibrator.tracker.calibration()
-    tell(f"{done.updates} updates, {done.refused} left out, {done.known} known from before")
-    written = [result.save(wanted.out)]
-    if done.updates:
-        history.draw(wanted.out / PICTURE)
-        written.append(wanted.out / PICTURE)
-    return result, written
+    notify(
+        f"{counts.updates} updates, {counts.refused} left out, {counts.skipped} known from before"
+    )
+    return result, _write_results(settings.out, result, history if counts.updates else None)
+
+
+def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
+    written = [result.save(folder)]
+    if history is not None:
+        history.draw(folder / PICTURE)
+        written.append(folder / PICTURE)
+    return written
 
 
 def _opened(
-    wanted: Tracking, source: Sequence[Path], stop: Callable[[], bool], tell: Say
+    settings: Tracking, source: Sequence[Path], stop: Callable[[], bool], notify: Notify
 ) -> tuple[Iterator[Item], DurableCalibrator]:
-    """The frames of the source and what takes them in."""
-    folder = wanted.out / STATE_FOLDER
-    if wanted.matcher is None:
-        items = frames_of(str(source[0]), follow=wanted.follow, stop=stop)
-        return items, _told(DurableCalibrator(folder, wanted.rig, wanted.config), tell)
-    matcher = to_full_matcher(wanted.matcher)
-    data = load_dataset(source, wanted.rig)
-    data = replace(data, frames=data.frames[:: wanted.every])
-    config = wanted.config.changed(stage1=matcher.stage1)
+    """The frames of the source, and the durable tracker."""
+    folder = settings.out / STATE_FOLDER
+    if settings.matcher is None:
+        items = frames_of(str(source[0]), follow=settings.follow, stop=stop)
+        return items, _report_recovery(
+            DurableCalibrator(folder, settings.rig, settings.config), notify
+        )
+    matcher = to_full_matcher(settings.matcher)
+    data = load_dataset(source, settings.rig)
+    data = replace(data, frames=data.frames[:: settings.every])
+    config = settings.config.changed(stage1=matcher.stage1)
     first: list[Calibration] = []
 
     def begin() -> Rig:
         first.append(first_frames(data, matcher, config))
         if first[0].verdict.status == "FAIL":
             reasons = "; ".join(first[0].verdict.reasons)
-            tell(f"warning: the first frames give no start that can be trusted: {reasons}")
+            notify(f"warning: the first frames give no reliable start: {reasons}")
         return first[0].rig
 
-    calibrator = _told(DurableCalibrator(folder, wanted.rig, config, begin=begin), tell)
+    calibrator = _report_recovery(
+        DurableCalibrator(folder, settings.rig, config, begin=begin), notify
+    )
     taken, count = calibrator.tracker.frame, config.tracking.start_frames
     head: Iterator[Item] = iter(())
     if taken is None or taken < data.frames[:count][-1].index:
-        # Also after a crash among the first frames: they go on from the same batch.
+        # Also after a crash among the first frames: they continue from the same batch.
         head = frames_of_batch(first[0] if first else first_frames(data, matcher, config))
     rest = [f for f in data.frames[count:] if taken is None or f.index > taken]
     later = matched_frames(
@@ -123,33 +135,33 @@ def _opened(
     return chain(head, later), calibrator
 
 
-def _told(calibrator: DurableCalibrator, tell: Say) -> DurableCalibrator:
+def _report_recovery(calibrator: DurableCalibrator, notify: Notify) -> DurableCalibrator:
     for damage in calibrator.damages:
-        tell(f"warning: {damage}")
+        notify(f"warning: {damage}")
     if calibrator.resumed:
-        tell(f"going on after frame {calibrator.tracker.frame}")
+        notify(f"going on after frame {calibrator.tracker.frame}")
     return calibrator
 
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[Callable[[], bool]]:
-    """While it lasts, the first SIGTERM or SIGINT only asks to stop.
+    """In the body, the first SIGTERM or SIGINT only sets the flag that is returned.
 
-    A second one does what it did before: someone who does not read may keep the first waiting.
+    A second one has its usual effect: a blocked output may delay the reaction to the first.
     """
-    asked: list[int] = []
+    received: list[int] = []
 
-    def ask(number: int, _: FrameType | None) -> None:
-        asked.append(number)
+    def receive(number: int, _: FrameType | None) -> None:
+        received.append(number)
         restore()
 
     def restore() -> None:
         for kind, handler in before.items():
             signal.signal(kind, handler)
 
-    before = {kind: signal.signal(kind, ask) for kind in (signal.SIGTERM, signal.SIGINT)}
+    before = {kind: signal.signal(kind, receive) for kind in (signal.SIGTERM, signal.SIGINT)}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         restore()
 
@@ -158,14 +170,14 @@ def _write_line(line: str) -> None:
     """Print a line at once.
 
     Raises:
-        BrokenPipeError: if nobody reads any more.
+        BrokenPipeError: if the reader has closed the pipe.
         FileError: if it cannot be written.
     """
     try:
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # Python tries again at its end to write what is left, and would complain.
+        # Otherwise Python writes the rest at its exit, and reports the error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise

@@ -1,4 +1,4 @@
-"""Frames of a dataset, matched one by one from the estimate of the moment."""
+"""Frames of a dataset, matched one by one from the present estimate."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.stream import Item, Refused, StreamFrame
+from calibgraph.tracking.streams import Item, Refused, StreamFrame
 
 
 def first_frames(dataset: Dataset, matcher: FullMatcher, config: Config) -> Calibration:
-    """The first frames calibrated as a batch: a matcher finds far more from several at once.
+    """The first frames calibrated as a batch: several frames give far more matches than one.
 
     Raises:
         CalibrationError: if that fails.
@@ -40,20 +40,20 @@ def frames_of_batch(result: Calibration) -> Iterator[Item]:
 
 
 def matched_frames(
-    dataset: Dataset, matcher: FullMatcher, config: Config, rig_now: Callable[[], Rig]
+    dataset: Dataset, matcher: FullMatcher, config: Config, current_rig: Callable[[], Rig]
 ) -> Iterator[Item]:
     """Match each frame from the present estimate.
 
     Args:
         dataset: its frames, in order of time.
-        matcher: which goes through its rounds for tracking, see ``Matcher``.
+        matcher: its rounds for tracking are run, see ``Matcher``.
         config: settings of the solves between its rounds.
-        rig_now: the rig with the present estimate, asked before each frame.
+        current_rig: returns the rig with the present estimate; called before each frame.
     """
     for frame in dataset.frames:
         alone = replace(dataset, frames=(frame,))
         try:
-            table = _matched(alone, matcher, config, rig_now())
+            table = _matched(alone, matcher, config, current_rig())
         except (CalibrationError, OSError) as error:
             yield Refused(f"frame {frame.name} ({frame.index}): {error}")
         else:
@@ -61,7 +61,7 @@ def matched_frames(
 
 
 def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> Correspondences:
-    """One frame's matches: coarse from the estimate, then finer from where these say."""
+    """One frame's matches: coarse from the estimate, then finer from the solved rig."""
     *coarse, last = tracking_rounds(matcher)
     settings = config.changed(stage1=matcher.stage1)
     for index in coarse:
@@ -71,19 +71,19 @@ def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> 
 
 
 def tracking_rounds(matcher: FullMatcher) -> tuple[int, ...]:
-    """The rounds that a matcher goes through for a single frame: its own choice, or all."""
+    """The matcher's rounds for a single frame: its own choice, or all."""
     return matcher.tracking_rounds or tuple(range(matcher.rounds))
 
 
 def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
-    """The rig with each camera moved to what one frame says, where it says something."""
+    """The rig with each camera solved from one frame, where it has enough matches."""
     for name in table.cameras:
         own = table.of_camera(name)
         own = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
         one = Rig(cameras={name: rig.cameras[name]})
         try:
             rig = rig.moved_to(solve_joint(one, own, config).T_camera_lidar)
-        except CorrespondenceError:  # too few matches to move it: the next round starts as this one
+        except CorrespondenceError:  # too few matches: the next round starts from the same rig
             continue
     return rig
 

@@ -1,8 +1,8 @@
-"""Cameras, or the LiDAR under all of them, that move slowly: followed at once, told when clear.
+"""Slow drift of cameras, or of the LiDAR under all of them: followed at once, reported when clear.
 
-A drift is noticed by the first camera that shows it. Whose it is shows only later, when the others
-have moved along, or have not: so what was known of all cameras is kept as an anchor, and the way
-from there is judged at every new epoch until it is clear.
+A drift is detected at the first camera that shows it. Whether that camera or the LiDAR drifts is
+decided later, when the other cameras have shifted too, or have not. So the summaries of all cameras
+are kept as anchors, and the steps from there are tested at every new epoch.
 """
 
 from __future__ import annotations
@@ -11,46 +11,42 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.tracking.epoch_summary import Memory
-from calibgraph.tracking.events import (
-    CLEARLY,
-    Event,
-    Size,
-    Steps,
-    alarm_limit,
-    cause_of,
-    unexplained,
-)
+from calibgraph.model.geometry import pose_rows
+from calibgraph.tracking.cause import CLEARLY, Steps, alarm_limit, find_cause, unexplained
+from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.posterior import inverse, is_determined, posterior
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal
 
-_QUIET = 1000  # frames in which a drift of the same camera is not told again
-_PATIENCE = 300  # frames until it is told in any case
+_QUIET = 1000  # frames in which a drift of the same camera is not reported again
+_PATIENCE = 300  # frames until it is reported in any case
 
 
-def drifting(state: State, camera: int, walk: int) -> State:
-    """The state in which a camera walks, and is watched until it is clear what drifts."""
-    known = state.cameras[camera]
-    said = known.drift_said_at
-    quiet = said >= 0 and state.updates - said < _QUIET
+def follow_drift(state: State, camera: int, walk: int) -> State:
+    """The state with a random walk of a camera, and a watch until it is clear what drifts."""
+    camera_state = state.cameras[camera]
+    reported_at = camera_state.drift_reported_at
+    quiet = reported_at >= 0 and state.updates - reported_at < _QUIET
     if state.drift is None and not quiet:
-        anchors = tuple(one.memory for one in state.cameras)
-        since = _frames_ago(state, known.memory, walk)
+        anchors = tuple(one.summary for one in state.cameras)
+        since = _frames_ago(state, camera_state.summary, walk)
         watch = DriftWatch(camera, state.updates, since, anchors)
         state = replace(state, drift=watch)
-    if known.memory.walk:
+    if camera_state.summary.walk:
         return state
-    return state.with_camera(camera, replace(known, memory=known.memory.walking(walk)))
+    return state.with_camera(
+        camera, replace(camera_state, summary=camera_state.summary.with_walk(walk))
+    )
 
 
-def _frames_ago(state: State, memory: Memory, walk: int) -> int:
-    """Number of the frame from which the walking memory still knows something."""
+def _frames_ago(state: State, summary: EpochSummary, walk: int) -> int:
+    """Number of the first frame that the summary of a walk still remembers."""
     oldest = state.live_frames[0].number if state.live_frames else state.frame or 0
-    return max(0, oldest - int(memory.frames[walk]))
+    return max(0, oldest - int(summary.frames[walk]))
 
 
-def told(state: State) -> tuple[State, list[Event]]:
-    """The state after a drift has been told, if it is clear by now what drifts."""
+def report_drift(state: State) -> tuple[State, list[Event]]:
+    """The state and the event of a drift, once it is clear what drifts."""
     watch = state.drift
     if watch is None:
         return state, []
@@ -61,7 +57,7 @@ def told(state: State) -> tuple[State, list[Event]]:
     waited = state.updates - watch.begun
     if abs(by_lidar - by_camera) < CLEARLY and waited < _PATIENCE and len(steps.cameras) > 1:
         return state, []
-    cause = cause_of(steps, sure={watch.camera})
+    cause = find_cause(steps, found_by={watch.camera})
     if cause.lidar:
         name, size = None, Size.of(*cause.lidar)
     else:
@@ -69,20 +65,20 @@ def told(state: State) -> tuple[State, list[Event]]:
         size = Size.of(*steps.of(steps.cameras.index(watch.camera)))
     event = Event("drifts", name, watch.frame, state.frame or 0, state.stamp_ns, size)
     for camera in range(len(state.cameras)) if cause.lidar else (watch.camera,):
-        known = replace(state.cameras[camera], drift_said_at=state.updates)
-        state = state.with_camera(camera, known)
+        camera_state = replace(state.cameras[camera], drift_reported_at=state.updates)
+        state = state.with_camera(camera, camera_state)
     return replace(state, drift=None), [event]
 
 
 def _steps(state: State, watch: DriftWatch) -> Steps:
-    """How far each camera has come from where it stood still."""
+    """The step of each camera since its anchor."""
     sums = posterior(state)
     cameras, steps, covariances = [], [], []
     for camera, anchor in enumerate(watch.anchors):
         now = sums.step(camera)
         if now is None or not is_determined(anchor.hessian[0]):
             continue
-        rows = slice(6 * camera, 6 * camera + 6)
+        rows = pose_rows(camera)
         pairs = ((anchor.hessian[0], anchor.scatter[0]),
                  (sums.hessian[camera], sums.scatter[rows, rows]))  # fmt: skip
         spreads = [inverse(hessian) @ scatter @ inverse(hessian) for hessian, scatter in pairs]

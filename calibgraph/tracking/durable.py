@@ -1,4 +1,4 @@
-"""A tracker whose every update is on disk when it returns: snapshot and journal."""
+"""A tracker whose every update is on disk when it returns."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.tracking.packing import UnreadableError, packed, unpacked
-from calibgraph.tracking.store import Store
-from calibgraph.tracking.tracker import IncrementalCalibrator, Update
+from calibgraph.tracking.state_bytes import StateError, decode, encode
+from calibgraph.tracking.state_database import StateDatabase
+from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.tracking.update import Update
 
 _SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many
 
@@ -22,25 +23,25 @@ _SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many
 class DurableCalibrator:
     """An :class:`IncrementalCalibrator` that survives ``kill -9`` at any moment.
 
-    An update that has returned is on disk. After a restart the next update gives the same numbers
-    as if nothing had happened.
+    An update that has returned is on disk. After a restart, the next update gives the same numbers
+    as without the restart.
 
     Attributes:
-        tracker: what is kept.
-        damages: a line for each file that was found damaged.
-        resumed: whether there was a state to go on from.
-        repeated: after a crash the last update, which may or may not have returned before it; None
+        tracker: the calibrator that is kept on disk.
+        damages: one line for each damaged part of the state that was found and is not used.
+        resumed: whether there was a state to continue from.
+        repeated: after a crash, the last update before it, which may not have returned then; None
             after a :meth:`close`.
 
     Args:
-        folder: where it keeps its state; one process at a time.
+        folder: where the state is kept; one process at a time.
         rig: cameras with their initial guess.
         config: settings; the preset ``auto`` if None.
-        begin: gives a better guess than ``rig``; asked only if there is no state to go on from.
+        begin: computes a better guess than ``rig``; called only if there is no state yet.
 
     Raises:
-        FileError: if another process has the folder, or the state in it is of another rig or of
-            other settings.
+        FileError: if another process uses the folder, or the state in it is damaged, of another
+            layout, another rig or other settings. The state is left as it was.
     """
 
     def __init__(
@@ -51,23 +52,23 @@ class DurableCalibrator:
         *,
         begin: Callable[[], Rig] | None = None,
     ) -> None:
-        self._store = Store(Path(folder))
+        self._database = StateDatabase(Path(folder))
         try:
-            recovered = self._store.recover()
+            recovered = self._database.recovered
             self.damages = recovered.damages
             self._pending = len(recovered.inputs)
             if recovered.snapshot is None:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
                 self._snapshot()
             else:
-                self.tracker = _restored(Path(folder), recovered.snapshot)
+                self.tracker = _restore(Path(folder), recovered.snapshot)
                 _require_same(Path(folder), self.tracker, rig, config or Config())
             self.repeated: Update | None = None
             for record in recovered.inputs:
-                frame, table = unpacked(record)
+                frame, table = decode(record)
                 self.repeated = self.tracker.update(table, frame=frame)
         except BaseException:
-            self._store.close()
+            self._database.close()
             raise
         self.resumed = self.tracker.frame is not None
 
@@ -79,23 +80,23 @@ class DurableCalibrator:
                 changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
-        record = _record(table, frame, self.tracker.initial_rig)
+        record = _encode_input(table, frame, self.tracker.initial_rig)
         if self._pending >= _SNAPSHOT_EVERY:
             self._snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
-        self._store.append(record)
+        self._database.append(record)
         self._pending += 1
         return update
 
     def close(self) -> None:
-        """Write a last snapshot and let go of the folder."""
+        """Write a last snapshot and release the folder."""
         try:
             self._snapshot()
         finally:
-            self._store.close()
+            self._database.close()
 
     def _snapshot(self) -> None:
-        self._store.snapshot(self.tracker.to_bytes())
+        self._database.snapshot(self.tracker.to_bytes())
         self._pending = 0
 
     def __enter__(self) -> Self:
@@ -109,31 +110,31 @@ class DurableCalibrator:
     ) -> None:
         if kind is None:
             self.close()
-        else:  # the journal has every update that has returned, the tracker may have half a one
-            self._store.close()
+        else:  # the journal has every update that returned; the tracker may be in the middle of one
+            self._database.close()
 
 
-def _record(table: Correspondences, frame: int | None, rig: Rig) -> bytes:
+def _encode_input(table: Correspondences, frame: int | None, rig: Rig) -> bytes:
     number = None if frame is None else index(frame)
     try:
-        return packed((number, table), rig)
+        return encode((number, table), rig)
     except (TypeError, ValueError, RecursionError) as error:
         raise CorrespondenceError(
             f"the table cannot be kept ({error}); give plain values as metadata", frame=number
         ) from error
 
 
-def _restored(folder: Path, snapshot: bytes) -> IncrementalCalibrator:
+def _restore(folder: Path, snapshot: bytes) -> IncrementalCalibrator:
     try:
         return IncrementalCalibrator.from_bytes(snapshot)
-    except UnreadableError as error:  # its checksum is right: written so
+    except StateError as error:  # its checksum is right, so another version wrote it
         raise FileError(
             folder, f"holds a state of another version; choose another folder ({error})"
         ) from error
 
 
 def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config: Config) -> None:
-    """The state in a folder is of the cameras and the settings that are asked for."""
+    """The state in a folder must be of the same cameras and the same settings."""
     if _without_guess(tracker.initial_rig) != _without_guess(rig):
         raise FileError(
             folder,

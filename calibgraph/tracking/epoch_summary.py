@@ -1,20 +1,20 @@
-"""What one camera's past says, in constant size: sums of quadratics, forgotten as a walk asks.
+"""One camera's older epochs in constant size: sums of quadratics, discounted by a random walk.
 
-A block of correspondences says, near a reference pose, half its cost ``d^T H d / 2 + b^T d + c``
-for the tangent step d from the reference. Such sums add, so thousands of frames are one (H, b).
-H is the true Hessian of the robust cost: with it the step to the minimum is exact to second order,
-where the reweighted Hessian would be 20 to 40 percent short. Beside them runs the scatter
-``B = sum g g^T`` of the frames' gradients, and ``H^-1 B H^-1`` is the covariance at any time.
+Near a reference T_lidar_camera, half the cost of a block of correspondences is
+``d^T H d / 2 + b^T d + c`` for the tangent step d from the reference. Such sums add: thousands of
+frames are one (H, b). H is the true Hessian of the robust cost: with it the step to the minimum is
+exact to second order, while with the reweighted Hessian it is 20 to 40 percent too short. The
+scatter ``B = sum g g^T`` of the frames' gradients is summed too: ``H^-1 B H^-1`` is the covariance.
 
-If the extrinsic may have walked by a covariance Q since, what is known of it now is
+If the extrinsic may have walked by a covariance Q since, then
 
     H' = (H^-1 + Q / k)^-1 = G H,   b' = G b,   B' = G B G^T + H' Q H'
 
 so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
-``H^-1 B`` per frame, says how much too confident H is because matches of a frame share errors.
+``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
 
-Several walks are kept side by side: standing still, and a few strengths of drift. Each predicts
-every new epoch; how well it did is its evidence, and the best one is believed.
+Several walks are kept side by side: static, and a few strengths of drift. Each predicts every new
+epoch; the log-likelihoods of these predictions are its evidence, and the best one is selected.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
-"""The walks, in units of the configured one; the first stands still."""
+"""The walks, in units of the configured one; the first is static."""
 
 _EVIDENCE_KEPT = 0.98  # of the log-likelihood, from one epoch to the next: half in 34 epochs
-_DISTANCE_CAP = 24.0  # squared sigmas of one epoch: a single odd one decides nothing
-_BELIEVE_WALK = 12.0  # log-likelihood by which a walk must beat standing still
-_BELIEVE_STILL = 12.0  # by which standing still must beat the walk it started from
-_PREFER_WALK = 3.0  # by which another strength must beat the present one
-_LEAST_FRAMES = 4.0  # to predict anything from
+_DISTANCE_CAP = 24.0  # squared sigmas of one epoch: so that a single outlier decides nothing
+_SELECT_WALK = 12.0  # log-likelihood by which a walk must exceed the static model
+_SELECT_STATIC = 12.0  # by which the static model must exceed the walk it started from
+_PREFER_WALK = 3.0  # by which another strength must exceed the present one
+_LEAST_FRAMES = 4.0  # for a prediction
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
-    """One camera's past, under every walk.
+class EpochSummary:
+    """Sums over one camera's older epochs, for every walk.
 
     Attributes:
         hessian: (w, 6, 6) sum of the frames' true Hessians, in the tangent of T_lidar_camera.
-        gradient: (w, 6) at the reference pose, which the holder keeps.
+        gradient: (w, 6) at the reference, which ``State`` holds.
         scatter: (w, 6, 6) sum of the outer products of the frames' gradients, and the walk.
         frames: (w,) how many frames that is, after forgetting.
         evidence: (w,) log-likelihoods of the epochs, forgotten slowly.
-        walk: which of the walks is believed.
+        walk: which of the walks is selected.
         halves_hessian, halves_gradient: (2, 6, 6) and (2, 6) of every other epoch.
-        next_half: which of them comes next.
+        next_half: which of the two the next epoch is added to.
     """
 
     hessian: Array
@@ -64,10 +64,10 @@ class Memory:
     next_half: int
 
     @staticmethod
-    def empty() -> Memory:
-        """Nothing is known."""
+    def empty() -> EpochSummary:
+        """Sums over no epochs."""
         w = len(STRENGTHS)
-        return Memory(
+        return EpochSummary(
             hessian=np.zeros((w, 6, 6)),
             gradient=np.zeros((w, 6)),
             scatter=np.zeros((w, 6, 6)),
@@ -79,16 +79,16 @@ class Memory:
             next_half=0,
         )
 
-    def seen_from(self, step: Array) -> Memory:
-        """With the reference moved by a tangent step."""
+    def shift_reference(self, step: Array) -> EpochSummary:
+        """The sums about a reference that is moved by a tangent step."""
         return replace(
             self,
             gradient=self.gradient + self.hessian @ step,
             halves_gradient=self.halves_gradient + self.halves_hessian @ step,
         )
 
-    def plus(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> Memory:
-        """With an epoch's sums added, taken at the same reference."""
+    def add(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> EpochSummary:
+        """The sums with an epoch's added, taken at the same reference."""
         halves_hessian, halves_gradient = self.halves_hessian.copy(), self.halves_gradient.copy()
         halves_hessian[self.next_half] += hessian
         halves_gradient[self.next_half] += gradient
@@ -103,25 +103,25 @@ class Memory:
             next_half=1 - self.next_half,
         )
 
-    def after_walk(self, variance: Array, inflation: float) -> tuple[Memory, Array]:
-        """What is known after an epoch in which the extrinsic may have walked.
+    def propagate(self, variance: Array, inflation: float) -> tuple[EpochSummary, Array]:
+        """The sums after the random walk of an epoch, and the gain.
 
         Args:
             variance: (6,) of the configured walk over the epoch.
-            inflation: k above.
+            inflation: k of the module's description.
 
         Returns:
-            The memory; (6, 6) G of the walk that is believed.
+            The summary; (6, 6) G of the selected walk.
         """
         gains = np.stack([
-            kept_share(H, strength**2 * variance / inflation)
+            gain_of_walk(H, strength**2 * variance / inflation)
             for H, strength in zip(self.hessian, STRENGTHS, strict=True)
         ])  # fmt: skip
         hessian = gains @ self.hessian
         hessian = (hessian + hessian.transpose(0, 2, 1)) / 2
         walked = STRENGTHS[:, None, None] ** 2 * np.diag(variance)
         kept = np.trace(gains, axis1=1, axis2=2) / 6
-        memory = replace(
+        summary = replace(
             self,
             hessian=hessian,
             gradient=np.einsum("wij,wj->wi", gains, self.gradient),
@@ -130,15 +130,15 @@ class Memory:
             halves_hessian=self.halves_hessian * kept[self.walk],
             halves_gradient=self.halves_gradient * kept[self.walk],
         )
-        return memory, gains[self.walk]
+        return summary, gains[self.walk]
 
-    def judged(self, hessian: Array, gradient: Array, noise: Array) -> Memory:
-        """With the walks' evidence updated by how well each predicts an epoch.
+    def update_evidence(self, hessian: Array, gradient: Array, noise: Array) -> EpochSummary:
+        """The summary with the walks' evidence updated by how well each predicts an epoch.
 
         Args:
             hessian: (6, 6) the epoch's.
             gradient: (6,) the epoch's, at the reference.
-            noise: (6, 6) covariance of such a gradient at the true pose.
+            noise: (6, 6) covariance of such a gradient at the true extrinsic.
         """
         if not (self.frames >= _LEAST_FRAMES).all():
             return self
@@ -153,38 +153,42 @@ class Memory:
         gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm)
         return replace(self, evidence=_EVIDENCE_KEPT * self.evidence + gain)
 
-    def reconsidered(self) -> Memory:
-        """With the walk that the evidence speaks for.
+    def select_walk(self) -> EpochSummary:
+        """The summary with the walk selected by the evidence.
 
-        While the camera walks, the memory that stands still goes stale. It starts anew from the
-        walking one whenever the evidence is against it, and must earn its belief from there.
+        During a drift the static sums become outdated. Whenever the evidence is against them, they
+        restart from those of the walk, and must gain evidence from there.
         """
         best = self.best_walk
         if self.walk == 0:
-            if self.evidence[best] - self.evidence[0] <= _BELIEVE_WALK:
+            if self.evidence[best] - self.evidence[0] <= _SELECT_WALK:
                 return self
-            return replace(self, walk=best, evidence=np.zeros_like(self.evidence))._still_from(best)
-        if self.evidence[0] - self.evidence[self.walk] > _BELIEVE_STILL:
+            return replace(
+                self, walk=best, evidence=np.zeros_like(self.evidence)
+            )._restart_static_from(best)
+        if self.evidence[0] - self.evidence[self.walk] > _SELECT_STATIC:
             return replace(self, walk=0, evidence=np.zeros_like(self.evidence))
         walk = self.walk
         if self.evidence[best] - self.evidence[walk] > _PREFER_WALK:
             walk = best
-        memory = replace(self, walk=walk)
+        summary = replace(self, walk=walk)
         if self.evidence[walk] - self.evidence[0] > _PREFER_WALK:
-            memory = memory._still_from(walk)
-        return memory
+            summary = summary._restart_static_from(walk)
+        return summary
 
     @property
     def best_walk(self) -> int:
-        """The walk that the evidence speaks for, standing still left out."""
+        """The walk with the most evidence, the static one left out."""
         return 1 + int(np.argmax(self.evidence[1:]))
 
-    def walking(self, walk: int) -> Memory:
-        """With a walk believed for other reasons than the evidence."""
-        return replace(self, walk=walk, evidence=np.zeros_like(self.evidence))._still_from(walk)
+    def with_walk(self, walk: int) -> EpochSummary:
+        """The summary with a walk selected for other reasons than the evidence."""
+        return replace(self, walk=walk, evidence=np.zeros_like(self.evidence))._restart_static_from(
+            walk
+        )
 
-    def _still_from(self, walk: int) -> Memory:
-        """The memory that stands still starts anew from a walking one."""
+    def _restart_static_from(self, walk: int) -> EpochSummary:
+        """The summary with the static sums restarted from those of a walk."""
         columns = {}
         for name in ("hessian", "gradient", "scatter", "frames", "evidence"):
             column = getattr(self, name).copy()
@@ -193,7 +197,7 @@ class Memory:
         return replace(self, **columns)
 
 
-def kept_share(hessian: Array, variance: Array) -> Array:
+def gain_of_walk(hessian: Array, variance: Array) -> Array:
     """(6, 6) G with ``(H^-1 + diag(variance))^-1 = G H``; H may be singular."""
     if not variance.any():
         return np.eye(6)

@@ -1,4 +1,4 @@
-"""The end of an epoch: the oldest live one goes into the memory, a new one begins."""
+"""The end of an epoch: the oldest live one is summarized, a new one begins."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, merged
-from calibgraph.tracking.drift import drifting, told
+from calibgraph.solver.camera_block import MIN_MATCHES, merge
+from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.posterior import true_hessian
@@ -20,36 +20,41 @@ from calibgraph.tracking.state import CameraState, Epoch, State, block_diagonal
 Array = NDArray[np.float64]
 
 
-def closed(state: State, poses: Sequence[tuple[gtsam.Pose3, ...]]) -> tuple[State, list[Event]]:
+def close_epoch(
+    state: State, estimates: Sequence[tuple[gtsam.Pose3, ...]]
+) -> tuple[State, list[Event]]:
     """The state with its open epoch closed and a new one begun.
 
     Args:
         state: before.
-        poses: the newest estimates, per live epoch and camera.
+        estimates: the newest T_lidar_camera estimates, per live epoch and camera.
     """
     epochs = tuple(
-        replace(epoch, poses=of_epoch) for epoch, of_epoch in zip(state.epochs, poses, strict=True)
+        replace(epoch, T_lidar_camera=of_epoch)
+        for epoch, of_epoch in zip(state.epochs, estimates, strict=True)
     )
     state = replace(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
-        state = _oldest_remembered(state)
-    state = _seen_from(state, state.poses)
+        state = _summarize_oldest(state)
+    state = _with_references(state, state.T_lidar_camera)
     cameras = tuple(
-        replace(known, scale=known.spread.scale(state.config)) if known.started else known
-        for known in state.cameras
+        replace(camera_state, scale=camera_state.residuals.scale(state.config))
+        if camera_state.started
+        else camera_state
+        for camera_state in state.cameras
     )
     state = replace(state, cameras=cameras)
-    epochs = tuple(_gated_anew(state, epoch) for epoch in state.epochs)
-    return told(replace(state, epochs=(*epochs, Epoch((), state.poses))))
+    epochs = tuple(_regate(state, epoch) for epoch in state.epochs)
+    return report_drift(replace(state, epochs=(*epochs, Epoch((), state.T_lidar_camera))))
 
 
-def _gated_anew(state: State, epoch: Epoch) -> Epoch:
+def _regate(state: State, epoch: Epoch) -> Epoch:
     """The epoch with its frames gated at its newest estimate."""
     frames = []
     for frame in epoch.frames:
         used = {
             camera: raw.without_outliers(
-                to_T_camera_lidar(epoch.poses[camera]), state.cameras[camera].scale
+                to_T_camera_lidar(epoch.T_lidar_camera[camera]), state.cameras[camera].scale
             )
             for camera, raw in frame.raw.items()
         }
@@ -58,17 +63,19 @@ def _gated_anew(state: State, epoch: Epoch) -> Epoch:
     return replace(epoch, frames=tuple(frames))
 
 
-def _seen_from(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with its sums about other reference poses."""
-    steps = np.array([*map(step_between, state.references, poses)])
+def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
+    """The state with its sums about other references."""
+    steps = np.array([*map(step_between, state.references, references)])
     cameras = tuple(
-        replace(known, memory=known.memory.seen_from(step))
-        for known, step in zip(state.cameras, steps, strict=True)
+        replace(camera_state, summary=camera_state.summary.shift_reference(step))
+        for camera_state, step in zip(state.cameras, steps, strict=True)
     )
     drift = state.drift
     if drift is not None:
         anchors = zip(drift.anchors, steps, strict=True)
-        drift = replace(drift, anchors=tuple(anchor.seen_from(step) for anchor, step in anchors))
+        drift = replace(
+            drift, anchors=tuple(anchor.shift_reference(step) for anchor, step in anchors)
+        )
     epochs = tuple(
         replace(
             epoch,
@@ -79,12 +86,12 @@ def _seen_from(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
         )
         for epoch in state.epochs
     )
-    return replace(state, cameras=cameras, epochs=epochs, references=poses, drift=drift)
+    return replace(state, cameras=cameras, epochs=epochs, references=references, drift=drift)
 
 
 @dataclass(frozen=True, eq=False)
 class _EpochSums:
-    """An epoch's matches, gated anew, as sums about a camera's reference.
+    """Sums of an epoch's matches, gated anew, about a camera's reference.
 
     Attributes:
         hessian: (6, 6).
@@ -106,37 +113,37 @@ def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
     nothing = _EpochSums(np.zeros((6, 6)), np.zeros(6), scores, 0)
     if not raw:
         return nothing
-    pose, scale = epoch.poses[camera], state.cameras[camera].scale
-    everything = merged(raw)
-    inliers = everything.without_outliers(to_T_camera_lidar(pose), scale)
+    T_lidar_camera, scale = epoch.T_lidar_camera[camera], state.cameras[camera].scale
+    everything = merge(raw)
+    inliers = everything.without_outliers(to_T_camera_lidar(T_lidar_camera), scale)
     if len(inliers.frame) < MIN_MATCHES:
         return nothing
-    block = inliers.scaled(scale)
+    block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
-    gradients = block.frame_sums(pose, np.append(starts, len(inliers.frame))).gradient
+    gradients = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame))).gradient
     scores[np.searchsorted(numbers, own)] = gradients
-    hessian = true_hessian(everything, block, scale, pose)
-    to_reference = step_between(pose, state.references[camera])
+    hessian = true_hessian(everything, block, scale, T_lidar_camera)
+    to_reference = step_between(T_lidar_camera, state.references[camera])
     gradient = gradients.sum(axis=0) + hessian @ to_reference
     return _EpochSums(hessian, gradient, scores, len(own))
 
 
-def _oldest_remembered(state: State) -> State:
-    """The state with its oldest epoch in the memories."""
+def _summarize_oldest(state: State) -> State:
+    """The state with its oldest epoch added to the summaries."""
     epoch, *younger = state.epochs
     sums = [_epoch_sums(state, epoch, camera) for camera in range(len(state.cameras))]
-    judged = [_judged(state, camera, s) for camera, s in enumerate(sums)]
-    state = replace(state, cameras=tuple(judged))
-    state = _with_walks(state)
+    update_evidence = [_update_evidence(state, camera, s) for camera, s in enumerate(sums)]
+    state = replace(state, cameras=tuple(update_evidence))
+    state = _select_walks(state)
     gains, cameras = [], []
-    for camera, (known, s) in enumerate(zip(state.cameras, sums, strict=True)):
-        memory = known.memory
+    for camera, (camera_state, s) in enumerate(zip(state.cameras, sums, strict=True)):
+        summary = camera_state.summary
         if s.frames:
-            memory = memory.plus(s.hessian, s.gradient, s.scores.T @ s.scores, s.frames)
-        memory, gain = memory.after_walk(
+            summary = summary.add(s.hessian, s.gradient, s.scores.T @ s.scores, s.frames)
+        summary, gain = summary.propagate(
             state.walk_variance(len(epoch.frames)), state.overconfidence(camera)
         )
-        cameras.append(replace(known, memory=memory))
+        cameras.append(replace(camera_state, summary=summary))
         gains.append(gain)
     scores = np.hstack([s.scores for s in sums])
     cross, gain = state.cross + _between_cameras(scores), block_diagonal(np.array(gains))
@@ -146,35 +153,34 @@ def _oldest_remembered(state: State) -> State:
 
 
 def _between_cameras(scores: Array) -> Array:
-    """(6 n, 6 n) scatter of (f, 6 n) gradients, without that of each camera with itself."""
+    """(6 n, 6 n) scatter of (f, 6 n) gradients; 0 in the blocks of one camera."""
     scatter: Array = scores.T @ scores
     for rows in range(0, len(scatter), 6):
         scatter[rows : rows + 6, rows : rows + 6] = 0.0
     return scatter
 
 
-def _judged(state: State, camera: int, sums: _EpochSums) -> CameraState:
-    """A camera whose walks are judged by how well they predicted an epoch.
+def _update_evidence(state: State, camera: int, sums: _EpochSums) -> CameraState:
+    """The camera with the evidence of its walks updated by how well they predict an epoch.
 
-    What groups of frames show is learned here too, from epochs old enough for a move within them
-    to have been found.
+    The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
-    known, alone = state.cameras[camera], state.scatter_of_frames(camera)
+    camera_state, alone = state.cameras[camera], state.scatter_of_frames(camera)
     noise = state.frame_noise(camera)
     if noise is None or alone is None or not sums.frames:
-        return known
+        return camera_state
     score = sums.scores.sum(axis=0)
-    groups = tuple(one.plus(score, sums.frames, alone) for one in known.groups)
-    memory = known.memory.judged(sums.hessian, sums.gradient, noise * sums.frames)
-    return replace(known, memory=memory, groups=groups)
+    groups = tuple(one.add(score, sums.frames, alone) for one in camera_state.groups)
+    summary = camera_state.summary.update_evidence(sums.hessian, sums.gradient, noise * sums.frames)
+    return replace(camera_state, summary=summary, groups=groups)
 
 
-def _with_walks(state: State) -> State:
-    """The state with the walks believed that the evidence speaks for."""
-    for camera, known in enumerate(state.cameras):
-        memory = known.memory.reconsidered()
-        if memory.walk > 0 == known.memory.walk:
-            state = drifting(state, camera, memory.walk)
+def _select_walks(state: State) -> State:
+    """The state with each camera's walk selected by the evidence."""
+    for camera, camera_state in enumerate(state.cameras):
+        summary = camera_state.summary.select_walk()
+        if summary.walk > 0 == camera_state.summary.walk:
+            state = follow_drift(state, camera, summary.walk)
         else:
-            state = state.with_camera(camera, replace(known, memory=memory))
+            state = state.with_camera(camera, replace(camera_state, summary=summary))
     return state

@@ -14,73 +14,73 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.factor_graph import optimize, projection_graph
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.state import CameraState, Suspect
+from calibgraph.tracking.state import CameraState, OutlierFrame
 
 Array = NDArray[np.float64]
 
 AGREEMENT = 0.7
-"""A frame agrees with a pose that explains this share of the matches that are usually explained."""
+"""A frame agrees with an estimate that explains this share of the usual share of its matches."""
 
 
-def inlier_share(matches: CameraBlock, pose: gtsam.Pose3, scale: ResidualScale) -> float:
+def inlier_share(block: CameraBlock, T_lidar_camera: gtsam.Pose3, scale: ResidualScale) -> float:
     """Share of the matches within the gate at a T_lidar_camera."""
-    errors, valid = matches.errors_px(to_T_camera_lidar(pose))
+    errors, valid = block.errors_px(to_T_camera_lidar(T_lidar_camera))
     return float(np.mean(valid & (errors <= scale.gate_px)))
 
 
-def agrees(matches: CameraBlock, pose: gtsam.Pose3, known: CameraState) -> bool:
-    """Whether a pose explains about as many of a frame's matches as usual."""
-    share = inlier_share(matches, pose, known.scale)
-    enough = share * len(matches.frame) >= MIN_MATCHES
-    return enough and share >= AGREEMENT * known.inlier_share
+def agrees(block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: CameraState) -> bool:
+    """Whether a T_lidar_camera explains about the usual share of a frame's matches."""
+    share = inlier_share(block, T_lidar_camera, camera_state.scale)
+    enough = share * len(block.frame) >= MIN_MATCHES
+    return enough and share >= AGREEMENT * camera_state.inlier_share
 
 
-def suspect(
+def find_outlier_frame(
     number: int,
-    matches: CameraBlock,
-    pose: gtsam.Pose3,
+    block: CameraBlock,
+    T_lidar_camera: gtsam.Pose3,
     *,
     camera: Camera,
-    known: CameraState,
+    camera_state: CameraState,
     config: Config,
-) -> Suspect | None:
-    """The frame with a pose of its own, if there is one that explains it; else it has failed."""
-    for start in _starts(matches, pose, camera, config):
-        found = refined(matches, start, known.scale, config)
-        if agrees(matches, found, known):
-            return Suspect(number, matches, found)
+) -> OutlierFrame | None:
+    """The frame with its own T_lidar_camera; None if none explains it, so the matching failed."""
+    for start in _starts(block, T_lidar_camera, camera, config):
+        T_own = refine(block, start, camera_state.scale, config)
+        if agrees(block, T_own, camera_state):
+            return OutlierFrame(number, block, T_own)
     return None
 
 
 def _starts(
-    matches: CameraBlock, pose: gtsam.Pose3, camera: Camera, config: Config
+    block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera: Camera, config: Config
 ) -> list[gtsam.Pose3]:
-    """Where to look for the frame's own pose: by PnP if points are matched, else nearby."""
-    if matches.information is not None or config.stage1 == "rig":
-        return [pose]
+    """Start values for the frame's own T_lidar_camera: by PnP if possible, and the estimate."""
+    if block.information is not None or config.stage1 == "rig":
+        return [T_lidar_camera]
     table = Correspondences.from_arrays(
         camera="camera",
         frame=0,
-        pixels_px=matches.block.pixels_px,
-        points_lidar_m=matches.block.points_lidar_m,
+        pixels_px=block.block.pixels_px,
+        points_lidar_m=block.block.points_lidar_m,
     )
     by_pnp = frame_pose(camera, table, config)
-    return [pose] if by_pnp is None else [to_T_lidar_camera(by_pnp), pose]
+    return [T_lidar_camera] if by_pnp is None else [to_T_lidar_camera(by_pnp), T_lidar_camera]
 
 
-def refined(
-    matches: CameraBlock, start: gtsam.Pose3, scale: ResidualScale, config: Config
+def refine(
+    block: CameraBlock, start: gtsam.Pose3, scale: ResidualScale, config: Config
 ) -> gtsam.Pose3:
-    """The T_lidar_camera that matches of a camera say, with a wide loss first."""
+    """The T_lidar_camera that fits a camera's matches, with a wide loss first."""
     T = to_T_camera_lidar(start)
     widening = max(config.pnp_threshold_px / scale.gate_px, 1.0)
     for factor in (widening, 1.0):
         wide = ResidualScale(
             scale.sigma, scale.loss_scale * factor, scale.gate_px * factor, scale.sigma_px
         )
-        inliers = matches.without_outliers(T, wide)
+        inliers = block.without_outliers(T, wide)
         if len(inliers.frame) < MIN_MATCHES:
             return start
-        graph = projection_graph(["camera"], {"camera": inliers.scaled(wide)})
+        graph = projection_graph(["camera"], {"camera": inliers.with_scale(wide)})
         T = optimize(graph, ["camera"], {"camera": T}).T_camera_lidar["camera"]
     return to_T_lidar_camera(T)

@@ -1,4 +1,4 @@
-"""The quadratics of blocks of matches, and what their running sums say of all cameras."""
+"""Quadratic approximations of blocks of matches, and their sums over frames."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.epoch_summary import STRENGTHS, kept_share, step_between
+from calibgraph.tracking.epoch_summary import STRENGTHS, gain_of_walk, step_between
 from calibgraph.tracking.state import Epoch, LiveFrame, State, block_diagonal
 from factors import ProjectionBlock
 
@@ -24,37 +24,41 @@ def quadratic(
     raw: CameraBlock,
     used: CameraBlock,
     scale: ResidualScale,
-    pose: gtsam.Pose3,
+    T_lidar_camera: gtsam.Pose3,
     reference: gtsam.Pose3,
 ) -> tuple[Array, Array]:
-    """What one frame says of a camera.
+    """The quadratic approximation of one frame's cost for a camera.
 
     Args:
         raw: its matches.
-        used: those within the gate at the pose.
+        used: those within the gate at T_lidar_camera.
         scale: of the residuals.
-        pose: T_lidar_camera near the minimum.
-        reference: T_lidar_camera where the gradient is wanted.
+        T_lidar_camera: near the minimum.
+        reference: T_lidar_camera at which the gradient is taken.
 
     Returns:
-        (6, 6) true Hessian of half the cost near the pose; (6,) gradient at the reference.
+        (6, 6) true Hessian of half the cost there; (6,) gradient at the reference.
     """
-    block = used.scaled(scale)
-    hessian = true_hessian(raw, block, scale, pose)
-    gradient = block.sums(pose).gradient + hessian @ step_between(pose, reference)
+    block = used.with_scale(scale)
+    hessian = true_hessian(raw, block, scale, T_lidar_camera)
+    gradient = block.sums(T_lidar_camera).gradient + hessian @ step_between(
+        T_lidar_camera, reference
+    )
     return hessian, gradient
 
 
 def true_hessian(
-    raw: CameraBlock, block: ProjectionBlock, scale: ResidualScale, pose: gtsam.Pose3
+    raw: CameraBlock, block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3
 ) -> Array:
-    """(6, 6) of the robust cost of the matches in the gate, which moves with the pose."""
-    return robust_hessian(block, pose) + raw.gate_hessian(to_T_camera_lidar(pose), scale)
+    """(6, 6) of the robust cost of the matches in the gate, which moves with T_lidar_camera."""
+    return robust_hessian(block, T_lidar_camera) + raw.gate_hessian(
+        to_T_camera_lidar(T_lidar_camera), scale
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What frames say of all cameras at one time, as sums about the references.
+    """Sums of all cameras' quadratics at one time, about the references.
 
     Attributes:
         hessian: (n, 6, 6) per camera: projections tie no two cameras.
@@ -69,22 +73,22 @@ class Posterior:
     frames: Array
 
     @staticmethod
-    def of_memory(state: State) -> Posterior:
-        """What the marginalised epochs say of the first live one."""
-        memories = [camera.memory for camera in state.cameras]
+    def from_summaries(state: State) -> Posterior:
+        """The summaries of older epochs."""
+        summaries = [camera.summary for camera in state.cameras]
         scatter = state.cross.copy()
-        for place, memory in enumerate(memories):
-            rows = slice(6 * place, 6 * place + 6)
-            scatter[rows, rows] = memory.scatter[memory.walk]
+        for place, summary in enumerate(summaries):
+            rows = pose_rows(place)
+            scatter[rows, rows] = summary.scatter[summary.walk]
         return Posterior(
-            np.array([m.hessian[m.walk] for m in memories]),
-            np.array([m.gradient[m.walk] for m in memories]),
+            np.array([m.hessian[m.walk] for m in summaries]),
+            np.array([m.gradient[m.walk] for m in summaries]),
             scatter,
-            np.array([m.frames[m.walk] for m in memories]),
+            np.array([m.frames[m.walk] for m in summaries]),
         )
 
-    def plus(self, frames: Iterable[LiveFrame], steps: Array) -> Posterior:
-        """With frames added.
+    def add(self, frames: Iterable[LiveFrame], steps: Array) -> Posterior:
+        """The sums with frames added.
 
         Args:
             frames: that share one extrinsic.
@@ -105,15 +109,15 @@ class Posterior:
             self.frames + seen.sum(axis=0),
         )
 
-    def after_walk(self, state: State, frames: int) -> Posterior:
-        """After an epoch of so many frames in which the cameras that walk have walked."""
-        if not any(camera.memory.walk for camera in state.cameras):
+    def propagate(self, state: State, frames: int) -> Posterior:
+        """The sums after the random walk of an epoch of so many frames."""
+        if not any(camera.summary.walk for camera in state.cameras):
             return self
         gains, walked = [], []
         for place, camera in enumerate(state.cameras):
-            strength = STRENGTHS[camera.memory.walk]
+            strength = STRENGTHS[camera.summary.walk]
             variance = strength**2 * state.walk_variance(frames)
-            gains.append(kept_share(self.hessian[place], variance / state.overconfidence(place)))
+            gains.append(gain_of_walk(self.hessian[place], variance / state.overconfidence(place)))
             walked.append(variance)
         gain = np.array(gains)
         hessian = gain @ self.hessian
@@ -132,36 +136,36 @@ class Posterior:
             return None
         return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
 
-    def covariance(self, known: Array) -> Array:
-        """(6 n, 6 n) cluster-robust, with the (6 n, 6 n) Hessian of what is known beside them."""
-        inverse = np.linalg.inv(block_diagonal(self.hessian) + known)
+    def covariance(self, prior_hessian: Array) -> Array:
+        """(6 n, 6 n) cluster-robust, with the (6 n, 6 n) Hessian of priors."""
+        inverse = np.linalg.inv(block_diagonal(self.hessian) + prior_hessian)
         finite = np.repeat(np.sqrt(self.frames / np.maximum(self.frames - 1, 1)), 6)
         covariance: Array = inverse @ self.scatter @ inverse * np.outer(finite, finite)
         return covariance
 
 
 def posterior(state: State, before: int | None = None) -> Posterior:
-    """The sums over the memory and all live frames, or those before a frame's number."""
+    """The sums over the summaries and all live frames, or those before a frame's number."""
     sums = closed_posterior(state, before)
     return with_open_epoch(sums, state, before)
 
 
 def closed_posterior(state: State, before: int | None = None) -> Posterior:
     """The same without the frames of the open epoch."""
-    sums, steps = Posterior.of_memory(state), _steps(state)
+    sums, steps = Posterior.from_summaries(state), _steps(state)
     for epoch in state.epochs[:-1]:
-        sums = sums.plus(_until(epoch, before), steps).after_walk(state, len(epoch.frames))
+        sums = sums.add(_until(epoch, before), steps).propagate(state, len(epoch.frames))
     return sums
 
 
 def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:
     """The sums over closed epochs with the frames of the open one added."""
-    return sums.plus(_until(state.epochs[-1], before), _steps(state))
+    return sums.add(_until(state.epochs[-1], before), _steps(state))
 
 
 def _steps(state: State) -> Array:
     """(n, 6) from the references to the estimates."""
-    return np.array([*map(step_between, state.references, state.poses)])
+    return np.array([*map(step_between, state.references, state.T_lidar_camera)])
 
 
 def _until(epoch: Epoch, number: int | None) -> list[LiveFrame]:
@@ -174,7 +178,7 @@ def inverse(matrices: Array) -> Array:
 
 
 def is_determined(hessian: Array) -> bool:
-    """Whether no direction of the pose is free."""
+    """Whether all six directions are determined."""
     diagonal = np.diag(hessian)
     if not (diagonal > 0).all():
         return False

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibgraph.report.as_json import finite
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.tracker import Update
+from calibgraph.tracking.update import Update
 
 
 def json_line(update: Update) -> str:

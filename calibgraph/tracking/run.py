@@ -9,25 +9,25 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.report import json_line
-from calibgraph.tracking.stream import Item, Refused, StreamFrame
-from calibgraph.tracking.tracker import Update
+from calibgraph.tracking.streams import Item, Refused, StreamFrame
+from calibgraph.tracking.update import Update
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
 @dataclass
-class Done:
-    """What a run has done.
+class RunCounts:
+    """Counts of a run.
 
     Attributes:
         updates: frames taken in.
-        refused: input that was no frame, or a frame that could not be taken.
-        known: frames at the beginning that an earlier run had taken in already.
+        refused: input that was not a frame, or a frame that was left out.
+        skipped: frames at the beginning that an earlier run had taken in already.
     """
 
     updates: int = 0
     refused: int = 0
-    known: int = 0
+    skipped: int = 0
 
 
 def follow(
@@ -37,27 +37,27 @@ def follow(
     *,
     every: int,
     stop: Callable[[], bool],
-    write: Say,
-    tell: Say,
-) -> Done:
+    write: Notify,
+    notify: Notify,
+) -> RunCounts:
     """Update with each frame until there are no more, or ``stop()``.
 
     Args:
         items: the frames.
         calibrator: takes them in.
-        history: keeps what becomes of the extrinsics.
+        history: of the extrinsics; each update is added.
         every: take every so-many-th frame.
-        stop: asked after each frame.
-        write: given each update as a line of JSON, once it is on disk; after a crash first the
-            last one from before it, which may or may not have been written. A BrokenPipeError ends
-            the loop.
-        tell: given warnings and events as sentences.
+        stop: called after each frame.
+        write: called with each update as a line of JSON, once it is on disk; after a crash, first
+            with the last one before it, which may have been written already. A BrokenPipeError
+            ends the loop.
+        notify: called with warnings and events as sentences.
     """
-    run = _Run(calibrator, history, write, tell)
+    run = _Run(calibrator, history, write, notify)
     count = 0
     try:
-        if calibrator.repeated is not None:  # whether its line was printed nobody knows
-            run.tell_of(calibrator.repeated)
+        if calibrator.repeated is not None:  # its line may not have been printed
+            run.report(calibrator.repeated)
         for item in items:
             if isinstance(item, Refused):
                 run.refuse(item.message)
@@ -65,49 +65,49 @@ def follow(
                 if count % every == 0:
                     run.take(item)
                 count += 1
-            if stop():  # before the next one is waited for, or matched
+            if stop():  # before waiting for the next one, or matching it
                 break
     except BrokenPipeError:
-        tell("stopped: nobody reads standard output any more; what was done is on disk")
-    return run.done
+        notify("stopped: the reader of standard output is gone; all updates are on disk")
+    return run.counts
 
 
 class _Run:
-    """What is done with one item."""
+    """Handling of single items."""
 
     def __init__(
-        self, calibrator: DurableCalibrator, history: History, write: Say, tell: Say
+        self, calibrator: DurableCalibrator, history: History, write: Notify, notify: Notify
     ) -> None:
-        self.done = Done()
+        self.counts = RunCounts()
         self._calibrator = calibrator
         self._history = history
-        self._write, self._tell = write, tell
+        self._write, self._notify = write, notify
         self._resumed_at = calibrator.tracker.frame if calibrator.resumed else None
 
     def take(self, frame: StreamFrame) -> None:
         """Update with a frame, unless an earlier run has, or it is refused."""
         at = self._resumed_at
-        if at is not None and frame.frame <= at and not self.done.updates:
-            if not self.done.known:
-                self._tell(f"frame {frame.frame} and others up to {at} are known: skipped")
-            self.done.known += 1
+        if at is not None and frame.frame <= at and not self.counts.updates:
+            if not self.counts.skipped:
+                self._notify(f"frame {frame.frame} and others up to {at} are known: skipped")
+            self.counts.skipped += 1
             return
         try:
             update = self._calibrator.update(frame.table, frame=frame.frame)
         except CorrespondenceError as error:
             self.refuse(str(error))
             return
-        self.done.updates += 1
-        self.tell_of(update)
+        self.counts.updates += 1
+        self.report(update)
 
     def refuse(self, message: str) -> None:
-        """Say what is left out."""
-        self.done.refused += 1
-        self._tell(f"left out: {message}")
+        """Count an item that is left out, and report it."""
+        self.counts.refused += 1
+        self._notify(f"left out: {message}")
 
-    def tell_of(self, update: Update) -> None:
-        """Give an update out."""
+    def report(self, update: Update) -> None:
+        """Write an update, and report its events."""
         self._history.add(update)
         self._write(json_line(update))
         for event in update.events:
-            self._tell(f"frame {event.detected_frame}: {event}")
+            self._notify(f"frame {event.detected_frame}: {event}")

@@ -14,78 +14,78 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.noise import ResidualHistogram
 from calibgraph.tracking.posterior import quadratic
-from calibgraph.tracking.spread import Spread
-from calibgraph.tracking.state import HISTORY, CameraState, State, put
+from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
-_TRY_AGAIN = 1.5  # so many times more frames than at the last attempt
+_TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 
 
-def started(state: State, camera: int, table: Correspondences) -> State:
-    """The state after a camera that has no estimate yet saw one more frame.
+def try_to_start(state: State, camera: int, table: Correspondences) -> State:
+    """The state after one more frame of a camera that has no estimate yet.
 
     Args:
         state: before.
         camera: its place in the rig.
         table: the correspondences of that frame.
     """
-    known, name = state.cameras[camera], state.names[camera]
+    camera_state, name = state.cameras[camera], state.names[camera]
     own = table.of_camera(name)
     table = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
-    waiting = (*known.waiting, table)[-HISTORY:]
-    state = state.with_camera(camera, replace(known, waiting=waiting))
-    if not _is_time(len(known.waiting) + 1, state.config.tracking.start_frames):
+    waiting = (*camera_state.waiting, table)[-HISTORY:]
+    state = state.with_camera(camera, replace(camera_state, waiting=waiting))
+    if not _is_attempt_due(len(camera_state.waiting) + 1, state.config.tracking.start_frames):
         return state
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:
         result = solve(rig, concatenate(waiting), state.config)
     except CorrespondenceError as error:
-        return _refused(state, camera, (str(error),))
+        return _wait_longer(state, camera, (str(error),))
     if result.verdict.status == "FAIL":
-        return _refused(state, camera, result.camera_verdicts[name].reasons)
-    pose = to_T_lidar_camera(result.T_camera_lidar[name])
-    return _begun(state, camera, pose)
+        return _wait_longer(state, camera, result.camera_verdicts[name].reasons)
+    T_lidar_camera = to_T_lidar_camera(result.T_camera_lidar[name])
+    return _start_camera(state, camera, T_lidar_camera)
 
 
-def _is_time(frames: int, first: int) -> bool:
+def _is_attempt_due(frames: int, first: int) -> bool:
     """At the first frames, then at growing intervals, then with every new window of frames."""
     attempts = first * _TRY_AGAIN ** np.arange(10)
     return frames in attempts.astype(int) or frames >= HISTORY
 
 
-def _refused(state: State, camera: int, reasons: tuple[str, ...]) -> State:
-    known = replace(state.cameras[camera], refused=reasons)
-    if len(known.waiting) >= HISTORY:  # tried with a full window: the older half makes room
-        known = replace(known, waiting=known.waiting[HISTORY // 2 :])
-    return state.with_camera(camera, known)
+def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> State:
+    camera_state = replace(state.cameras[camera], refused=reasons)
+    if len(camera_state.waiting) >= HISTORY:  # tried with a full window: the older half makes room
+        camera_state = replace(camera_state, waiting=camera_state.waiting[HISTORY // 2 :])
+    return state.with_camera(camera, camera_state)
 
 
-def _begun(state: State, camera: int, pose: gtsam.Pose3) -> State:
-    """The state with a camera's first frames absorbed at its first pose."""
-    parts = [_matches(state, camera, table) for table in state.cameras[camera].waiting]
+def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> State:
+    """The state with a camera's first frames absorbed at its first estimate."""
+    parts = [_camera_block(state, camera, table) for table in state.cameras[camera].waiting]
     usable = [part for part in parts if part is not None]
-    spread = Spread()
+    residuals = ResidualHistogram()
     for part in usable:
-        spread = spread.plus(part, to_T_camera_lidar(pose))
-    scale = spread.scale(state.config)  # what `noted` counts inliers by
-    known = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
+        residuals = residuals.add(part, to_T_camera_lidar(T_lidar_camera))
+    scale = residuals.scale(state.config)  # the gate by which inliers are counted below
+    camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for part in usable:
-        known = noted(known, part, pose)
-    state = state.with_camera(camera, known)
-    state = replace(state, references=put(state.references, camera, pose))
-    return absorbed_late(state, camera, usable, pose)
+        camera_state = count_residuals(camera_state, part, T_lidar_camera)
+    state = state.with_camera(camera, camera_state)
+    state = replace(state, references=replace_item(state.references, camera, T_lidar_camera))
+    return absorb_frames(state, camera, usable, T_lidar_camera)
 
 
-def absorbed_late(
-    state: State, camera: int, matches: list[CameraBlock], pose: gtsam.Pose3
+def absorb_frames(
+    state: State, camera: int, blocks: list[CameraBlock], T_lidar_camera: gtsam.Pose3
 ) -> State:
-    """The state with a camera at a pose, and frames of it that had been set aside.
+    """The state with a camera at a new estimate, and frames absorbed that had been set aside.
 
-    Those of live frames take their places in them; older ones are left out.
+    Blocks of live frames are added to them; older ones are left out.
     """
     scale = state.cameras[camera].scale
-    T = to_T_camera_lidar(pose)
-    by_number = {int(part.frame[0]): part for part in matches}
+    T = to_T_camera_lidar(T_lidar_camera)
+    by_number = {int(part.frame[0]): part for part in blocks}
     epochs, counts = [], {"absorbed": 0, "given": 0, "used": 0}
     for epoch in state.epochs:
         frames = []
@@ -95,29 +95,37 @@ def absorbed_late(
             if raw is None or used is None or len(used.frame) < MIN_MATCHES:
                 frames.append(frame)
                 continue
-            sums = quadratic(raw, used, scale, pose, state.references[camera])
-            frames.append(frame.plus(camera, raw, used, sums))
+            sums = quadratic(raw, used, scale, T_lidar_camera, state.references[camera])
+            frames.append(frame.add(camera, raw, used, sums))
             for key, more in (
                 ("absorbed", 1),
                 ("given", len(raw.frame)),
                 ("used", len(used.frame)),
             ):
                 counts[key] += more
-        epochs.append(replace(epoch, frames=tuple(frames), poses=put(epoch.poses, camera, pose)))
+        epochs.append(
+            replace(
+                epoch,
+                frames=tuple(frames),
+                T_lidar_camera=replace_item(epoch.T_lidar_camera, camera, T_lidar_camera),
+            )
+        )
     state = replace(state, epochs=tuple(epochs))
-    return state.with_camera(camera, state.cameras[camera].counted(**counts))
+    return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 
-def noted(known: CameraState, matches: CameraBlock, pose: gtsam.Pose3) -> CameraState:
-    """The camera with a frame's residuals counted in what is usual."""
-    T = to_T_camera_lidar(pose)
-    errors, valid = matches.errors_px(T)
-    share = float(np.mean(valid & (errors <= known.scale.gate_px)))
-    recent = np.vstack([known.recent, [share, float(np.median(errors))]])[-HISTORY:]
-    return replace(known, recent=recent, spread=known.spread.plus(matches, T))
+def count_residuals(
+    camera_state: CameraState, block: CameraBlock, T_lidar_camera: gtsam.Pose3
+) -> CameraState:
+    """The camera with a frame's residuals counted."""
+    T = to_T_camera_lidar(T_lidar_camera)
+    errors, valid = block.errors_px(T)
+    share = float(np.mean(valid & (errors <= camera_state.scale.gate_px)))
+    recent = np.vstack([camera_state.recent, [share, float(np.median(errors))]])[-HISTORY:]
+    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(block, T))
 
 
-def _matches(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
+def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
     """The preprocessed matches of one camera's frame, None if there are too few."""
     name = state.names[camera]
     kept = preprocess(state.rig, table, state.config)

@@ -1,4 +1,4 @@
-"""What the tracker knows: everything that a restart needs, as plain arrays."""
+"""The state of the tracker, whole and immutable: a restart needs nothing else."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.epoch_summary import Memory
-from calibgraph.tracking.repetition import Groups, inflation, none_seen, widening
-from calibgraph.tracking.spread import Spread
+from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.noise import (
+    GroupScatter,
+    ResidualHistogram,
+    inflation,
+    no_groups,
+    widening,
+)
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
-HISTORY = 50
-"""Frames over which the size of the residuals and the share of inliers are taken."""
+LEAST_FRAMES = 15  # for the scatter of a six-vector
+HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +37,10 @@ class LiveFrame:
 
     Attributes:
         number: of the frame.
-        raw: per camera (by its place in the rig) that the frame agrees with: all its matches.
+        raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
         used: those within the gate.
         hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
-        gradient: (n, 6) at the cameras' reference poses.
+        gradient: (n, 6) at the cameras' references.
     """
 
     number: int
@@ -45,14 +50,14 @@ class LiveFrame:
     gradient: Array
 
     def without(self, camera: int) -> LiveFrame:
-        """The frame as if a camera had not seen it."""
+        """The frame without one camera's matches."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         hessian[camera], gradient[camera] = 0.0, 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
         used = {c: m for c, m in self.used.items() if c != camera}
         return LiveFrame(self.number, raw, used, hessian, gradient)
 
-    def plus(
+    def add(
         self, camera: int, raw: CameraBlock, used: CameraBlock, sums: tuple[Array, Array]
     ) -> LiveFrame:
         """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
@@ -64,7 +69,7 @@ class LiveFrame:
 
     @staticmethod
     def empty(number: int, cameras: int) -> LiveFrame:
-        """A frame that no camera has seen yet."""
+        """A frame without matches."""
         return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
 
 
@@ -74,72 +79,72 @@ class Epoch:
 
     Attributes:
         frames: in order.
-        poses: per camera, the estimate of T_lidar_camera.
+        T_lidar_camera: per camera, the estimate.
     """
 
     frames: tuple[LiveFrame, ...]
-    poses: tuple[gtsam.Pose3, ...]
+    T_lidar_camera: tuple[gtsam.Pose3, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Suspect:
-    """A frame that disagrees with a camera's estimate but has a pose of its own.
+class OutlierFrame:
+    """A frame that disagrees with a camera's estimate but fits another T_lidar_camera.
 
     Attributes:
         number: of the frame.
         raw: its matches.
-        pose: T_lidar_camera that they say.
+        T_lidar_camera: that fits them.
     """
 
     number: int
     raw: CameraBlock
-    pose: gtsam.Pose3
+    T_lidar_camera: gtsam.Pose3
 
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """What is known of one camera.
+    """The state of one camera.
 
     Attributes:
         started: whether it has an estimate of its own.
         waiting: before that, the frames it may start from.
         refused: why it has not started from them.
-        spread: of its residuals.
-        scale: that this spread says, as of the last epoch's beginning.
+        residuals: their histogram.
+        scale: of the residuals, as of the beginning of the last epoch.
         recent: (f, 2) of its last absorbed frames: the share of inliers, the median error [px].
-        memory: its past.
-        suspects: its last frames that disagree with the estimate but not with each other, newest
+        summary: of its older epochs.
+        outlier_frames: its last frames that disagree with the estimate but fit another one, newest
             last.
-        verdicts: of its last frames, newest last: whether each agreed, with its number.
+        agreements: of its last frames, newest last: its number, and whether it agreed.
         absent: frames since the last usable one.
-        groups: whether neighbouring frames repeat each other's errors.
-        moved_at: how many updates there were when it last moved, or -1.
-        drift_said_at: how many when its drift was last told, or -1.
-        counts: frames and correspondences, by what became of them.
+        groups: scatter of groups of epochs, by which errors shared by neighbouring frames show.
+        moved_at: number of updates when it last moved, or -1.
+        drift_reported_at: number of updates when its drift was last reported, or -1.
+        counts: of frames and correspondences that were given, used, left out.
     """
 
     started: bool = False
     waiting: tuple[Correspondences, ...] = ()
     refused: tuple[str, ...] = ()
-    spread: Spread = field(default_factory=Spread)
+    residuals: ResidualHistogram = field(default_factory=ResidualHistogram)
     scale: ResidualScale = ResidualScale(1.0, 1.0, 1.0, 1.0)
     recent: Array = field(default_factory=lambda: np.empty((0, 2)))
-    memory: Memory = field(default_factory=Memory.empty)
-    suspects: tuple[Suspect, ...] = ()
-    verdicts: tuple[tuple[int, bool], ...] = ()
+    summary: EpochSummary = field(default_factory=EpochSummary.empty)
+    outlier_frames: tuple[OutlierFrame, ...] = ()
+    agreements: tuple[tuple[int, bool], ...] = ()
     absent: int = 0
-    groups: tuple[Groups, ...] = field(default_factory=none_seen)
+    groups: tuple[GroupScatter, ...] = field(default_factory=no_groups)
     moved_at: int = -1
-    drift_said_at: int = -1
+    drift_reported_at: int = -1
     counts: dict[str, int] = field(default_factory=dict)
 
     @property
     def inlier_share(self) -> float:
-        """The usual share of inliers."""
+        """Median share of inliers of the last absorbed frames."""
         return float(np.median(self.recent[:, 0]))
 
-    def counted(self, **more: int) -> CameraState:
-        """With some counts raised."""
+    def count(self, **more: int) -> CameraState:
+        """The camera with some counts raised."""
         counts = dict(self.counts)
         for key, number in more.items():
             counts[key] = counts.get(key, 0) + number
@@ -148,24 +153,24 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class DriftWatch:
-    """A drift that has been noticed, and of which it is not clear yet what drifts.
+    """A drift that has been detected, but whose cause is not clear yet.
 
     Attributes:
         camera: that showed it first.
-        begun: how many updates there were then.
+        begun: number of updates at its detection.
         frame: number of the frame since which it drifts.
-        anchors: per camera, its memory at the time.
+        anchors: per camera, its summary at the time.
     """
 
     camera: int
     begun: int
     frame: int
-    anchors: tuple[Memory, ...]
+    anchors: tuple[EpochSummary, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything the tracker knows.
+    """The whole state of the tracker.
 
     Attributes:
         rig: the initial guess.
@@ -173,16 +178,16 @@ class State:
         cameras: per camera of the rig.
         references: per camera, T_lidar_camera about which sums are taken.
         epochs: the live ones; the last is open.
-        cross: (6 n, 6 n) scatter between different cameras in the memories.
+        cross: (6 n, 6 n) scatter between different cameras in the summaries.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
         total_frames: (n,) and of frames.
-        dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has made wrong.
-        drift: that is being watched, or None.
-        systematic_sigmas: rotation [rad] and translation [m] that the matcher says frames share.
+        dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
+        drift: whose cause is not clear yet, or None.
+        systematic_sigmas: rotation [rad], translation [m]: of the error that all frames share.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
-        updates: how many there were.
+        updates: number of updates.
     """
 
     rig: Rig
@@ -205,13 +210,13 @@ class State:
     def initial(rig: Rig, config: Config) -> State:
         """Before the first frame."""
         n = len(rig.cameras)
-        poses = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
+        guess = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
         return State(
             rig=rig,
             config=config,
             cameras=tuple(CameraState() for _ in range(n)),
-            references=poses,
-            epochs=(Epoch((), poses),),
+            references=guess,
+            epochs=(Epoch((), guess),),
             cross=np.zeros((6 * n, 6 * n)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
@@ -224,9 +229,9 @@ class State:
         return tuple(self.rig.cameras)
 
     @property
-    def poses(self) -> tuple[gtsam.Pose3, ...]:
-        """Per camera, the present estimate of T_lidar_camera."""
-        return self.epochs[-1].poses
+    def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
+        """Per camera, the present estimate."""
+        return self.epochs[-1].T_lidar_camera
 
     @property
     def live_frames(self) -> tuple[LiveFrame, ...]:
@@ -234,8 +239,8 @@ class State:
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
-        """With one camera's knowledge replaced."""
-        return replace(self, cameras=put(self.cameras, index, camera))
+        """The state with one camera replaced."""
+        return replace(self, cameras=replace_item(self.cameras, index, camera))
 
     def walk_variance(self, frames: int) -> Array:
         """(6,) variance of the configured walk over so many frames: rotation, translation."""
@@ -246,17 +251,17 @@ class State:
     def frame_noise(self, index: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
 
-        As much larger than that of frames as epochs scatter more than their frames say.
+        That of the frames alone, times the inflation.
         """
         noise = self.scatter_of_frames(index)
         return None if noise is None else noise * self.inflation(index)
 
     def inflation(self, index: int) -> float:
-        """How much more a camera's epochs scatter than their frames say, at least 1."""
+        """Ratio of the scatter of a camera's epochs to that of their frames, at least 1."""
         return inflation(self.cameras[index].groups)
 
-    def widened(self, scatter: Array) -> Array:
-        """(6 n, 6 n) scatter of all cameras' gradients, by what groups of frames show."""
+    def widen(self, scatter: Array) -> Array:
+        """(6 n, 6 n) scatter of all cameras' gradients, widened by the scatter of groups."""
         parts = []
         for index, camera in enumerate(self.cameras):
             noise = self.scatter_of_frames(index)
@@ -269,21 +274,17 @@ class State:
         frames = self.total_frames[index]
         if frames < LEAST_FRAMES:
             return None
-        rows = slice(6 * index, 6 * index + 6)
+        rows = pose_rows(index)
         return np.asarray(self.total[rows, rows] / (frames - 1))
 
     def overconfidence(self, index: int) -> float:
-        """How much too large a camera's Hessian is as an information, on average."""
+        """Mean ratio of a camera's Hessian to its information, at least 1."""
         frames = self.total_frames[index]
         if frames < LEAST_FRAMES:
             return 1.0
-        rows = slice(6 * index, 6 * index + 6)
+        rows = pose_rows(index)
         share = np.linalg.solve(self.total_hessian[index], self.total[rows, rows])
         return max(1.0, float(np.trace(share)) / 6)
-
-
-LEAST_FRAMES = 15
-"""Frames from which the scatter of a six-vector can be taken."""
 
 
 def block_diagonal(blocks: Array) -> Array:
@@ -294,6 +295,6 @@ def block_diagonal(blocks: Array) -> Array:
     return matrix.reshape(6 * n, 6 * n)
 
 
-def put(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
+def replace_item(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
     """The tuple with one item replaced."""
     return (*items[:index], item, *items[index + 1 :])

@@ -1,4 +1,4 @@
-"""Frames of correspondences from a table: a Parquet or CSV file, or Arrow data in memory."""
+"""Frames of correspondences from Arrow data: a Parquet or CSV file, or an Arrow IPC stream."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class StreamFrame:
 
 @dataclass(frozen=True)
 class Refused:
-    """Input that is no frame: one line that says what, where, what was found and what to do."""
+    """Input that is not a frame, as a message of one line."""
 
     message: str
 
@@ -45,7 +45,7 @@ Item = StreamFrame | Refused
 
 
 def refused(where: Path | str, what: str) -> Refused:
-    """The line for what is wrong somewhere in a source."""
+    """The message for wrong input: where it is, and what is wrong."""
     return Refused(str(FileError(where, what)))
 
 
@@ -95,7 +95,7 @@ def _frame_spans(file: Any) -> list[tuple[int, int]] | None:
 
 
 def _row_groups(file: Any, spans: Sequence[tuple[int, int]]) -> Iterator[pa.Table]:
-    """One row group at a time; a frame that goes on in the next one is held until it ends."""
+    """One row group at a time; a frame that continues in the next one is held until it ends."""
     import pyarrow as pa
 
     held: list[pa.Table] = []
@@ -103,14 +103,14 @@ def _row_groups(file: Any, spans: Sequence[tuple[int, int]]) -> Iterator[pa.Tabl
         table = pa.concat_tables([*held, file.read_row_group(group)])
         held = []
         if group + 1 < len(spans) and spans[group + 1][0] == last:
-            goes_on = table["frame"].to_numpy() == last
-            held = [table.filter(pa.array(goes_on))]
-            table = table.filter(pa.array(~goes_on))
+            continues = table["frame"].to_numpy() == last
+            held = [table.filter(pa.array(continues))]
+            table = table.filter(pa.array(~continues))
         yield table
 
 
 def require_schema(where: Path | str, schema: pa.Schema) -> None:
-    """What no row can mend: the columns' names and types, and the metadata.
+    """Check the columns' names and types, and the metadata.
 
     Raises:
         FileError: with the first thing that is wrong.
@@ -155,3 +155,46 @@ def _frame_or_refused(rows: pa.Table, where: str) -> Item:
         return refused(where, f"frame {number} is left out; among its rows, {error}")
     stamp_ns = None if table.stamp_ns is None else int(table.stamp_ns.max())
     return StreamFrame(number, stamp_ns, table)
+
+
+def frames_of_batches(file: Any, where: str) -> Iterator[Item]:
+    """The frames of an Arrow IPC stream with the columns of the Parquet file.
+
+    Every record batch holds one or several whole frames, which are given in the order in which they
+    first appear. A frame without rows cannot be expressed.
+
+    Args:
+        file: with ``read``, ``close`` and ``closed``.
+        where: the name of the file in messages.
+
+    Raises:
+        FileError: wherever the stream turns out not to be readable.
+    """
+    for number, batch in enumerate(_batches(file, where), start=1):
+        yield from _frames_of_batch(batch, f"{where}, batch {number}")
+
+
+def _batches(file: Any, where: str) -> Iterator[pa.RecordBatch]:
+    import pyarrow as pa
+    from pyarrow import ipc
+
+    count = 0
+    try:
+        with ipc.open_stream(pa.PythonFile(file, mode="r")) as reader:
+            require_schema(where, reader.schema)
+            for count, batch in enumerate(reader, start=1):  # noqa: B007 - for the message
+                yield batch
+    except (pa.ArrowException, OSError, ValueError) as error:
+        message = f"the Arrow stream breaks off after {count} batches ({error}); send it again"
+        raise FileError(where, message) from error
+
+
+def _frames_of_batch(batch: pa.RecordBatch, where: str) -> Iterator[Item]:
+    import pyarrow as pa
+
+    try:
+        batch.validate(full=True)
+    except pa.ArrowException as error:
+        yield refused(where, f"is damaged ({error}); send it again")
+        return
+    yield from frames_in(pa.Table.from_batches([batch]), where, ascending=False)

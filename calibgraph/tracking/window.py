@@ -1,15 +1,15 @@
 """The live epochs as an iSAM2 problem.
 
-A camera that walks has a variable per epoch:
+A camera with a random walk has a variable per epoch:
 
-    memory - x(c, 0) - walk - x(c, 1) - walk - ... - x(c, last) - priors, relative poses
-               |                |                      |
-             block            block             one block per frame
+    summary - x(c, 0) - walk - x(c, 1) - walk - ... - x(c, last) - priors, relative poses
+                |                |                      |
+              block            block             one block per frame
 
-One that stands still has a single variable, on which all of its blocks are.
+A static camera has a single variable for all of its blocks.
 
-Older epochs are in the memory, a quadratic about a reference pose. What is known of poses apart
-from correspondences stands once, at the last epoch.
+Older epochs are in the summary, a quadratic about a reference. Priors and relative poses, which are
+independent of correspondences, are added once, at the last epoch.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import CameraBlock, merged
-from calibgraph.solver.factor_graph import joined, objective_graph, pose_key
+from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
@@ -37,7 +37,7 @@ class Window:
 
     def __init__(self, state: State) -> None:
         self._names = state.names
-        self._walks = [camera.memory.walk > 0 for camera in state.cameras]
+        self._walks = [camera.summary.walk > 0 for camera in state.cameras]
         self._cameras = len(state.names)
         self._epochs = len(state.epochs)
         parameters = gtsam.ISAM2Params()
@@ -47,17 +47,17 @@ class Window:
         self._isam = gtsam.ISAM2(parameters)
         values = gtsam.Values()
         for place, epoch in enumerate(state.epochs):
-            for camera, pose in enumerate(epoch.poses):
+            for camera, T_lidar_camera in enumerate(epoch.T_lidar_camera):
                 if self._walks[camera] or epoch is state.epochs[-1]:
-                    values.insert(self._key(place, camera), pose)
-        graph = joined(self._memory_graph(state), self._walk_graph(state), known_of_poses(state))
-        for camera, known in enumerate(state.cameras):
+                    values.insert(self._key(place, camera), T_lidar_camera)
+        graph = join(self._summary_graph(state), self._walk_graph(state), pose_priors(state))
+        for camera, camera_state in enumerate(state.cameras):
             for key, seen in self._by_key(state, camera).items():
-                graph.add(block_factor(key, merged(seen).scaled(known.scale)))
+                graph.add(block_factor(key, merge(seen).with_scale(camera_state.scale)))
         self._isam.update(graph, values)
 
     def add(self, blocks: Mapping[int, ProjectionBlock]) -> list[int]:
-        """Add a frame's blocks to the last epoch; their places, to be replaced by."""
+        """Add a frame's blocks to the last epoch; returns their places, for :meth:`replace`."""
         graph = gtsam.NonlinearFactorGraph()
         for camera, block in blocks.items():
             graph.add(block_factor(self._key_of_last(camera), block))
@@ -65,22 +65,18 @@ class Window:
         return list(result.getNewFactorsIndices())
 
     def replace(self, places: Sequence[int], blocks: Mapping[int, ProjectionBlock]) -> None:
-        """Put other blocks in the place of those added."""
+        """Replace the blocks at some places."""
         graph = gtsam.NonlinearFactorGraph()
         for camera, block in blocks.items():
             graph.add(block_factor(self._key_of_last(camera), block))
         self._isam.update(graph, gtsam.Values(), list(places))
 
-    def settle(self) -> None:
-        """One more step to the optimum."""
-        self._isam.update()
-
-    def pose(self, camera: int) -> gtsam.Pose3:
-        """The estimate of a camera's T_lidar_camera in the last epoch."""
+    def T_lidar_camera(self, camera: int) -> gtsam.Pose3:
+        """The estimate of a camera in the last epoch."""
         return self._isam.calculateEstimatePose3(self._key_of_last(camera))
 
-    def poses(self) -> list[tuple[gtsam.Pose3, ...]]:
-        """Per epoch and camera, the estimates of T_lidar_camera."""
+    def T_lidar_camera_by_epoch(self) -> list[tuple[gtsam.Pose3, ...]]:
+        """The estimates, per live epoch and camera."""
         values = self._isam.calculateBestEstimate()
         return [
             tuple(values.atPose3(self._key(place, camera)) for camera in range(self._cameras))
@@ -88,7 +84,7 @@ class Window:
         ]
 
     def _key(self, place: int, camera: int) -> int:
-        """The last epoch's keys are those of a batch, so that its graphs serve here too."""
+        """The last epoch's keys are those of a batch: so its graphs can be added unchanged."""
         ago = self._epochs - 1 - place if self._walks[camera] else 0
         return pose_key(self._names, self._names[camera]) + ago * self._cameras
 
@@ -96,7 +92,7 @@ class Window:
         return self._key(self._epochs - 1, camera)
 
     def _by_key(self, state: State, camera: int) -> dict[int, list[CameraBlock]]:
-        """A camera's matches of all frames, by the variable that they are on."""
+        """A camera's matches of all frames, by the key of their variable."""
         by_key: dict[int, list[CameraBlock]] = {}
         for place, epoch in enumerate(state.epochs):
             seen = [frame.used[camera] for frame in epoch.frames if camera in frame.used]
@@ -104,12 +100,12 @@ class Window:
                 by_key.setdefault(self._key(place, camera), []).extend(seen)
         return by_key
 
-    def _memory_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
-        """What the marginalised epochs say of the first live one."""
+    def _summary_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
+        """The summaries of older epochs as factors on the first live one."""
         graph = gtsam.NonlinearFactorGraph()
-        for camera, known in enumerate(state.cameras):
-            memory = known.memory
-            hessian, gradient = memory.hessian[memory.walk], memory.gradient[memory.walk]
+        for camera, camera_state in enumerate(state.cameras):
+            summary = camera_state.summary
+            hessian, gradient = summary.hessian[summary.walk], summary.gradient[summary.walk]
             if hessian.any():
                 key = self._key(0, camera)
                 reference = gtsam.Values()
@@ -119,12 +115,12 @@ class Window:
         return graph
 
     def _walk_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
-        """The random walk from epoch to epoch, by each camera's own strength."""
+        """The random walk from epoch to epoch, with each camera's own strength."""
         graph = gtsam.NonlinearFactorGraph()
-        for camera, known in enumerate(state.cameras):
+        for camera, camera_state in enumerate(state.cameras):
             if not self._walks[camera]:
                 continue
-            strength = STRENGTHS[known.memory.walk] / np.sqrt(state.overconfidence(camera))
+            strength = STRENGTHS[camera_state.summary.walk] / np.sqrt(state.overconfidence(camera))
             for place in range(self._epochs - 1):
                 variance = state.walk_variance(len(state.epochs[place].frames))
                 noise = gtsam.noiseModel.Diagonal.Sigmas(strength * np.sqrt(variance))
@@ -139,8 +135,8 @@ class Window:
         return graph
 
 
-def known_of_poses(state: State) -> gtsam.NonlinearFactorGraph:
-    """Priors about the references, and the relative poses that no move has made wrong."""
+def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
+    """Priors about the references, and the relative poses that no move has invalidated."""
     pairs = enumerate(state.rig.relative_poses)
     kept = tuple(pair for place, pair in pairs if place not in state.dropped_pairs)
     rig = state.rig.model_copy(update={"relative_poses": kept})

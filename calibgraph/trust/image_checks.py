@@ -4,54 +4,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check, above, below, grade
+from calibgraph.model.verdict import Check, Threshold
 from calibgraph.progress import Progress
+from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
+from calibgraph.trust.thresholds import limit, threshold
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
 
-FOCAL_WARN, FOCAL_FAIL = 0.008, 0.025
-"""Relative error of the focal length. On sequence 00 and the sample: up to 0.5 % where it is right,
-1.1 % and more where it is wrong by 2 to 5 %. One percent displaces a result by about 10 cm."""
 
-RADIAL_WARN, RADIAL_FAIL = 0.03, 0.1
-"""Error of the first radial coefficient. On sequence 00 and the sample: up to 0.02 where it is
-right; 0.08 and more where it is wrong by 0.1, which displaces a result by about 15 cm."""
+def image_checks(evidence: RunEvidence) -> Checks:
+    """Whether the images agree with a result; nothing if there is no time left for them.
 
-CENTRE_WARN, CENTRE_FAIL = 0.018, 0.035
-"""Error of the principal point in focal lengths: radians that it turns a result by. On sequence 00
-and the sample: up to 0.013 where it is right, 0.026 and 0.04 where it is wrong by 20 px."""
-
-MAX_LENS_SIGMA = 0.5  # of the threshold: above, the images do not tell
-
-DISPLACED_WARN, DISPLACED_FAIL = 4.0, 2.5
-"""On sequences 00 and 01 and the sample: right results 4.9 and more, wrong ones from a start too
-far away up to 3.8, mostly below 2.5. Mispaired images reach 5.1: see FRAMES_BEST. A 16-beam LiDAR
-at one place had 2.9 at 0.4 deg."""
-
-LENS_CONTRAST = 3.0
-"""Below, the lens is not asked about: a wrong pose says nothing of it. On sequence 00 and the
-sample wrong lenses left 3.2 and more."""
-
-FRAMES_BEST_WARN, FRAMES_BEST_FAIL = 0.8, 0.5
-"""On sequence 00 and the sample: right results 100 %, mispaired images up to 67 %, mostly 50 %."""
-
-GAIN_WARN, GAIN_FAIL = 1.0, 3.0
-"""On sequence 00 and the sample: right results up to 0.65; one 0.35 deg off 1.0; local optima next
-to the right one 11 to 32."""
-
-PAIR_WARN, PAIR_FAIL = -0.05, -0.2
-"""On sequence 00: own clouds +0.4 and more, clouds that are one frame off -0.4 and less. Where the
-vehicle stands it is about zero, which is no fault."""
-
-OFFSET_WARN, OFFSET_FAIL, OFFSET_SIGMAS = 0.1, 0.3, 3.0
-"""Of a frame interval: at 10 Hz and 10 m/s, 10 cm and 30 cm. Counted from so many sigmas off."""
+    They are scored as by the matcher ``structure``, which does not use all that other matchers use:
+    the result of a matcher that does not fail on images gets warnings only.
+    """
+    run = evidence.run
+    if run.out_of_time:
+        return {}
+    rig, seed = run.solution.solved_rig, run.solution.config.seed
+    try:
+        checks = check_images(
+            run.dataset, rig, run.correspondences, seed=seed, progress=evidence.progress
+        )
+    except (CalibrationError, OSError) as error:  # files that its matcher did not need
+        text = f"the images could not be checked: {error}"
+        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
+    if run.matcher.fails_on_images:
+        return checks
+    return {
+        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
+        for name, of_camera in checks.items()
+    }
 
 
-def image_checks(
+def check_images(
     dataset: Dataset,
     rig: Rig,
     table: Correspondences,
@@ -59,17 +51,17 @@ def image_checks(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, tuple[Check, ...]]:
-    """Look at images and clouds once more from the poses of a result.
+    """Score images and clouds at the extrinsics of a result, and displaced from them.
 
-    Not found: a principal point wrong along the shorter side of the image (it is no different from
-    a rotation), and a time offset under an even motion (no different from a translation).
+    Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
+    a rotation), and a time offset under a constant motion (equivalent to a translation).
 
     Args:
         dataset: images and clouds; neighbouring frames of a folder are neighbours in time.
         rig: the result.
         table: the correspondences of its last round.
         seed: of the searches.
-        progress: to be told how far it is.
+        progress: called as the work goes on.
 
     Returns:
         Checks of every camera.
@@ -87,11 +79,11 @@ def image_checks(
 
 
 def _clouds_checks(camera: str, of_time: Mapping[str, Sequence[Check]]) -> list[Check]:
-    """What other cameras say of the clouds, which are all cameras' clouds."""
+    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras."""
     if any(check.status != "PASS" for check in of_time[camera]):
-        return []  # it says so itself
+        return []  # its own checks show it
     return [
-        Check("clouds of another time", "WARN", f"as {other} sees it, {check.text}")
+        Check("clouds of another time", "WARN", f"by camera {other}: {check.text}")
         for other, checks in of_time.items()
         for check in checks
         if check.status != "PASS"
@@ -99,36 +91,29 @@ def _clouds_checks(camera: str, of_time: Mapping[str, Sequence[Check]]) -> list[
 
 
 def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """Judge what the images say of one camera's result."""
+    """The checks of one camera's extrinsic and lens by the image evidence."""
     if math.isnan(found.displaced_z_score):
         text = (
-            f"the images could not be asked about the result: only {found.groups} places with "
-            "structure in both image and cloud"
+            f"the images could not be checked: only {found.groups} places with structure in both "
+            "image and cloud"
         )
         return (Check("image evidence", "WARN", text, found.groups),)
-    checks = [
-        below(
-            "contrast to displaced poses", found.displaced_z_score, DISPLACED_WARN, DISPLACED_FAIL,
-            "standard deviations",
-            "poses a degree or 40 cm away explain the images nearly as well; check the guess, "
-            "or record where there is more structure",
-        ),
-        _frames_check(found),
-    ]  # fmt: skip
-    if found.displaced_z_score >= LENS_CONTRAST and found.frames_best > FRAMES_BEST_FAIL:
-        # a wrong pose, or images of other clouds, say nothing of the lens
-        lens = _lens_checks(found)
-        checks += [*lens, *_gain_check(found, lens)]
-    return tuple(checks)
+    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
+    frames = _check_frames(found)
+    mispaired = found.frames_best <= threshold("frames_best").fail
+    if found.displaced_z_score < limit("lens_z_score") or mispaired:
+        return displaced, frames  # at a wrong extrinsic the lens cannot be measured
+    lens = _lens_checks(found)
+    return displaced, frames, *lens, *_gain_checks(found, lens)
 
 
-def _frames_check(found: ImageEvidence) -> Check:
+def _check_frames(found: ImageEvidence) -> Check:
     lost = ", ".join(map(str, found.frames_lost[:5])) + (", ..." if found.frames_lost[5:] else "")
-    return below(
-        "frames whose image fits the pose best", found.frames_best,
-        FRAMES_BEST_WARN, FRAMES_BEST_FAIL, "share",
-        f"frames {lost} prefer displaced poses; do their images and clouds belong together?",
-    )  # fmt: skip
+    advice = (
+        f"frames {lost} have higher scores at displaced extrinsics; do their images and clouds "
+        "belong together?"
+    )
+    return threshold("frames_best").check(found.frames_best, advice=advice)
 
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
@@ -136,46 +121,43 @@ def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     log_focal, radial, centre = found.lens
     focal = math.expm1(log_focal)
     longer = "longer" if focal > 0 else "shorter"
-    return tuple(
-        _lens_check(name, error, sigma, limits, text)
-        for name, error, sigma, limits, text in (
-            ("focal length", focal, found.lens_sigmas[0], (FOCAL_WARN, FOCAL_FAIL),
-             f"a focal length {abs(focal):.1%} {longer}: check fx, fy and the image size"),
-            ("radial distortion", radial, found.lens_sigmas[1], (RADIAL_WARN, RADIAL_FAIL),
-             f"a first radial coefficient {radial:+.2f} from the rig's: check the distortion, and "
-             "whether the images are undistorted already"),
-            ("principal point", centre, found.lens_sigmas[2], (CENTRE_WARN, CENTRE_FAIL),
-             f"a principal point {centre:+.1%} of a focal length from the rig's: check cx, cy, and "
-             "whether the images were cropped"),
-        )
+    return (
+        _check_lens(
+            threshold("focal_length"), focal, found.lens_sigmas[0],
+            f"a focal length {abs(focal):.1%} {longer}: check fx, fy and the image size",
+        ),
+        _check_lens(
+            threshold("radial_distortion"), radial, found.lens_sigmas[1],
+            f"a first radial coefficient {radial:+.2f} from the rig's: check the distortion, and "
+            "whether the images are undistorted already",
+        ),
+        _check_lens(
+            threshold("principal_point"), centre, found.lens_sigmas[2],
+            f"a principal point {centre:+.1%} of a focal length from the rig's: check cx, cy, and "
+            "whether the images were cropped",
+        ),
     )  # fmt: skip
 
 
-def _lens_check(
-    name: str, error: float, sigma: float, limits: tuple[float, float], better: str
-) -> Check:
-    warn, fail = limits
-    if not sigma < MAX_LENS_SIGMA * warn:
-        text = f"the images do not tell the {name} well enough to check it"
-        return Check(name, "PASS", text)
-    status = grade(abs(error) > warn, abs(error) > fail)
-    text = f"{name} agrees with the images" if status == "PASS" else f"the images fit {better}"
-    return Check(name, status, text, error, warn, fail)
+def _check_lens(row: Threshold, error: float, sigma: float, better: str) -> Check:
+    """One lens parameter, by its estimated error and the standard deviation of that."""
+    if not sigma < limit("lens_sigma_share") * row.warn:
+        text = f"the images do not determine the {row.name} well enough to check it"
+        return Check(row.name, "PASS", text)
+    status = row.grade(abs(error))
+    agrees = f"{row.name} agrees with the images"
+    return row.describe(error, status, agrees if status == "PASS" else f"the images fit {better}")
 
 
-def _gain_check(found: ImageEvidence, lens: tuple[Check, ...]) -> tuple[Check, ...]:
-    """Whether a pose nearby is better; not asked if that is the lens' doing."""
+def _gain_checks(found: ImageEvidence, lens: Sequence[Check]) -> tuple[Check, ...]:
+    """Whether an extrinsic nearby is better; not checked if a wrong lens is the cause."""
     if any(check.status != "PASS" for check in lens):
         return ()
-    advice = "a pose nearby fits the images better; calibrate again from the result, check the lens"
-    return (
-        above("gain of the best pose nearby", found.gain, GAIN_WARN, GAIN_FAIL, "chance spreads",
-              advice),
-    )  # fmt: skip
+    return (threshold("score_gain").check(found.gain),)
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """Judge whether images and clouds belong together; nothing without neighbouring frames."""
+    """Whether images and clouds belong together; nothing without neighbouring frames."""
     if math.isnan(found.pair_margin):
         return ()
     side = "next" if found.pair_offset > 0 else "previous"
@@ -183,21 +165,18 @@ def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
         f"the images fit the clouds of the {side} frame better; check which image belongs to "
         "which cloud, and their time stamps"
     )
-    return (
-        below("own clouds' lead over neighbouring ones", found.pair_margin, PAIR_WARN, PAIR_FAIL,
-              "share", advice),
-    )  # fmt: skip
+    return (threshold("own_clouds").check(found.pair_margin, advice=advice),)
 
 
 def offset_checks(offset: TimeOffset | None) -> tuple[Check, ...]:
-    """Judge the time offset of one camera; nothing where it could not be measured."""
+    """The time offset of one camera; nothing where it could not be measured."""
     if offset is None or math.isnan(offset.sigma):
         return ()
-    name, size = "time offset", abs(offset.intervals)
-    told = size > OFFSET_SIGMAS * offset.sigma
-    status = grade(told and size > OFFSET_WARN, told and size > OFFSET_FAIL)
+    row, size = threshold("time_offset"), abs(offset.intervals)
+    significant = size > limit("offset_sigmas") * offset.sigma
+    status = row.grade(size) if significant else "PASS"
     text = f"time offset {offset.intervals:+.2f} +- {offset.sigma:.2f} frame intervals"
     if status != "PASS":
         when = "later" if offset.intervals > 0 else "earlier"
-        text += f": the images were taken {when} than the clouds; correct the time stamps"
-    return (Check(name, status, text, offset.intervals, OFFSET_WARN, OFFSET_FAIL, "intervals"),)
+        text += f": the images were taken {when} than the clouds; {row.advice}"
+    return (row.describe(offset.intervals, status, text),)

@@ -1,4 +1,4 @@
-"""What the data leave loose, in words: the weakest direction, empty parts of image and depth."""
+"""What the data do not determine well, in words: weakest direction, empty parts, prior share."""
 
 from __future__ import annotations
 
@@ -13,43 +13,45 @@ from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
 
-_TURNS = ("about x (pitch)", "about y (yaw)", "about z (roll)")
+_ROTATIONS = ("about x (pitch)", "about y (yaw)", "about z (roll)")
 _SHIFTS = ("along x (right)", "along y (down)", "along z (the optical axis)")
-_UNITS = np.repeat([np.radians(0.15), 0.05], 3)  # what weighs alike: the sigmas that are a WARN
-_TOLD = 0.4  # of the largest component: smaller ones are left out of the words
+_UNITS = np.repeat([np.radians(0.15), 0.05], 3)  # errors that weigh alike: 0.15 deg, 5 cm
+_MENTIONED = 0.4  # of the largest component: smaller ones are left out of the sentence
 _THIRDS = ("left", "middle", "right")
 _EMPTY, _SPARSE = 0.002, 0.05  # share of the matches in a third of the image
 _NEAR_M, _FAR_M = 6.0, 20.0
 _SHALLOW = 2.0  # ratio of far to near
+_FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
 
-def weaknesses(fit: Solution, camera: str, covariance: Array | None) -> tuple[str, ...]:
-    """Sentences about what one camera's data leave loose, the most important first.
+def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[str, ...]:
+    """Sentences about what one camera's data do not determine well, the most important first.
 
     Args:
-        fit: the solution.
+        solution: of the joint solve.
         camera: whose.
-        covariance: (6, 6) by the scatter between frames, or None: then by the matches alone.
+        scatter: (6, 6) covariance by the scatter between frames; if None, that of independent
+            matches is used.
     """
-    matches = fit.inliers.blocks.get(camera)
-    if matches is None or not fit.objective.uses_correspondences:
+    block = solution.inliers.blocks.get(camera)
+    if block is None or not solution.objective.uses_correspondences:
         return ()
-    how = "weakest direction, by the scatter of the frames"
+    how, covariance = "weakest direction, by the scatter of the frames", scatter
     if covariance is None:
-        covariance = _at_best(matches, fit, camera)
         how = "weakest direction, by the matches as if each were independent"
+        covariance = _covariance_if_independent(block, solution, camera)
     direction = [] if covariance is None else [f"{how}: {weakest_direction(covariance)}"]
-    empty = empty_parts(fit.rig.cameras[camera], matches, fit.T_camera_lidar[camera])
-    return (*direction, *empty)
+    T = solution.T_camera_lidar[camera]
+    return (*direction, *empty_parts(solution.rig.cameras[camera], block, T))
 
 
-def _at_best(matches: CameraBlock, fit: Solution, camera: str) -> Array | None:
-    """(6, 6) inverse of the information of the matches; None where it has none."""
-    block, pose = matches.scaled(fit.scales[camera]), to_T_lidar_camera(fit.T_camera_lidar[camera])
-    hessian = block.sums(pose).hessian
+def _covariance_if_independent(block: CameraBlock, solution: Solution, camera: str) -> Array | None:
+    """(6, 6) inverse of the Hessian of the matches; None if that is singular."""
+    T_lidar_camera = to_T_lidar_camera(solution.T_camera_lidar[camera])
+    hessian = block.with_scale(solution.scales[camera]).sums(T_lidar_camera).hessian
     units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
-    if values[0] < 1e-12:  # noqa: PLR2004 - rounding noise of a unit diagonal
+    if values[0] < _FREE:
         return None
     inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
     return inverse
@@ -65,56 +67,61 @@ def weakest_direction(covariance: Array) -> str:
     """
     values, vectors = np.linalg.eigh(covariance / np.outer(_UNITS, _UNITS))
     component = vectors[:, -1] * np.sqrt(values[-1])
-    told = np.abs(component) >= _TOLD * np.abs(component).max()
+    large = np.abs(component) >= _MENTIONED * np.abs(component).max()
     sigmas = np.abs(component * _UNITS)
-    turns = [f"turn {_TURNS[i]} {np.degrees(sigmas[i]):.2g} deg" for i in range(3) if told[i]]
-    shifts = [f"shift {_SHIFTS[i]} {100 * sigmas[i + 3]:.2g} cm" for i in range(3) if told[i + 3]]
+    turns = [f"turn {_ROTATIONS[i]} {np.degrees(sigmas[i]):.2g} deg" for i in range(3) if large[i]]
+    shifts = [f"shift {_SHIFTS[i]} {100 * sigmas[i + 3]:.2g} cm" for i in range(3) if large[i + 3]]
     together = ", together" if len(turns) + len(shifts) > 1 else ""
     return f"{' and '.join(shifts + turns)} (1 sigma{together})"
 
 
-def empty_parts(camera: Camera, matches: CameraBlock, T_camera_lidar: Array) -> list[str]:
-    """Sentences about the parts of the image and of depth that have no matches."""
-    columns = np.clip(3 * (matches.block.pixels_px[:, 0] + 0.5) / camera.width_px, 0, 2.999)
+def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> list[str]:
+    """Sentences about the parts of the image and of depth that have no matches.
+
+    Args:
+        camera: for the size of its image.
+        block: its matches.
+        T_camera_lidar: (4, 4).
+    """
+    columns = np.clip(3 * (block.block.pixels_px[:, 0] + 0.5) / camera.width_px, 0, 2.999)
     shares = np.bincount(columns.astype(np.int64), minlength=3) / len(columns)
     words = []
     for third, share in zip(_THIRDS, shares, strict=True):
         if share < _SPARSE:
             few = "no matches" if share < _EMPTY else f"only {share:.1%} of the matches"
             words.append(f"the {third} third of the image has {few}")
-    near, far = depth_range(matches, T_camera_lidar)
+    near, far = depth_range(block, T_camera_lidar)
     if near > _NEAR_M:
         words.append(f"nothing nearer than {near:.2g} m")
     if far < _FAR_M:
         words.append(f"nothing farther than {far:.2g} m")
     if far < _SHALLOW * near:
-        words.append("all at about one distance: turn and shift are hard to tell apart")
+        words.append("all at about one distance: turn and shift are hard to distinguish")
     return words
 
 
-def depth_range(matches: CameraBlock, T_camera_lidar: Array) -> tuple[float, float]:
+def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float]:
     """Distances [m] from the camera between which 96 % of its matches lie."""
-    points = matches.block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    points = block.block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     near, far = np.quantile(np.linalg.norm(points, axis=1), [0.02, 0.98])
     return float(near), float(far)
 
 
-def prior_shares(fit: Solution) -> dict[str, float]:
-    """Per camera which share of its result comes from priors and relative poses, not from matches.
+def prior_shares(solution: Solution) -> dict[str, float]:
+    """Per camera, which share of its result comes from priors and relative poses, not from matches.
 
-    It is the mean over the camera's six numbers of the influence of what they say, the diagonal
-    of H^-1 H_prior: 0 if the matches decide alone, 1 if there are none.
+    It is the mean over the camera's six components of the priors' influence, the diagonal of
+    H^-1 H_prior: 0 if the matches decide alone, 1 if there are none.
     """
-    cameras = list(fit.T_camera_lidar)
-    priors = pose_hessian(fit.inliers.pose_graph, cameras, fit.T_camera_lidar)
+    T_camera_lidar = solution.T_camera_lidar
+    cameras = list(T_camera_lidar)
+    priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
     hessian = priors.copy()
-    for name, matches in fit.inliers.blocks.items():
-        if fit.objective.uses_correspondences:
+    for name, matches in solution.inliers.blocks.items():
+        if solution.objective.uses_correspondences:
             rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
-            block = matches.scaled(fit.scales[name])
-            hessian[rows, rows] += robust_hessian(
-                block, to_T_lidar_camera(fit.T_camera_lidar[name])
-            )
+            block = matches.with_scale(solution.scales[name])
+            hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
     influence = np.diag(np.linalg.pinv(hessian, hermitian=True) @ priors).reshape(-1, 6)
     return {
         name: float(np.clip(influence[place].mean(), 0.0, 1.0))

@@ -1,136 +1,90 @@
-"""Checks of a whole run: the rounds, the displaced start, and the images."""
+"""Checks of the rounds of matching: convergence, repeated clouds, the displaced start, time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
+from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.verdict import Check, above
-from calibgraph.progress import Progress
-from calibgraph.trust.guess import range_checks
-from calibgraph.trust.image_checks import image_checks
-from calibgraph.trust.solution_checks import (
-    MOVING_FAIL_CM,
-    MOVING_FAIL_DEG,
-    MOVING_WARN_CM,
-    MOVING_WARN_DEG,
-)
-
-Array = NDArray[np.float64]
-Checks = Mapping[str, Sequence[Check]]
+from calibgraph.model.verdict import Check
+from calibgraph.trust.evidence import Checks, RunEvidence
+from calibgraph.trust.thresholds import threshold
 
 REMATCH_DEG, REMATCH_M = 0.5, 0.08
-BACK_WARN_DEG, BACK_FAIL_DEG = 0.15, 0.5
-BACK_WARN_CM, BACK_FAIL_CM = 5.0, 15.0
-"""From where a matcher must find back to its result, and how near."""
+"""How far the start of matching again is displaced from the result."""
 
 
-def assess_images(
-    run: MatchingRun, hashes: Mapping[str, str], progress: Progress
-) -> dict[str, list[Check]]:
-    """Per camera all checks that need images, clouds, or the matcher.
-
-    Args:
-        run: the outcome of the rounds.
-        hashes: of the files, by path.
-        progress: to be told how far it is.
-    """
-    rig, guess = run.solution.solved_rig, run.guess.T_camera_lidar
-    repeated = frames_checks(run.dataset, hashes)
-    again, seen = _asked_again(run, progress)
+def last_round_checks(evidence: RunEvidence) -> Checks:
+    """How far the last of several rounds of matching still moved the cameras."""
+    rounds = evidence.run.rounds
+    if len(rounds) == 1:
+        return {}
     return {
         name: [
-            *last_round_checks(run.rounds, name),
-            *range_checks(guess[name], T, run.correspondences.findings),
-            *repeated,
-            *again.get(name, ()),
-            *seen.get(name, ()),
+            threshold("last_round_rotation").check(moved["moved_deg"]),
+            threshold("last_round_translation").check(moved["moved_cm"]),
         ]
-        for name, T in rig.T_camera_lidar.items()
+        for name, moved in rounds[-1].items()
     }
 
 
-def _asked_again(run: MatchingRun, progress: Progress) -> tuple[Checks, Checks]:
-    """What matching again says, and what the images say; in short, if there is no time for it."""
-    again = rematch_checks(run.rematch)
-    if not run.out_of_time:
-        return again, image_checks_of(run, progress)
-    missed = f"{run.missed_rounds} rounds of matching and " if run.missed_rounds else ""
-    text = f"partial: there was no time for {missed}a second look at the images"
-    check = Check("time limit", "WARN", text, run.missed_rounds)
-    return {name: [*again.get(name, ()), check] for name in run.solution.solved_rig.cameras}, {}
+def repeated_cloud_checks(evidence: RunEvidence) -> Checks:
+    """Whether two frames have the same cloud: they are not independent."""
+    checks = check_repeated_clouds(evidence.run.dataset, evidence.hashes)
+    return {name: checks for name in evidence.solution.cameras}
 
 
-def last_round_checks(rounds: Sequence[RoundSummary], camera: str) -> list[Check]:
-    """Whether the last of several rounds of matching still moved a camera."""
-    if len(rounds) == 1:
-        return []
-    last, what = rounds[-1][camera], "the last round of matching moved it by"
-    return [
-        above(what, last["moved_deg"], MOVING_WARN_DEG, MOVING_FAIL_DEG, "deg"),
-        above(what, last["moved_cm"], MOVING_WARN_CM, MOVING_FAIL_CM, "cm"),
-    ]
+def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
+    """The first two frames with the same cloud, if any.
 
-
-def frames_checks(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
-    """Whether two frames have the very same cloud: they are no independent evidence."""
-    seen: dict[str, str] = {}
+    Args:
+        dataset: its frames.
+        hashes: of the files, by path.
+    """
+    names: dict[str, str] = {}
     for frame in dataset.frames:
         digest = hashes[str(frame.cloud_path)]
-        if digest in seen:
-            text = f"frames {seen[digest]} and {frame.name} have the same cloud: counted as if "
-            return [Check("repeated frames", "WARN", text + "independent; remove one")]
-        seen[digest] = frame.name
+        if digest in names:
+            text = (
+                f"frames {names[digest]} and {frame.name} have the same cloud, and count as if "
+                "independent; remove one"
+            )
+            return [Check("repeated frames", "WARN", text)]
+        names[digest] = frame.name
     return []
 
 
-def rematch_checks(rematch: Rematch | None) -> Checks:
-    """Per camera, whether matching again from a displaced start ended at the same place."""
+def rematch_checks(evidence: RunEvidence) -> Checks:
+    """Whether matching again from a displaced start ended at the same result."""
+    return compare_ends(evidence.run.rematch)
+
+
+def compare_ends(rematch: Rematch | None) -> Checks:
+    """Per camera, the difference between the two ends; nothing if there is only one."""
     if rematch is None:
         return {}
+    start = f"matching again from {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
     if rematch.again is None:
-        text = f"matching again from {_start()} gave nothing: {rematch.failure}"
-        return {name: [Check("matching again", "FAIL", text)] for name in rematch.first.cameras}
-    again = rematch.again.T_camera_lidar
-    return {name: _apart(T, again[name]) for name, T in rematch.first.T_camera_lidar.items()}
+        check = Check("matching again", "FAIL", f"{start} failed: {rematch.failure}")
+        return {name: [check] for name in rematch.first.cameras}
+    again, checks = rematch.again.T_camera_lidar, {}
+    for name, T in rematch.first.T_camera_lidar.items():
+        degrees, centimetres = pose_difference(T, again[name])
+        words = f"{start}, the result differs by"
+        checks[name] = [
+            threshold("rematch_rotation").check(degrees, name=words),
+            threshold("rematch_translation").check(centimetres, name=words),
+        ]
+    return checks
 
 
-def _start() -> str:
-    return f"{REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
-
-
-def _apart(result: Array, again: Array) -> list[Check]:
-    degrees, centimetres = pose_difference(result, again)
-    name = f"matching again from {_start()} ends away by"
-    advice = "the images do not pin it down"
-    return [
-        above(name, degrees, BACK_WARN_DEG, BACK_FAIL_DEG, "deg", advice),
-        above(name, centimetres, BACK_WARN_CM, BACK_FAIL_CM, "cm", advice),
-    ]
-
-
-def image_checks_of(run: MatchingRun, progress: Progress) -> Checks:
-    """What the images say of a result. Of another matcher's result they can only warn.
-
-    They are asked by the matcher `structure`, which does not see everything that others see.
-    """
-    rig = run.solution.solved_rig
-    try:
-        seed = run.solution.config.seed
-        checks = image_checks(run.dataset, rig, run.correspondences, seed=seed, progress=progress)
-    except (CalibrationError, OSError) as error:  # what its matcher did not need to read
-        text = f"the images could not be asked about the result: {error}"
-        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    if run.matcher.fails_on_images:
-        return checks
-    return {
-        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
-        for name, of_camera in checks.items()
-    }
+def time_limit_checks(evidence: RunEvidence) -> Checks:
+    """Whether the time limit left something out."""
+    run = evidence.run
+    if not run.out_of_time:
+        return {}
+    missed = f"{run.missed_rounds} rounds of matching and " if run.missed_rounds else ""
+    text = f"partial: there was no time for {missed}the checks against the images"
+    check = Check("time limit", "WARN", text, run.missed_rounds)
+    return {name: [check] for name in evidence.solution.cameras}

@@ -1,11 +1,11 @@
-"""Do the residuals follow the motion of the images? Then images and clouds differ in time.
+"""The time offset between images and clouds, from residuals that follow the image motion.
 
-A pixel that was seen later than its point moved on by (time offset) x (image motion). Regressing
-the residuals of the correspondences on the motion of the image, together with the pose, gives the
-offset. Any matcher's correspondences will do.
+The pixel of a point that was seen later has moved by (time offset) x (image motion). Regressing the
+residuals of the correspondences on the image motion, together with the extrinsic, gives the offset.
+Any matcher's correspondences will do.
 
-An even motion straight ahead is no different from a camera that sits further ahead: the offset
-shows only where the motion varies between frames, and its sigma says how well.
+A constant motion straight ahead is equivalent to a camera that is mounted further ahead: the offset
+is observable only where the motion varies between frames, which its sigma includes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from calibgraph.solver.augmented_fit import MIN_ROWS, fit_augmented
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-MAX_ROWS = 10_000  # per camera: dense matches say no more
+MAX_ROWS = 10_000  # per camera: more of dense matches add no information
 MAX_FRAMES = 24  # evenly spread over those with a neighbour: bounds the time
-MIN_FRAMES = 4  # that move: with fewer, one frame decides
-MIN_MOTION_PX = 0.5  # median image motion per frame: below, nothing moves
-RETURN_PX = 1.0  # a tracked pixel must come back this closely
+MIN_FRAMES = 4  # that move: with fewer, a single frame decides
+MIN_MOTION_PX = 0.5  # median image motion per frame: below, the vehicle stands
+RETURN_PX = 1.0  # a pixel tracked forth and back must end this near
 SYSTEMATIC_PX = 0.15
 """Error of the matches that follows the motion without a time offset. On sequence 00 (even motion,
 no offset) it made offsets of 0.03 to 0.17 intervals."""
@@ -37,12 +37,12 @@ _WINDOW, _LEVELS = (21, 21), 4  # of the pyramids of the flow
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """When one camera's images were taken, against the clouds.
+    """The time offset of one camera's images to the clouds.
 
     Attributes:
         intervals: how much later the images are than the clouds, in frame intervals.
-        sigma: its standard deviation: the scatter of the frames, and what systematic errors of
-            the matches do where a pose can imitate most of the motion.
+        sigma: its standard deviation: the scatter of the frames, and the effect of systematic
+            errors of the matches where a pose explains most of the motion.
         frames: frames that it comes from.
         motion_px: median image motion per frame interval.
     """
@@ -54,11 +54,11 @@ class TimeOffset:
 
 
 def time_offsets(dataset: Dataset, rig: Rig, table: Correspondences) -> dict[str, TimeOffset]:
-    """Time offset of every camera for which the correspondences and their motion tell it.
+    """The time offset of every camera whose correspondences and image motion determine it.
 
     Args:
         dataset: the images; neighbouring frames of a folder must be neighbours in time.
-        rig: the poses of the result.
+        rig: lenses, and the extrinsics of the result.
         table: the correspondences of the result, distorted pixels.
     """
     found = {}
@@ -73,10 +73,10 @@ def time_offsets(dataset: Dataset, rig: Rig, table: Correspondences) -> dict[str
 
 
 def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> TimeOffset | None:
-    """Fit pose and time offset to one camera's correspondences.
+    """Fit extrinsic and time offset to one camera's correspondences.
 
     Args:
-        camera: lens, and the pose of the result.
+        camera: lens, and the extrinsic of the result.
         table: the rows of this camera.
         motion_px: (n, 2) image motion at each row's pixel per frame interval; NaN if unknown.
 
@@ -101,7 +101,7 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
 def image_motion(dataset: Dataset, name: str, camera: Camera, table: Correspondences) -> Array:
     """(n, 2) motion of each row's pixel per frame interval; NaN where it cannot be tracked.
 
-    Half the way from the image before to the image after, or to the one of them that there is.
+    The mean of the motions from the previous and to the next image; one of them at either end.
     """
     motion = np.full((len(table), 2), np.nan)
     with_rows = set(np.unique(table.frame).tolist())
@@ -131,7 +131,7 @@ def _neighbours(dataset: Dataset, frame: Frame) -> list[tuple[Frame, int]]:
 
 
 def _tracked(image: Gray, other: Gray, pixels_px: Array) -> Array:
-    """(n, 2) motion from an image to another by sparse flow; NaN where the way back differs."""
+    """(n, 2) motion from an image to another by sparse flow; NaN where it does not track back."""
     start = pixels_px.astype(np.float32).reshape(-1, 1, 2)
     options = {"winSize": _WINDOW, "maxLevel": _LEVELS}
     there, found, _ = cv2.calcOpticalFlowPyrLK(image, other, start, None, **options)  # type: ignore[call-overload]

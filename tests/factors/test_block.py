@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import FrozenInstanceError, replace
 
 import gtsam
 import numpy as np
@@ -14,20 +15,25 @@ from factors import (
     ProjectionBlock,
     block_factor,
     projection_factor,
-    projection_residual,
     square_root,
 )
 from factors.block import BlockSums
 from tests.conftest import FORWARD, KANNALA, RADTAN5, RADTAN8
 
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
+
+
 LENSES = {
     "pinhole": Lens.pinhole(**K),
     "radtan": Lens.pinhole(**K, distortion=RADTAN5),
     "rational": Lens.pinhole(**K, distortion=RADTAN8),
     "fisheye": Lens.fisheye(**K, distortion=KANNALA),
 }
+
+
 KEY = 7
+
+
 TRUTH = gtsam.Pose3(gtsam.Rot3(FORWARD.T), np.array([0.3, 0.1, -0.1]))  # T_lidar_camera
 
 
@@ -130,7 +136,7 @@ def test_numbers_as_weights_equal_the_separate_factors(name: str, weights: str, 
 def test_sigma_divides_the_whitened_residuals(loss: str) -> None:
     block = with_loss(world(LENSES["pinhole"], 100), loss)
     divided = replace(block, sqrt_information=block.sqrt_information / 0.7, scale=2.0)
-    found, expected = block.rescaled(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
+    found, expected = block.rescale(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
     # Sums of 100 terms, each rounded a few times: 1e-12 of the largest is far above that.
     for a, b in zip(vars(found).values(), vars(expected).values(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
@@ -138,7 +144,6 @@ def test_sigma_divides_the_whitened_residuals(loss: str) -> None:
 
 def test_selected_correspondences_are_those_of_the_arrays() -> None:
     block = with_loss(world(LENSES["pinhole"], 300), "cauchy")
-    block.residuals(TRUTH)  # remembered, and not to be taken for those of the selection
     some = np.random.default_rng(1).random(300) < 0.5
     part = block.select(some)
     made = ProjectionBlock(
@@ -190,48 +195,6 @@ def test_gradient_agrees_with_finite_differences_of_the_error(name: str) -> None
             for d in step * np.eye(6)
         ]
         np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_projection_jacobian_agrees_with_finite_differences(name: str) -> None:
-    """By the pose, in GTSAM's tangent: near, off, far, and 1e-7 from the identity."""
-    lens = LENSES[name]
-    block = world(lens, 5)
-    identity = gtsam.Pose3.Expmap(1e-7 * np.array([1, -2, 3, 2, 1, -1.0]))
-    ahead = np.array([[0.5, -0.3, 5.0]])  # what a camera at the identity sees
-    for pose in [*poses()[:4], identity]:
-        points = ahead if pose is identity else block.points_lidar_m
-        for point in points:
-            residual, jacobian = projection_residual(lens, pose, point, np.zeros(2))
-            numeric = np.empty((2, 6))
-            for axis in range(6):
-                d = 1e-6 * np.eye(6)[axis]
-                plus, _ = projection_residual(lens, pose.retract(d), point, np.zeros(2))
-                minus, _ = projection_residual(lens, pose.retract(-d), point, np.zeros(2))
-                numeric[:, axis] = (plus - minus) / 2e-6
-            # Rounding: eps |residual| / step; truncation is smaller.
-            tolerance = 1e-9 * max(1e3, np.abs(residual).max()) + 1e-7 * np.abs(jacobian).max()
-            np.testing.assert_allclose(jacobian, numeric, rtol=0, atol=tolerance)
-
-
-def test_projection_factor_equals_gtsams_stock_factor() -> None:
-    calibration = gtsam.Cal3_S2(718.0, 710.0, 0.0, 607.0, 185.0)
-    cauchy = gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.Cauchy.Create(4.0), gtsam.noiseModel.Unit.Create(2)
-    )
-    block = world(LENSES["pinhole"], 20)
-    landmark = 99
-    for k in range(20):
-        point, pixel = block.points_lidar_m[k], block.pixels_px[k]
-        values = at(poses()[2])
-        values.insert(landmark, point)
-        stock = gtsam.GenericProjectionFactorCal3_S2(pixel, cauchy, KEY, landmark, calibration)
-        ours = projection_factor(KEY, LENSES["pinhole"], point, pixel, scale=4.0)
-        np.testing.assert_allclose(ours.error(values), stock.error(values), rtol=1e-12)
-        expected, right = stock.linearize(values).jacobian()
-        A, b = ours.linearize(values).jacobian()
-        np.testing.assert_allclose(A, expected[:, :6], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(b, right, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -316,13 +279,50 @@ def test_bad_blocks_are_refused() -> None:
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), scale=0.0)
 
 
-def test_a_copy_with_other_matches_does_not_remember_those_of_the_original() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(2, 9, (20, 3))
-    whole = ProjectionBlock(Lens.pinhole(fx=300, fy=300, cx=0, cy=0), points, np.zeros((20, 2)))
-    pose = gtsam.Pose3()
-    before = whole.error_and_jacobian(pose)[1]
-    part = replace(whole, points_lidar_m=points[:10], pixels_px=np.zeros((10, 2)))
-    found, again = part.error_and_jacobian(pose)[1], whole.error_and_jacobian(pose)[1]
-    np.testing.assert_allclose(found.T @ found, part.sums(pose).hessian, rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(again, before)
+def test_a_factor_is_that_of_its_own_block_whatever_was_evaluated_before() -> None:
+    """A factor remembers its last pose; another block's factor, and another pose, do not use it."""
+    block = with_loss(world(LENSES["pinhole"], 40), "cauchy")
+    part = block.select(np.arange(20))
+    factors = {id(b): block_factor(KEY, b) for b in (block, part)}
+    for pose in [*poses(), *poses()]:
+        for b in (block, part):
+            expected = b.sums(pose)
+            A, right = factors[id(b)].linearize(at(pose)).jacobian()
+            hessian, gradient = A.T @ A, -A.T @ right
+            # Of sums of 40 terms, through an eigendecomposition.
+            scale = np.abs(expected.hessian).max()
+            np.testing.assert_allclose(hessian, expected.hessian, rtol=0, atol=1e-12 * scale)
+            largest = np.abs(expected.gradient).max()
+            np.testing.assert_allclose(gradient, expected.gradient, rtol=0, atol=1e-9 * largest)
+            assert 2 * factors[id(b)].error(at(pose)) == pytest.approx(expected.cost, rel=1e-12)
+
+
+def test_a_block_cannot_be_changed() -> None:
+    block = world(LENSES["pinhole"], 10)
+    before = dict(vars(block))
+    with pytest.raises(FrozenInstanceError):
+        block.scale = 1.0
+    for name in ("points_lidar_m", "pixels_px", "sqrt_information", "_columns", "_whitening"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(block, name)[0] = 0.0
+    block.residuals(TRUTH), block.sums(TRUTH), block.error_and_jacobian(TRUTH)
+    block.select(np.arange(3)), block.rescale(scale=2.0, sigma=3.0)
+    assert vars(block).keys() == before.keys()
+    assert all(vars(block)[name] is value for name, value in before.items())
+
+
+def test_a_block_does_not_make_the_arrays_of_its_maker_read_only() -> None:
+    points, pixels, roots = np.ones((4, 3)), np.ones((4, 2)), np.ones((4, 3))
+    ProjectionBlock(LENSES["pinhole"], points, pixels, roots)
+    for array in (points, pixels, roots):
+        assert array.flags.writeable
+
+
+def test_threads_get_the_sums_of_their_own_pose() -> None:
+    """One factor, evaluated at many poses by several threads at once."""
+    factor = block_factor(KEY, with_loss(world(LENSES["pinhole"], 500), "cauchy"))
+    many = [TRUTH.retract(0.01 * k * np.ones(6)) for k in range(20)]
+    alone = [factor.error(at(pose)) for pose in many]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: factor.error(at(many[k % 20])), range(400)))
+    assert found == [alone[k % 20] for k in range(400)]

@@ -9,15 +9,12 @@ import pytest
 import yaml
 
 from calibgraph import (
-    CalibrationError,
     FileError,
     RelativePose,
     Rig,
     RigError,
     load_rig,
-    perturb,
 )
-from calibgraph.model.geometry import angle_deg
 from calibgraph.model.rig import rigid_transform
 from tests.conftest import stereo_relative_pose
 
@@ -86,50 +83,6 @@ def test_a_bad_rig_file_is_refused_in_one_line(case: str, pair: Rig, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
-def test_a_key_given_twice_is_refused(pair: Rig, tmp_path: Path) -> None:
-    path = written(pair, tmp_path)
-    path.write_text(path.read_text() + "\nlidar: another\n")
-    with pytest.raises(FileError, match="'lidar' is given twice"):
-        load_rig(path)
-
-
-@pytest.mark.parametrize("text", ["", "- a\n- b\n", "{unclosed", "\x00\x01", "just words"])
-def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    with pytest.raises(FileError, match=str(path)):
-        load_rig(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a: 2020-13-45", "not valid YAML"),
-        ("a: !!int abc", "not valid YAML"),
-        ("a: " + "9" * 5000, "not valid YAML"),
-        ("[" * 20_000, "not valid YAML|too deeply"),
-        ("{a: " * 1000, "not valid YAML|too deeply"),
-        ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process
-        ("&a [*a]", "."),
-    ],
-)
-def test_what_the_yaml_parser_chokes_on_is_refused(text: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    with pytest.raises(FileError, match=message) as caught:
-        load_rig(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
-    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
-    path = tmp_path / "rig.yaml"
-    path.write_text("\n".join([*lines, "cameras: {a: {T_camera_lidar: *a11}}"]))
-    with pytest.raises(FileError, match="aliases stand for over"):
-        load_rig(path)
-
-
 def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
     T = pair.T_camera_lidar["left"].tolist()
     path = tmp_path / "rig.yaml"
@@ -147,16 +100,6 @@ def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
 def test_camera_names_that_are_no_file_names_are_refused(name: str, pair: Rig) -> None:
     with pytest.raises(ValueError, match="camera name"):
         Rig(cameras={name: pair.cameras["left"]})
-
-
-def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "rig.bin").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(FileError, match="not a text file"):
-        load_rig(tmp_path / "rig.bin")
-    with pytest.raises(FileError, match="holds none of"):
-        load_rig(tmp_path)
-    with pytest.raises(FileError, match="no such file"):
-        load_rig(tmp_path / "nothing.yaml")
 
 
 def test_a_relative_pose_must_name_two_cameras(pair: Rig) -> None:
@@ -185,26 +128,9 @@ def test_rounded_digits_are_made_a_rotation_again() -> None:
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_perturb_displaces_by_exactly_what_it_says(pair: Rig, seed: int) -> None:
-    moved = perturb(pair, rotation_deg=20, translation_m=1.5, seed=seed)
-    deltas = [moved.T_camera_lidar[n] @ np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()]
-    for delta in deltas:
-        assert angle_deg(delta[:3, :3]) == pytest.approx(20, abs=1e-9)
-        assert np.linalg.norm(delta[:3, 3]) == pytest.approx(1.5, abs=1e-12)
-    assert np.abs(deltas[0] - deltas[1]).max() > 0.1  # independent per camera
-
-
-def test_perturb_uniform_stays_in_its_box(pair: Rig) -> None:
-    shifts = []
-    for seed in range(100):
-        moved = perturb(pair, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
-        delta = moved.T_camera_lidar["left"] @ np.linalg.inv(pair.T_camera_lidar["left"])
-        shifts.append(delta[:3, 3])
-    assert np.abs(shifts).max() <= 1.5
-    # Uniform on +-1.5: a standard deviation of 1.5 / sqrt(3), known from 300 draws to 4 %.
-    assert np.std(shifts) == pytest.approx(1.5 / np.sqrt(3), rel=0.15)
-
-
-def test_errors_are_one_line() -> None:
-    assert str(CalibrationError("a\n  b")) == "a b"
+def test_a_changed_lens_is_not_the_old_one(pair: Rig) -> None:
+    camera = pair.cameras["left"]
+    other = camera.model_copy(update={"distortion": (-0.3, 0.1, 0.0, 0.0)})
+    point = np.array([[1.0, 0.5, 4.0]])
+    assert np.abs(other.lens.project(point)[0] - camera.lens.project(point)[0]).max() > 1
+    assert camera.moved_to(np.eye(4)).lens is camera.lens

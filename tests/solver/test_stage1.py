@@ -19,7 +19,7 @@ from calibgraph.solver.pnp import normalized
 from calibgraph.solver.stage1 import (
     T_hat,
     aggregate,
-    agreeing,
+    are_near_median,
     estimate_stage1,
     geodesic_median,
     half_sample_mode,
@@ -129,12 +129,12 @@ def test_stray_frames_are_recognised_without_a_reference() -> None:
     rng = np.random.default_rng(7)
     good, bad = poses(rng, 20, 0.01), poses(rng, 5, 0.5)
     both = np.concatenate([good, bad])
-    kept = agreeing(both)
+    kept = are_near_median(both)
     # A Gaussian vector in 3 dimensions lies within 6 medians (9 sigma) of its centre.
     assert kept[:20].all() and not kept[20:].any()
     np.testing.assert_allclose(aggregate(both[kept], "mean"), aggregate(good, "mean"))
-    assert agreeing(np.tile(np.eye(4), (4, 1, 1))).all()
-    assert agreeing(bad[:2]).all()  # of two, none can be said to be the wrong one
+    assert are_near_median(np.tile(np.eye(4), (4, 1, 1))).all()
+    assert are_near_median(bad[:2]).all()  # of two, none can be said to be the wrong one
 
 
 def test_stray_frames_count_as_failed(pair: Rig) -> None:

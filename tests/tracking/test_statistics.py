@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
-from types import ModuleType
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.accuracy.events import SCENARIOS
 from calibgraph import (
     Config,
     IncrementalCalibrator,
@@ -23,28 +21,16 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from tests.conftest import ROOT
 
 pytestmark = pytest.mark.statistics
 
 
-def events_module() -> ModuleType:
-    """benchmarks/events.py, which makes the drives."""
-    if "events" not in sys.modules:
-        spec = importlib.util.spec_from_file_location("events", ROOT / "benchmarks" / "events.py")
-        assert spec is not None and spec.loader is not None
-        sys.modules["events"] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return sys.modules["events"]
-
-
 def run(scenario: str, seed: int) -> Any:
-    return events_module().SCENARIOS[scenario](seed)
+    return SCENARIOS[scenario](seed)
 
 
 def outcomes_of(scenario: str, runs: int) -> list[Any]:
     """In fresh processes: a fork of one whose libraries run threads may die."""
-    events_module()  # whose outcomes come back
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         return list(pool.map(partial(run, scenario), range(1000, 1000 + runs)))
 
@@ -57,7 +43,7 @@ def outcomes_of(scenario: str, runs: int) -> list[Any]:
 def test_what_moves_is_found_and_named(scenario: str, runs: int) -> None:
     """At a rate of 99 %, one miss in 4 happens once in 25 times, two once in 1700 times.
 
-    ``benchmarks/events.py`` has more runs, and the drift of a LiDAR.
+    ``benchmarks.accuracy.events`` has more runs, and the drift of a LiDAR.
     """
     outcomes = outcomes_of(scenario, runs)
     missed = sum(not (o.detected and o.attributed) for o in outcomes)
@@ -66,7 +52,7 @@ def test_what_moves_is_found_and_named(scenario: str, runs: int) -> None:
 
 
 @pytest.mark.parametrize(("scenario", "runs"), [("nothing", 2), ("garbage", 4)])
-def test_what_stands_still_is_not_called_moved(scenario: str, runs: int) -> None:
+def test_what_is_static_is_not_reported_as_moved(scenario: str, runs: int) -> None:
     """2000 frames each; at most one alarm in 10,000 is allowed."""
     outcomes = outcomes_of(scenario, runs)
     assert sum(o.false_alarms for o in outcomes) <= 1, outcomes

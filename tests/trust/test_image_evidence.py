@@ -11,7 +11,7 @@ import pytest
 import calibgraph
 from calibgraph import Correspondences, Dataset, Rig
 from calibgraph.trust import image_evidence
-from calibgraph.trust.image_checks import evidence_checks, image_checks, pairing_checks
+from calibgraph.trust.image_checks import check_images, evidence_checks, pairing_checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_evidence import LensEvidence
 from tests.conftest import SAMPLE
@@ -63,8 +63,8 @@ def test_mispaired_clouds_fail_and_point_to_the_neighbour(dataset: Dataset, trut
     late = measure_image_evidence(with_clouds_of(dataset, [1, 2, 3, 4, 5, 0]), truth)[NAME]
     assert late.pair_offset == -1
     found = statuses(late)
-    assert found["own clouds' lead over neighbouring ones"] == "FAIL"
-    assert found["frames whose image fits the pose best"] == "FAIL"
+    assert found["score with the own clouds above that with neighbouring ones"] == "FAIL"
+    assert found["frames whose score is highest at the result"] == "FAIL"
 
 
 @pytest.mark.usefixtures("no_lens")
@@ -99,6 +99,6 @@ def test_a_camera_without_structure_gets_a_warning(
         pixels_px=np.empty((0, 2)),
         points_lidar_m=np.empty((0, 3)),
     )
-    checks = image_checks(replace(dataset, frames=frames), truth, empty)[NAME]
+    checks = check_images(replace(dataset, frames=frames), truth, empty)[NAME]
     assert [check.status for check in checks] == ["WARN"]
     assert "structure in both image and cloud" in checks[0].text

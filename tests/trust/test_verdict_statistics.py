@@ -1,4 +1,4 @@
-"""No false PASS: a small part of `benchmarks/verdicts.py`, on cases no threshold was set on."""
+"""No false PASS: a part of `benchmarks.accuracy.verdicts`, on cases that set no threshold."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ TABLES = (
 
 
 def cameras_of(tmp_path: Path, *options: object) -> list[dict[str, Any]]:
-    """Run the benchmark; what each camera's result says and how far off it is, with its kind."""
+    """Run the benchmark: the verdict and the error of each camera's result, with its kind."""
     out = tmp_path / "cases.jsonl"
-    command = [sys.executable, ROOT / "benchmarks" / "verdicts.py", "--set", "count", "--out", out]
-    subprocess.run([*map(str, command), *map(str, options)], check=True, capture_output=True)
+    module = "benchmarks.accuracy.verdicts"
+    command = [sys.executable, "-m", module, "--set", "count", "--out", out, *options]
+    subprocess.run(list(map(str, command)), cwd=ROOT, check=True, capture_output=True)
     cases = [json.loads(line) for line in out.read_text().splitlines()]
     assert not any("crash" in case for case in cases)
     return [{**one, "kind": c["kind"]} for c in cases for one in c.get("cameras", {}).values()]

@@ -1,4 +1,4 @@
-"""Which network a checkpoint holds: recognised from its shapes, checked against its config."""
+"""The architecture of a checkpoint's network: recognised from shapes, compared with its config."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _MAX_WIDTH = 256
 
 
 @dataclass(frozen=True)
-class Variant:
+class Architecture:
     """What distinguishes one CMRNext network from another.
 
     Attributes:
         fourier_levels: of the depth encoding; -1: plain depth.
         reflectance: whether the LiDAR image has a channel of intensities.
         context: which image the context encoder reads.
-        uncertainty: ``nll``: the flow head also gives standard deviations; ``nll_frozen``: a
+        uncertainty: ``nll``: the flow head also predicts standard deviations; ``nll_frozen``: a
             second update block does.
         width: channels of the first layer, a multiple of 8; published networks have 64.
     """
@@ -54,26 +54,44 @@ class Variant:
         """Channels of the context encoder's input."""
         return self.lidar_channels if self.context == "lidar" else _RGB
 
-    def scaled(self, channels: int) -> int:
+    def scale(self, channels: int) -> int:
         """A layer's channels, from those of the published width."""
         return channels * self.width // FULL_WIDTH
 
 
-def recognised(shapes: Shapes, *, reflectance: bool) -> Variant:
-    """The variant that a state dict's shapes belong to.
+def recognize_architecture(shapes: Shapes, *, reflectance: bool) -> Architecture:
+    """The architecture that a state dict's shapes belong to.
 
     Args:
-        shapes: by name.
-        reflectance: whether the config promises it; the parity of the channels must agree.
+        shapes: by parameter name.
+        reflectance: as in the config; the parity of the LiDAR channels must agree.
 
     Raises:
-        ValueError: if they are of no variant, in words for the user.
+        ValueError: if they belong to no supported architecture.
     """
     lidar = _dimension(shapes, "fnet_lidar.conv1.weight", 1)
     context = _dimension(shapes, "cnet.conv1.weight", 1)
+    uncertainty = _recognize_uncertainty(shapes)
+    if context not in (_RGB, lidar):
+        raise ValueError(f"its context encoder reads {context} channels, expected 3 or {lidar}")
+    encoding = lidar - reflectance
+    if encoding < 1 or encoding % 2 == 0:
+        raise ValueError(
+            f"its LiDAR encoder reads {lidar} channels, which does not fit its config's "
+            f"use_reflectance {reflectance}"
+        )
+    return Architecture(
+        fourier_levels=(encoding - 1) // 2 or -1,
+        reflectance=reflectance,
+        context="lidar" if context == lidar else "rgb",
+        uncertainty=uncertainty,  # type: ignore[arg-type]
+        width=_dimension(shapes, "fnet_img.conv1.weight", 0),
+    )
+
+
+def _recognize_uncertainty(shapes: Shapes) -> str:
     outputs = _dimension(shapes, "update_block.flow_head.conv2.weight", 0)
-    frozen = any(name.startswith("update_block_unc.") for name in shapes)
-    if frozen:
+    if any(name.startswith("update_block_unc.") for name in shapes):
         head = _dimension(shapes, "update_block_unc.flow_head.conv2.weight", 0)
         uncertainty = "nll_frozen" if (outputs, head) == (2, 2) else None
         outputs = head if outputs == 2 else outputs  # noqa: PLR2004 - the plain head
@@ -84,44 +102,30 @@ def recognised(shapes: Shapes, *, reflectance: bool) -> Variant:
         raise ValueError(
             f"has {kind} uncertainty head of {outputs} outputs, which is not supported"
         )
-    if context not in (_RGB, lidar):
-        raise ValueError(f"its context encoder reads {context} channels, expected 3 or {lidar}")
-    encoded = lidar - reflectance
-    if encoded < 1 or encoded % 2 == 0:
-        raise ValueError(
-            f"its LiDAR encoder reads {lidar} channels, which does not fit its config's "
-            f"use_reflectance {reflectance}"
-        )
-    return Variant(
-        fourier_levels=(encoded - 1) // 2 or -1,
-        reflectance=reflectance,
-        context="lidar" if context == lidar else "rgb",
-        uncertainty=uncertainty,  # type: ignore[arg-type]
-        width=_dimension(shapes, "fnet_img.conv1.weight", 0),
-    )
+    return uncertainty
 
 
-def require_config_agrees(variant: Variant, config: Mapping[str, Any]) -> None:
-    """Check what the file says of its network against what it holds.
+def require_config_agrees(architecture: Architecture, config: Mapping[str, Any]) -> None:
+    """Compare a checkpoint's config with the architecture of its weights.
 
     Raises:
         ValueError: on the first disagreement.
     """
-    head = {"none": False, "nll": True, "nll_frozen": True}[variant.uncertainty]
-    found = {
-        "fourier_levels": variant.fourier_levels,
-        "context_encoder": variant.context,
+    head = {"none": False, "nll": True, "nll_frozen": True}[architecture.uncertainty]
+    of_weights = {
+        "fourier_levels": architecture.fourier_levels,
+        "context_encoder": architecture.context,
         "uncertainty": head,
-        "unc_freeze": variant.uncertainty == "nll_frozen",
+        "unc_freeze": architecture.uncertainty == "nll_frozen",
         "al_contrario": False,
     }
     defaults = {"fourier_levels": -1, "context_encoder": "rgb"}
-    for key, actual in found.items():
-        said = config.get(key, defaults.get(key, False))
+    for key, actual in of_weights.items():
+        given = config.get(key, defaults.get(key, False))
         if key == "unc_freeze" and not head:
             continue
-        if said != actual:
-            raise ValueError(f"its config says {key} = {said!r}, its weights say {actual!r}")
+        if given != actual:
+            raise ValueError(f"its config has {key} = {given!r}, its weights have {actual!r}")
 
 
 def _dimension(shapes: Shapes, name: str, axis: int) -> int:

@@ -1,24 +1,26 @@
-"""Weights from files: strictly, safely, and with a hash of what was read."""
+"""Checkpoints: a network's weights, checked against their config, with the file's hash."""
 
 from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from calibgraph.errors import FileError
 from calibgraph.files import sha256, write_atomically
-from calibgraph.matching.cmrnext.architecture import Variant, recognised, require_config_agrees
+from calibgraph.matching.cmrnext.architecture import (
+    Architecture,
+    recognize_architecture,
+    require_config_agrees,
+)
 from calibgraph.matching.cmrnext.network import CmrNext
-from calibgraph.matching.cmrnext.pickle_reader import read_checkpoint
+from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
 
 SAFETENSORS = ".safetensors"
 TORCH_SUFFIXES = (".tar", ".pt", ".pth")
@@ -36,53 +38,53 @@ _NUMBERS = {
     "max_t": (0.0, 1000.0, False),
     "systematic_rotation_rad": (0.0, 10.0, False),
     "systematic_translation_m": (0.0, 1000.0, False),
-}  # least, most, and whether they must be there
+}  # least, most, and whether the key is required
 _SWITCHES = {"use_reflectance": True, "normalize_images": True, "half_resolution": False}
 _MAX_TEXT, _MAX_INTEGER = 200, 2**53
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A network's weights and what they were made for.
+    """A network's weights and the config of their training.
 
     Attributes:
         path: of the file.
         sha256: of the file.
-        variant: of the network, recognised from the shapes.
-        config: what the file says of its training; plain values only.
+        architecture: of the network, recognised from the shapes.
+        config: of the training; plain values only.
         state: the state dict.
     """
 
     path: Path
     sha256: str
-    variant: Variant
+    architecture: Architecture
     config: dict[str, Any]
     state: dict[str, Tensor]
 
     @property
     def max_depth_m(self) -> float:
-        """What depths are divided by."""
+        """The divisor of depths."""
         return float(self.config["max_depth"])
 
     @property
     def range_deg_m(self) -> tuple[float, float] | None:
-        """Largest perturbation per axis in training, degrees and metres, if the file says."""
+        """Largest perturbation per axis in training [deg, m]; None if the config lacks it."""
         rotation, translation = (self.config.get(key) for key in ("max_r", "max_t"))
         return (float(rotation), float(translation)) if rotation and translation else None
 
     def summary(self) -> dict[str, Any]:
-        """What the file holds, as plain values."""
+        """File, hash, number of parameters, architecture and config, as plain values."""
         return {
             "file": str(self.path),
             "sha256": self.sha256,
-            "parameters": sum(t.numel() for name, t in self.state.items() if not _copied(name)),
-            "network": asdict(self.variant),
+            "parameters": sum(t.numel() for name, t in self.state.items() if _is_parameter(name)),
+            "network": asdict(self.architecture),
             "config": self.config,
         }
 
     def network(self, device: str | torch.device = "cpu") -> CmrNext:
         """The network with these weights, for evaluation."""
-        model = CmrNext(self.variant)
+        model = CmrNext(self.architecture)
         model.load_state_dict(self.state)
         return model.to(device).eval()
 
@@ -91,16 +93,15 @@ class Checkpoint:
         from safetensors.torch import save_file
 
         metadata = {"format": "calibgraph-cmrnext/1", "config": json.dumps(self.config)}
-        # Some tensors are stored under two names; safetensors wants them apart.
+        # Some tensors are stored under two names; safetensors requires separate memory.
         state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
         write_atomically(path, lambda temporary: save_file(state, temporary, metadata))
 
 
-def _copied(name: str) -> bool:
-    """Whether a state dict's entry is no parameter: a second name, or a running statistic."""
-    return ".downsample.1." in name or name.endswith(
-        ("running_mean", "running_var", "num_batches_tracked")
-    )
+def _is_parameter(name: str) -> bool:
+    """Whether an entry of a state dict is neither a second name nor a running statistic."""
+    statistics = ("running_mean", "running_var", "num_batches_tracked")
+    return ".downsample.1." not in name and not name.endswith(statistics)
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
@@ -109,52 +110,69 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     Nothing in the file is executed.
 
     Raises:
-        FileError: if the file is missing, damaged, hostile, not of a CMRNext network, or differs
-            from what it says of itself.
+        FileError: if the file is missing, damaged or hostile, holds no CMRNext network, or if its
+            config and weights disagree.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
         raise FileError(path, "is not a file; expected weights, .tar or .safetensors")
     if not path.exists():
         raise FileError(path, f"no such file of weights; {DOWNLOAD}")
-    given, tensors = _read_safetensors(path) if path.suffix == SAFETENSORS else _read_torch(path)
+    read = _read_safetensors if path.suffix == SAFETENSORS else _read_torch
+    return _to_checkpoint(path, *read(path))
+
+
+def load_training(path: Path | str) -> tuple[Checkpoint, dict[Any, Any]]:
+    """Read the checkpoint of a training run, and all content of its file.
+
+    Raises:
+        FileError: as :func:`load_checkpoint`.
+    """
+    path = Path(path)
+    content = read_torch_file(path)
+    return _to_checkpoint(path, *_weights_in(content, path)), content
+
+
+def _to_checkpoint(
+    path: Path, given: Mapping[Any, Any], tensors: Mapping[str, Tensor]
+) -> Checkpoint:
     try:
         config = _plain(given)
         _require_sound(config)
         shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        variant = recognised(shapes, reflectance=config["use_reflectance"])
-        require_config_agrees(variant, config)
-        state = _checked_state(variant, tensors)
+        architecture = recognize_architecture(shapes, reflectance=config["use_reflectance"])
+        require_config_agrees(architecture, config)
+        state = _copy_state(architecture, tensors)
     except ValueError as error:
         raise FileError(path, f"{error}") from None
-    return Checkpoint(path, sha256(path), variant, config, state)
+    return Checkpoint(path, sha256(path), architecture, config, state)
 
 
-def _read_torch(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    content = read_checkpoint(path)
+def _read_torch(path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
+    return _weights_in(read_torch_file(path), path)
+
+
+def _weights_in(content: Mapping[Any, Any], path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
     for key in ("config", "state_dict"):
         if not isinstance(content.get(key), dict):
             raise FileError(path, f"lacks {key!r}: expected the checkpoint of a CMRNext training")
     tensors = {}
-    for name, array in content["state_dict"].items():
-        if not isinstance(name, str) or not isinstance(array, np.ndarray):
+    for name, tensor in content["state_dict"].items():
+        if not isinstance(name, str) or not isinstance(tensor, Tensor):
             raise FileError(path, f"its state_dict holds {str(name)[:100]!r}, which is no tensor")
-        # A number that is repeated by a stride of zero is copied only when its shape is right.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # torch: the array is read-only; so be it
-            tensors[name.removeprefix("module.")] = torch.from_numpy(array)
+        tensors[name.removeprefix("module.")] = tensor.detach()
     return content["config"], tensors
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load
+    from safetensors import SafetensorError, safe_open
 
     try:
-        data = path.read_bytes()
-        tensors = load(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-        text = header.get("__metadata__", {}).get("config")
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes, expected at most {MAX_BYTES}")
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            text = (file.metadata() or {}).get("config")
         config = None if text is None else json.loads(text)
     except (SafetensorError, ValueError, OSError, RecursionError, KeyError) as error:
         reason = getattr(error, "strerror", None) or str(error)
@@ -187,55 +205,52 @@ def _require_sound(config: Mapping[str, Any]) -> None:
     Raises:
         ValueError: on the first that is missing or out of its range.
     """
-    for key, (least, most, needed) in _NUMBERS.items():
-        value = config.get(key)
-        if value is None and not needed:
+    for key, (least, most, required) in _NUMBERS.items():
+        value: Any = config.get(key)
+        if value is None and not required:
             continue
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float))
-            or not (least <= value <= most)
-        ):
+        if type(value) not in (int, float) or not least <= value <= most:
             raise ValueError(
                 f"its config has {key!r} = {value!r}, expected a number from {least} to {most}"
             )
-    for key, needed in _SWITCHES.items():
+    for key, required in _SWITCHES.items():
         value = config.get(key)
-        if not isinstance(value, bool) and (needed or value is not None):
+        if not isinstance(value, bool) and (required or value is not None):
             raise ValueError(f"its config has {key!r} = {value!r}, expected true or false")
 
 
-def _checked_state(variant: Variant, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict, after comparing every name and shape with the network's.
+def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state dict, after comparing every name, shape and type with the network's.
 
     Raises:
         ValueError: on the first difference, and on numbers that are not finite.
     """
     with torch.device("meta"):
-        expected = CmrNext(variant).state_dict()
+        expected = CmrNext(architecture).state_dict()
     for kind, names in (
         ("lacks", expected.keys() - tensors.keys()),
         ("has the unknown", tensors.keys() - expected.keys()),
     ):
         if names:
             raise ValueError(f"{kind} weights {min(names)!r} ({len(names)} such names)")
-    state = {}
-    for name, like in expected.items():
-        tensor = tensors[name]
-        if tensor.shape != like.shape:
-            raise ValueError(
-                f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}"
-            )
-        if tensor.is_floating_point() != like.is_floating_point():
-            raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
-        state[name] = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
-        if not torch.isfinite(state[name]).all():
-            raise ValueError(f"{name!r} holds values that are not finite")
-        if name.endswith("running_var") and (state[name] < 0).any():
-            raise ValueError(f"{name!r} holds variances below zero")
+    state = {name: _copy(name, tensors[name], like) for name, like in expected.items()}
     for name, tensor in state.items():
         if ".norm3." in name and not torch.equal(
             tensor, state[name.replace(".norm3.", ".downsample.1.")]
         ):
             raise ValueError(f"{name!r} and its copy under 'downsample.1' differ")
     return state
+
+
+def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:
+    """A sound copy of a tensor, in the type that the network expects."""
+    if tensor.shape != like.shape:
+        raise ValueError(f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}")
+    if tensor.is_floating_point() != like.is_floating_point():
+        raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
+    copy = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
+    if not torch.isfinite(copy).all():
+        raise ValueError(f"{name!r} holds values that are not finite")
+    if name.endswith("running_var") and (copy < 0).any():
+        raise ValueError(f"{name!r} holds variances below zero")
+    return copy

@@ -1,7 +1,7 @@
-"""How well LiDAR cells fit image cells: windows of the correlation pyramid about given positions.
+"""Correlation of LiDAR cells with image cells: windows of a pyramid around given positions.
 
-Both ways give the same numbers. :class:`Volume` computes all pairs once: fast, but its memory grows
-with the square of the image. :class:`OnTheFly` computes only the windows that are asked for.
+Both classes give the same numbers. :class:`Volume` computes all pairs once: fast, but its memory
+grows with the square of the image. :class:`OnTheFly` computes only the requested windows.
 """
 
 from __future__ import annotations
@@ -18,17 +18,23 @@ RADIUS = 4
 WINDOW = 2 * RADIUS + 1
 CHANNELS = LEVELS * WINDOW**2
 
-_CORNERS = WINDOW + 1  # whole cells that a window at a fractional position touches, per axis
+_CORNERS = WINDOW + 1  # whole cells under a window at a fractional position, per axis
 _CHUNK_BYTES = 32 * 2**20
 _PYRAMID = sum(0.25**level for level in range(LEVELS))
-_FAR = 1e6  # cells: positions are bounded before they become whole numbers
+_FAR = 1e6  # cells: positions are clamped before rounding to integers
 
 
 class Correlation(Protocol):
-    """A correlation pyramid of two feature maps."""
+    """A correlation pyramid of two feature maps.
+
+    Attributes:
+        device: of its tensors.
+    """
+
+    device: torch.device
 
     def window(self, positions: Tensor) -> Tensor:
-        """Correlation of each LiDAR cell with the image around a position.
+        """Correlation of each LiDAR cell with the image cells around a position.
 
         Args:
             positions: (B, 2, h, w) x, y in image cells of level 0.
@@ -46,11 +52,11 @@ def volume_bytes(batch: int, height: int, width: int) -> int:
 
 
 def cross_entropy(windows: Tensor, targets: Tensor) -> Tensor:
-    """How badly windows point at their targets: mean of -log softmax over the finest level.
+    """Mean cross-entropy of the finest level's softmax at the targets.
 
     Args:
         windows: (n, 81) the first channels of :meth:`Correlation.window`.
-        targets: (n, 2) x, y of the truth from the window's centre, cells; within +-4.
+        targets: (n, 2) x, y of the true position from the window's centre, cells; within +-4.
     """
     fraction, whole = torch.frac(targets + RADIUS), (targets + RADIUS).long()
     corner = (WINDOW * whole[:, 0] + whole[:, 1])[:, None]
@@ -65,6 +71,7 @@ class Volume:
     """All pairs of cells, computed once."""
 
     def __init__(self, lidar: Tensor, image: Tensor) -> None:
+        self.device = lidar.device
         batch, channels, height, width = lidar.shape
         scaled = lidar.flatten(2).transpose(1, 2) / math.sqrt(channels)
         cells = (scaled @ image.flatten(2)).view(batch * height * width, 1, *image.shape[2:])
@@ -79,14 +86,15 @@ class Volume:
         for level, cells in enumerate(self.levels):
             index, inside, fraction = _corners(points / 2**level, cells.shape[-2:])
             found = cells.flatten(1).gather(1, index) * inside
-            windows.append(_blended(found, fraction))
-        return _as_maps(torch.cat(windows, dim=1), positions)
+            windows.append(_blend(found, fraction))
+        return _to_maps(torch.cat(windows, dim=1), positions)
 
 
 class OnTheFly:
-    """Only the windows asked for, from pooled features: pooling and dot products commute."""
+    """Requested windows only, from pooled features: pooling and dot products commute."""
 
     def __init__(self, lidar: Tensor, image: Tensor) -> None:
+        self.device = lidar.device
         scaled = lidar / math.sqrt(lidar.shape[1])
         self.lidar = scaled.flatten(2).transpose(1, 2).contiguous()  # (B, cells, C)
         self.levels = [image]
@@ -97,7 +105,7 @@ class OnTheFly:
     def window(self, positions: Tensor) -> Tensor:
         """See :meth:`Correlation.window`."""
         batch = [self._one(i, p.flatten(1).T) for i, p in enumerate(positions)]
-        return _as_maps(torch.cat(batch), positions)
+        return _to_maps(torch.cat(batch), positions)
 
     def _one(self, item: int, points: Tensor) -> Tensor:
         """(cells, 324) windows of one batch item."""
@@ -112,12 +120,12 @@ class OnTheFly:
                     for k in range(0, len(index), size)
                 ]
             )
-            windows.append(_blended(found * inside, fraction))
+            windows.append(_blend(found * inside, fraction))
         return torch.cat(windows, dim=1)
 
 
 def _corners(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
-    """The whole cells around points: (n, 100) row-major index and whether inside; (n, 2) rest.
+    """The whole cells around points: (n, 100) row-major index, (n, 100) inside, (n, 2) fraction.
 
     All samples of a window have the same fractional part, so 10 x 10 cells give 9 x 9 samples.
     """
@@ -133,7 +141,7 @@ def _corners(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
     return index.flatten(1), inside.flatten(1), bounded - base
 
 
-def _blended(corners: Tensor, fraction: Tensor) -> Tensor:
+def _blend(corners: Tensor, fraction: Tensor) -> Tensor:
     """(n, 81) bilinear samples, x slow and y fast, from (n, 100) cells."""
     grid = corners.view(-1, _CORNERS, _CORNERS)
     x, y = fraction[:, 0, None, None], fraction[:, 1, None, None]
@@ -141,6 +149,6 @@ def _blended(corners: Tensor, fraction: Tensor) -> Tensor:
     return torch.lerp(along_x[:, :, :-1], along_x[:, :, 1:], y).flatten(1)
 
 
-def _as_maps(rows: Tensor, positions: Tensor) -> Tensor:
+def _to_maps(rows: Tensor, positions: Tensor) -> Tensor:
     batch, _, height, width = positions.shape
     return rows.view(batch, height, width, -1).permute(0, 3, 1, 2)

@@ -1,6 +1,6 @@
-"""What the network is shown: a cloud as a sparse depth image, and the camera's image beside it.
+"""The network's inputs: a cloud as a sparse depth image, and the camera's image.
 
-The conventions are those that the published networks were trained with; they stop here.
+The conventions of the published networks (rounding, scaling, padding, encoding) stop here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from calibgraph.errors import DatasetError
-from calibgraph.matching.cmrnext.architecture import Variant
+from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE
 from calibgraph.model.rig import Camera
 
@@ -28,7 +28,7 @@ MAX_DEPTH_M = 1000.0
 _MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
 _STD = np.array([0.229, 0.224, 0.225], dtype=np.float32)
 
-_MARGIN_PX = 0.1  # the networks' training left out points nearer to the left and upper edge
+_MARGIN_PX = 0.1  # as in the published training: at the left and upper edge
 _MAX_BYTE = 255.0
 
 _OCCLUDER_RADIUS_PX = 10
@@ -40,7 +40,7 @@ class View:
 
     Args:
         camera: its pose is not used.
-        crop_even: leave out the last column or row where their number is odd.
+        crop_even: leave out the last column or row if their number is odd.
     """
 
     def __init__(self, camera: Camera, *, crop_even: bool = False) -> None:
@@ -51,8 +51,8 @@ class View:
             size - size % 2 if crop_even else size for size in (camera.width_px, camera.height_px)
         )
 
-    def image(self, recorded: Image) -> Image:
-        """(height, width, 3) RGB without distortion, from the image as recorded, BGR."""
+    def undistort(self, recorded: Image) -> Image:
+        """(height, width, 3) RGB without distortion, from the recorded BGR image."""
         rgb = cv2.cvtColor(recorded, cv2.COLOR_BGR2RGB)
         if self.camera.distortion or self.camera.model != "pinhole":
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
@@ -63,19 +63,19 @@ class View:
         plane = points_camera_m[:, :2] / points_camera_m[:, 2:]
         return np.asarray(plane * self.focal_px + self.centre_px)
 
-    def recorded(self, pixels_px: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, 2) pixels of the image as recorded, and which of them are on it."""
+    def distort(self, pixels_px: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """(n, 2) pixels of the recorded image, and which of them are inside it."""
         plane = (pixels_px - self.centre_px) / self.focal_px
         pixels, valid = self.camera.lens.project(np.column_stack([plane, np.ones(len(plane))]))
         return pixels, valid & self.camera.in_image(pixels)
 
     @cached_property
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where each pixel lies in the image as recorded; off it where the lens does not see."""
+        """Each pixel's place in the recorded image; outside it where the lens has no view."""
         shape = self.camera.height_px, self.camera.width_px
         v, u = np.indices(shape, dtype=np.float64).reshape(2, -1)
-        pixels, seen = self.recorded(np.column_stack([u, v]))
-        x, y = np.where(seen[:, None], pixels, -1e6).astype(np.float32).T
+        pixels, visible = self.distort(np.column_stack([u, v]))
+        x, y = np.where(visible[:, None], pixels, -1e6).astype(np.float32).T
         return x.reshape(shape), y.reshape(shape)
 
 
@@ -84,10 +84,10 @@ class LidarImage:
     """A cloud in a view, the nearest point per pixel.
 
     Attributes:
-        point_index: (m,) row in the cloud of each point that is seen.
-        pixels_px: (m, 2) its exact projection.
-        cells: (m, 2) its pixel's row and column.
-        depth_m: (m,) along the camera's z axis.
+        point_index: (m,) row in the cloud of each visible point.
+        pixels_px: (m, 2) exact projections.
+        cells: (m, 2) row and column of their pixels.
+        depth_m: (m,) depths along the camera's z axis.
         shape: height and width of the image.
         intensity: (m,) in 0..1, or NaN where the cloud has none.
     """
@@ -100,7 +100,7 @@ class LidarImage:
     intensity: NDArray[np.float32]
 
     @staticmethod
-    def of(cloud: NDArray[np.float32], T_camera_lidar: Array, view: View) -> LidarImage:
+    def render(cloud: NDArray[np.float32], T_camera_lidar: Array, view: View) -> LidarImage:
         """Project a cloud.
 
         Args:
@@ -125,7 +125,7 @@ class LidarImage:
             cells=cells[nearest],
             depth_m=depth[nearest],
             shape=(view.height, view.width),
-            intensity=_unit_intensity(cloud)[index[nearest]],
+            intensity=_scale_intensity(cloud)[index[nearest]],
         )
 
     def select(self, rows: NDArray[np.bool_]) -> LidarImage:
@@ -140,9 +140,9 @@ class LidarImage:
         )
 
     def without_occluded(self) -> LidarImage:
-        """Without points seen through something nearer: nearer points in all four quadrants."""
+        """Without points that have nearer points in all four quadrants around them."""
         radius = _OCCLUDER_RADIUS_PX
-        depth = self.image(self.depth_m)
+        depth = self.rasterize(self.depth_m)
         depth[depth == 0] = np.inf
         farthest = np.zeros_like(depth)
         for anchor in ((0, 0), (0, radius), (radius, 0), (radius, radius)):
@@ -153,15 +153,15 @@ class LidarImage:
         limit = _OCCLUDER_SHARE * self.depth_m - _OCCLUDER_M
         return self.select(farthest[rows, columns] >= limit)
 
-    def image(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(height, width) of one value per point, zero where there is no point."""
+    def rasterize(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(height, width) image of one value per point, zero where there is no point."""
         image = np.zeros(self.shape, dtype=np.float32)
         image[self.cells[:, 0], self.cells[:, 1]] = values
         return image
 
 
-def _unit_intensity(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n,) intensity in 0..1: as it is, or of bytes."""
+def _scale_intensity(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n,) intensity in 0..1; values above 1 are taken as bytes."""
     intensity = cloud[:, 3]
     finite = intensity[np.isfinite(intensity)]
     if len(finite) and finite.max() > 1.0:
@@ -169,25 +169,27 @@ def _unit_intensity(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(intensity, dtype=np.float32)
 
 
-def lidar_channels(image: LidarImage, variant: Variant, max_depth_m: float) -> NDArray[np.float32]:
-    """(1 or 2, height, width) normalised depth, and intensity if the network wants it.
+def lidar_channels(
+    image: LidarImage, architecture: Architecture, max_depth_m: float
+) -> NDArray[np.float32]:
+    """(1 or 2, height, width) normalised depth, and intensity if the network reads it.
 
     Raises:
-        DatasetError: if it wants intensity and the cloud has none.
+        DatasetError: if it reads intensity and the cloud has none.
     """
-    channels = [image.image(image.depth_m / np.float32(max_depth_m))]
-    if variant.reflectance:
+    channels = [image.rasterize(image.depth_m / np.float32(max_depth_m))]
+    if architecture.reflectance:
         if not np.isfinite(image.intensity).all():
             raise DatasetError(
                 "the network reads LiDAR intensity, and the cloud has none; use weights without "
                 "reflectance, or clouds with intensity"
             )
-        channels.append(image.image(image.intensity))
+        channels.append(image.rasterize(image.intensity))
     return np.stack(channels)
 
 
-def halved_lidar(channels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Half the size: each 2x2 block becomes the mean of its pixels that hold a point."""
+def halve_lidar(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Halve the size: each 2x2 block becomes the mean of its pixels with a point."""
     c, height, width = channels.shape
     blocks = channels.reshape(c, height // 2, 2, width // 2, 2)
     count = (channels[0] > 0).reshape(height // 2, 2, width // 2, 2).sum(axis=(1, 3))
@@ -195,7 +197,7 @@ def halved_lidar(channels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def network_size(height: int, width: int) -> tuple[int, int]:
-    """The next larger size that the network takes."""
+    """The smallest size that the network accepts and that holds (height, width)."""
     rows, columns = (
         max(SIZE_MIN, -(-size // SIZE_MULTIPLE) * SIZE_MULTIPLE) for size in (height, width)
     )
@@ -206,31 +208,31 @@ def rgb_tensor(image: Image, *, normalize: bool) -> Tensor:
     """(3, H, W) padded at the right and bottom with the mean colour, from (h, w, 3) RGB."""
     unit = image.astype(np.float32) / np.float32(_MAX_BYTE)
     values = (unit - _MEAN) / _STD if normalize else unit
-    return _padded(torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1))))
+    return _pad(torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1))))
 
 
 def lidar_tensor(channels: NDArray[np.float32]) -> Tensor:
     """(1 or 2, H, W) padded with zeros at the right and bottom."""
-    return _padded(torch.from_numpy(np.ascontiguousarray(channels)))
+    return _pad(torch.from_numpy(np.ascontiguousarray(channels)))
 
 
-def encoded(lidar: Tensor, variant: Variant) -> Tensor:
+def encode_depth(lidar: Tensor, architecture: Architecture) -> Tensor:
     """The network's LiDAR input: Fourier encoding of the depth, then depth, then intensity.
 
     Args:
         lidar: (B, 1 or 2, H, W) normalised depth d, 0 where empty; intensity.
-        variant: of the network.
+        architecture: of the network.
 
     Returns:
         (B, C, H, W): sin(pi d 2^l), cos(pi d 2^l) for l = 0 .. L - 1, then d; zero where empty.
     """
     depth = lidar[:, :1]
-    angles = [depth * torch.pi * 2**level for level in range(variant.fourier_levels)]
+    angles = [depth * torch.pi * 2**level for level in range(architecture.fourier_levels)]
     waves = [wave(angle) for angle in angles for wave in (torch.sin, torch.cos)]
     return torch.cat([*waves, lidar], dim=1) * (depth > 0)
 
 
-def _padded(image: Tensor) -> Tensor:
+def _pad(image: Tensor) -> Tensor:
     height, width = image.shape[1:]
     rows, columns = network_size(height, width)
     return torch.nn.functional.pad(image, (0, columns - width, 0, rows - height))

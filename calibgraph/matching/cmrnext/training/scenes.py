@@ -1,27 +1,42 @@
-"""Frames whose extrinsics are trusted, to learn from."""
+"""Scenes to learn from: images and clouds of frames whose extrinsics are trusted."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibgraph.errors import DatasetError
 from calibgraph.io import kitti
-from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.dataset import Dataset, Frame, load_dataset
 from calibgraph.io.rigs import load_rig
-from calibgraph.matching.cmrnext.samples import Scene
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
 
 REFERENCE_NAME = "reference.yaml"
 
 
-def trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
-    """A dataset whose rig holds extrinsics to train on.
+@dataclass(frozen=True)
+class Scene:
+    """One camera's image and the cloud of one frame.
+
+    Attributes:
+        frame: of the dataset.
+        name: of the camera.
+        camera: with its trusted T_camera_lidar.
+    """
+
+    frame: Frame
+    name: str
+    camera: Camera
+
+
+def load_trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
+    """Load a dataset with extrinsics to train on.
 
     Args:
         folder: a KITTI odometry sequence, or a dataset folder.
-        rig: the trusted one; if None, the sequence's calib.txt or the folder's reference.yaml.
+        rig: with the trusted extrinsics; if None, the sequence's calib.txt or the folder's
+            reference.yaml.
 
     Raises:
         DatasetError: if the folder has neither: its rig.yaml is only a guess.
@@ -38,7 +53,7 @@ def trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
 
 
 def split(datasets: Sequence[Dataset]) -> tuple[list[Dataset], list[Dataset]]:
-    """The first four fifths of each dataset's frames, and the last: neighbours look alike.
+    """Split each dataset's frames into the first four fifths and the last; neighbours look alike.
 
     Raises:
         DatasetError: if one has a single frame.
@@ -55,7 +70,7 @@ def split(datasets: Sequence[Dataset]) -> tuple[list[Dataset], list[Dataset]]:
     )
 
 
-def scenes_of(datasets: Sequence[Dataset]) -> list[Scene]:
+def list_scenes(datasets: Sequence[Dataset]) -> list[Scene]:
     """Every camera of every frame."""
     return [
         Scene(frame, name, camera)
@@ -65,8 +80,8 @@ def scenes_of(datasets: Sequence[Dataset]) -> list[Scene]:
     ]
 
 
-def require_apart(scenes: Sequence[Scene], held_out: Sequence[Scene]) -> None:
-    """Check that no frame is both learned from and held out.
+def require_disjoint(scenes: Sequence[Scene], held_out: Sequence[Scene]) -> None:
+    """Check that no frame is both trained on and held out.
 
     Raises:
         DatasetError: naming one that is.

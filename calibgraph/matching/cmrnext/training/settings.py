@@ -1,68 +1,74 @@
-"""What to train, and on what; and how a checkpoint says so."""
+"""Settings of a training: from a YAML file, and in the checkpoint's config."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibgraph.errors import FileError
-from calibgraph.files import describe
-from calibgraph.matching.cmrnext.architecture import FULL_WIDTH, Variant
+from calibgraph.files import checked_model, describe, read_yaml, write_yaml
+from calibgraph.matching.cmrnext.architecture import FULL_WIDTH, Architecture
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
-from calibgraph.matching.cmrnext.samples import SampleSettings
+from calibgraph.matching.cmrnext.training.samples import SampleSettings
 from calibgraph.matching.cmrnext.training.validation import Validation
 from calibgraph.model.config import Seed
 
 Count = Annotated[int, Field(ge=1, le=10**9)]
-CropSize = Annotated[int, Field(ge=64, le=100_000)]
+CropSize = Annotated[int, Field(ge=64, le=100_000, multiple_of=2)]
+
+_PREFIX = "train_"  # of the settings in a checkpoint's config
 
 
 class TrainSettings(BaseModel):
-    """What to train, and on what. Everything is written into the checkpoint.
+    """Settings of a training. All of them are written into the checkpoint."""
 
-    Attributes:
-        rotation_deg, translation_m: largest perturbation per axis, uniform: the network's range.
-        steps: optimizer steps in all.
-        batch: samples per step.
-        iterations: of the recurrent update, in training.
-        learning_rate: the peak of the one-cycle schedule.
-        warm_up_share: of the steps, until that peak.
-        correlation_weight: of an additional loss that pulls the two encoders' features together:
-            cross-entropy of the correlation at the true cell. The published training has none; it
-            saves short trainings the time until the flow's own loss reaches the encoders.
-        correlation_steps: how many steps, at first, train the encoders by that loss alone.
-        crop_px: height and width of random crops at full resolution; None: whole images.
-        half_resolution: whether the network sees images of half their size.
-        width, fourier_levels, reflectance, context: of the network, see :class:`Variant`.
-        max_depth_m: what depths are divided by.
-        seed: of the weights and of all samples.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     rotation_deg: Annotated[float, Field(gt=0, le=180)] = 20.0
+    """Largest perturbation per axis, uniform: the network's range."""
     translation_m: Annotated[float, Field(gt=0, le=1000)] = 1.5
+    """Largest perturbation per axis, uniform: the network's range."""
     steps: Count = 100_000
+    """Optimizer steps in all."""
     batch: Annotated[int, Field(ge=1, le=1024)] = 4
+    """Samples per step."""
     iterations: Annotated[int, Field(ge=1, le=100)] = 12
+    """Iterations of the recurrent update in training."""
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 3e-4
+    """Peak of the one-cycle schedule."""
     warm_up_share: Annotated[float, Field(ge=0.01, le=0.99)] = 0.4
+    """Share of the steps before that peak."""
     correlation_weight: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Weight of an additional loss on the encoders: cross-entropy of the correlation at the true
+    cell. The published training has none. With 0.3, short trainings need not wait for the
+    gradients of the flow to reach the encoders."""
     correlation_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """Steps at the beginning with that loss alone."""
     crop_px: tuple[CropSize, CropSize] | None = (320, 960)
+    """Height and width of random crops at full resolution, even numbers; null for whole images."""
     half_resolution: bool = False
+    """Halve the images."""
     width: int = FULL_WIDTH
+    """Channels of the network's first layer, a multiple of 8; 64 as published."""
     fourier_levels: int = 12
+    """Levels of the depth's Fourier encoding; -1 for plain depth."""
     reflectance: bool = False
+    """Whether the network also reads the LiDAR's intensity."""
     context: Literal["lidar", "rgb"] = "lidar"
+    """Which image the context encoder reads: lidar or rgb."""
     max_depth_m: Annotated[float, Field(ge=1, le=10_000)] = 160.0
+    """Divisor of depths."""
     seed: Seed = 0
+    """Of the initial weights and of all samples."""
 
     @model_validator(mode="after")
-    def _can_be_trained(self) -> Self:
-        _ = self.variant
+    def _require_trainable(self) -> Self:
+        _ = self.architecture
         if self.correlation_steps and not self.correlation_weight:
             raise ValueError("correlation_steps need a correlation_weight above 0")
         return self
@@ -73,12 +79,12 @@ class TrainSettings(BaseModel):
         Raises:
             ValueError: on an unknown setting or a wrong value, in one line.
         """
-        return _checked({**self.model_dump(), **settings})
+        return _validate({**self.model_dump(), **settings})
 
     @property
-    def variant(self) -> Variant:
-        """Of the network."""
-        return Variant(
+    def architecture(self) -> Architecture:
+        """The architecture of the network."""
+        return Architecture(
             fourier_levels=self.fourier_levels,
             reflectance=self.reflectance,
             context=self.context,
@@ -86,7 +92,7 @@ class TrainSettings(BaseModel):
         )
 
     def samples(self, *, augment: bool) -> SampleSettings:
-        """How samples are made: for training, or whole images for validation."""
+        """Settings of augmented samples for training, or of whole images for validation."""
         return SampleSettings(
             rotation_deg=self.rotation_deg,
             translation_m=self.translation_m,
@@ -96,29 +102,39 @@ class TrainSettings(BaseModel):
             augment=augment,
         )
 
+    def save(self, path: Path) -> None:
+        """Write all settings as YAML."""
+        write_yaml(path, self.model_dump())
 
-def parsed_crop(text: str) -> tuple[int, int] | None:
-    """``320x960`` as height and width, ``none`` as None.
+
+def load_settings(path: Path | str) -> TrainSettings:
+    """Read settings from YAML; those that the file lacks have their defaults.
 
     Raises:
-        ValueError: if it is neither.
+        FileError: if the file is missing, has an unknown key or a wrong value.
     """
-    if text == "none":
-        return None
-    parts = text.split("x")
-    if len(parts) != 2 or not all(p.isdecimal() and int(p) >= 64 for p in parts):  # noqa: PLR2004
-        raise ValueError(f"crop {text!r}: expected HxW in pixels, at least 64x64, or none")
-    return int(parts[0]) // 2 * 2, int(parts[1]) // 2 * 2
+    return checked_model(TrainSettings, read_yaml(Path(path)), path)
 
 
-def config_of(settings: TrainSettings, validation: Validation) -> dict[str, Any]:
-    """What the checkpoint says of itself: the published files' keys, and our settings."""
+def commented_defaults() -> str:
+    """A settings file with all defaults, each with its description."""
+    lines = []
+    for name, field in TrainSettings.model_fields.items():
+        description = " ".join((field.description or "").split())
+        lines += textwrap.wrap(description, 98, initial_indent="# ", subsequent_indent="# ")
+        default = yaml.safe_dump(field.default, default_flow_style=True).splitlines()[0]
+        lines += [f"{name}: {default}", ""]
+    return "\n".join(lines)
+
+
+def to_config(settings: TrainSettings, validation: Validation) -> dict[str, Any]:
+    """The checkpoint's config: the keys of the published files, and all settings."""
     return {
         "use_reflectance": settings.reflectance,
         "normalize_images": True,
         "max_depth": settings.max_depth_m,
         "upsample_method": "transposed",
-        "fourier_levels": settings.variant.fourier_levels,
+        "fourier_levels": settings.architecture.fourier_levels,
         "context_encoder": settings.context,
         "uncertainty": False,
         "der_type": "NLL",
@@ -127,52 +143,51 @@ def config_of(settings: TrainSettings, validation: Validation) -> dict[str, Any]
         "al_contrario": False,
         "max_r": settings.rotation_deg,
         "max_t": settings.translation_m,
-        **{f"train_{key}": value for key, value in settings.model_dump().items()},
+        **{f"{_PREFIX}{key}": value for key, value in settings.model_dump().items()},
         "half_resolution": settings.half_resolution,
         "systematic_rotation_rad": validation.systematic_rotation_rad,
         "systematic_translation_m": validation.systematic_translation_m,
     }
 
 
-def settings_in(config: Mapping[str, Any]) -> TrainSettings:
-    """The settings in a config that :func:`config_of` made.
+def settings_of(config: Mapping[str, Any]) -> TrainSettings:
+    """The settings in a config that :func:`to_config` made.
 
     Raises:
-        ValueError: if it was made otherwise.
+        ValueError: if it was not made so.
     """
-    prefix = "train_"
-    said = {key.removeprefix(prefix): v for key, v in config.items() if key.startswith(prefix)}
-    if not said:
+    given = {key.removeprefix(_PREFIX): config[key] for key in config if key.startswith(_PREFIX)}
+    if not given:
         raise ValueError("it was not made by calibgraph train; start from it with --from")
-    if missing := TrainSettings.model_fields.keys() - said.keys():
-        raise ValueError(f"its config lacks a sound {prefix}{min(missing)}")
-    return _checked(said)
+    if missing := TrainSettings.model_fields.keys() - given.keys():
+        raise ValueError(f"its config lacks a sound {_PREFIX}{min(missing)}")
+    return _validate(given)
 
 
-def _checked(settings: Mapping[str, Any]) -> TrainSettings:
-    try:
-        return TrainSettings.model_validate(settings)
-    except ValidationError as error:
-        raise ValueError(describe(error)) from error
-
-
-def settings_from(settings: TrainSettings, checkpoint: Checkpoint) -> TrainSettings:
-    """The settings with the network of the weights that training starts from.
+def adopt_architecture(settings: TrainSettings, checkpoint: Checkpoint) -> TrainSettings:
+    """The settings with the network of the weights from which training starts.
 
     Raises:
         FileError: if they cannot be trained.
     """
-    variant = checkpoint.variant
-    if variant.uncertainty != "none" or not checkpoint.config["normalize_images"]:
+    architecture = checkpoint.architecture
+    if architecture.uncertainty != "none" or not checkpoint.config["normalize_images"]:
         raise FileError(
             checkpoint.path,
             "has an uncertainty head or reads images that are not normalised: training such a "
             "network is not supported; start from plain weights",
         )
     return settings.changed(
-        width=variant.width,
-        fourier_levels=variant.fourier_levels,
-        reflectance=variant.reflectance,
-        context=variant.context,
+        width=architecture.width,
+        fourier_levels=architecture.fourier_levels,
+        reflectance=architecture.reflectance,
+        context=architecture.context,
         max_depth_m=checkpoint.max_depth_m,
     )
+
+
+def _validate(settings: Mapping[str, Any]) -> TrainSettings:
+    try:
+        return TrainSettings.model_validate(settings)
+    except ValidationError as error:
+        raise ValueError(describe(error)) from error

@@ -1,4 +1,4 @@
-"""How a network in training does on frames that it does not learn from."""
+"""Validation of a network in training on held-out frames."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import spread_out
-from calibgraph.matching.cmrnext.architecture import Variant
-from calibgraph.matching.cmrnext.samples import Sample, SampleSettings, Scene, make_sample
+from calibgraph.matching.cmrnext.architecture import Architecture
+from calibgraph.matching.cmrnext.training.samples import Sample, SampleSettings, make_sample
+from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.pnp import frame_pose
@@ -21,24 +22,24 @@ from calibgraph.solver.pnp import frame_pose
 Array = NDArray[np.float64]
 
 MAX_SCENES = 100
-"""Images validated on, spread evenly over those held out: they are kept in memory."""
+"""Most images to validate on, evenly spread over those held out: they are kept in memory."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """How a network does on frames that it was not trained on.
+    """Errors of a network on held-out frames.
 
     Attributes:
         step: of the training.
         train_loss: mean since the last validation.
         epe_px: mean length of the flow's error, full-resolution pixels.
         median_px: its median.
-        zero_px: mean length of the flow itself: the error of a network that finds nothing.
+        zero_px: mean length of the true flow: the error of a network that predicts zero.
         pose_deg, pose_cm: median error of a single frame's pose, by PnP.
-        start_deg, start_cm: that of the perturbed start.
-        failed_share: of the frames, those without a pose.
+        start_deg, start_cm: median error of the perturbed start.
+        failed_share: share of the frames without a pose.
         systematic_rotation_rad, systematic_translation_m: error per axis that the frames of a
-            camera share; the matcher adds it to the error bar.
+            camera share; the matcher reports it, for the covariance.
     """
 
     step: int
@@ -55,17 +56,17 @@ class Validation:
     systematic_translation_m: float
 
 
-def validation_samples(
-    held_out: Sequence[Scene], settings: SampleSettings, variant: Variant, *, seed: int
+def make_validation_samples(
+    held_out: Sequence[Scene], settings: SampleSettings, architecture: Architecture, *, seed: int
 ) -> list[tuple[Scene, Sample]]:
-    """Every scene (of many, some), perturbed; the same for every call.
+    """At most ``MAX_SCENES`` perturbed scenes; the same at every call.
 
     Raises:
         DatasetError: if none shows enough points.
     """
     rng = np.random.default_rng([seed, 2**31])
     made = [
-        (scene, make_sample(scene, settings=settings, variant=variant, rng=rng))
+        (scene, make_sample(scene, settings=settings, architecture=architecture, rng=rng))
         for scene in spread_out(held_out, MAX_SCENES)
     ]
     samples = [(scene, sample) for scene, sample in made if sample is not None]
@@ -93,13 +94,13 @@ def _twist(T: Array) -> Array:
     return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
 
 
-def pose_figures(
-    samples: list[tuple[Scene, Sample]], poses: list[Array | None], settings: SampleSettings
+def summarize_poses(
+    samples: Sequence[tuple[Scene, Sample]], poses: list[Array | None], settings: SampleSettings
 ) -> dict[str, float]:
-    """The pose figures of a :class:`Validation`."""
+    """The members of a :class:`Validation` that concern poses."""
     starts = np.array([_twist(sample.E) for _, sample in samples])
     solved = [pose for pose in poses if pose is not None]
-    found = np.array(solved or [np.full(6, np.nan)])
+    errors = np.array(solved or [np.full(6, np.nan)])
     cameras: dict[str, list[Array]] = {}
     for (scene, _), pose in zip(samples, poses, strict=True):
         if pose is not None:
@@ -108,8 +109,8 @@ def pose_figures(
         [math.radians(settings.rotation_deg)] * 3 + [settings.translation_m] * 3
     ])  # fmt: skip
     return {
-        "pose_deg": float(np.degrees(np.median(np.linalg.norm(found[:, :3], axis=1)))),
-        "pose_cm": float(100 * np.median(np.linalg.norm(found[:, 3:], axis=1))),
+        "pose_deg": float(np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1)))),
+        "pose_cm": float(100 * np.median(np.linalg.norm(errors[:, 3:], axis=1))),
         "start_deg": float(np.degrees(np.median(np.linalg.norm(starts[:, :3], axis=1)))),
         "start_cm": float(100 * np.median(np.linalg.norm(starts[:, 3:], axis=1))),
         "failed_share": 1 - len(solved) / len(poses),

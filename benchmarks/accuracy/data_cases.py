@@ -1,0 +1,288 @@
+"""Recorded and simulated data that are good, or wrong in one of many ways: see ``verdicts``."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.accuracy.rig_changes import (
+    Rng,
+    compose_extrinsics,
+    derangement,
+    invert_extrinsics,
+    random_sign,
+    to_transform,
+    with_focal,
+    with_stereo,
+)
+from benchmarks.accuracy.worlds import Problem
+from calibgraph import Dataset, Frame, Rig, calibrate, load_dataset, load_rig, perturb
+
+Array = np.ndarray
+
+GUESS_DEG, GUESS_M = 2.0, 0.2
+MOTORWAY = "01"
+SEQUENCES = {
+    "tune": ("00",),
+    "count": ("05", "06", "07", "08", "06+07+08", "05+06+07+08"),
+}
+OTHER = {"00": "01", "01": "00", "05": "06", "06": "07", "07": "08", "08": "05", "06+07+08": "05"}
+"""Which sequence's images replace a sequence's own, of the same rig; else its own other half."""
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where the data are.
+
+    Attributes:
+        realdata: of the recordings, or None.
+        scenes: of simulated streets ``scene_0``, ``scene_1``, ..., or None.
+    """
+
+    realdata: Path | None
+    scenes: Path | None
+
+    def names(self, which: str) -> list[str]:
+        """The data of a set, but for the motorway: sequences, and scenes by odd or even number."""
+        names = list(SEQUENCES[which]) if self.realdata is not None else []
+        found = sorted(self.scenes.glob("scene_*")) if self.scenes is not None else []
+        odd = which == "count"
+        return names + [path.name for path in found if int(path.name.split("_")[1]) % 2 == odd]
+
+    def load(self, name: str) -> tuple[Dataset, Rig]:
+        """Data by name, and the true rig."""
+        if name.startswith("scene_"):
+            folder = _known(self.scenes, "--scenes") / name
+            return load_dataset(folder), load_rig(folder / "reference.yaml")
+        recorded = _known(self.realdata, "--realdata")
+        if (recorded / name / "reference.yaml").is_file():
+            return load_dataset(recorded / name), load_rig(recorded / name / "reference.yaml")
+        sequences = recorded / "kitti_odometry" / "sequences"
+        data = load_dataset([sequences / part for part in name.split("+")])
+        return data, data.rig
+
+    def images_for(self, name: str) -> Dataset:
+        """Data of the same rig whose images show another place."""
+        if not name.startswith("scene_"):
+            return self.load(OTHER.get(name, name))[0]
+        own = int(name.split("_")[1])
+        others = [n for which in SEQUENCES for n in self.names(which) if n.startswith("scene_")]
+        same_set = [n for n in others if n != name and (int(n.split("_")[1]) - own) % 2 == 0]
+        return self.load(same_set[0] if same_set else name)[0]
+
+
+def _known(folder: Path | None, option: str) -> Path:
+    if folder is None:
+        raise ValueError(f"this case needs {option}")
+    return folder
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Good data, for a case to spoil.
+
+    Attributes:
+        name: of the data.
+        data: the frames.
+        truth: the true rig.
+        folders: where other data are.
+        scratch: an empty folder, removed after the case.
+        seed: of the guess.
+    """
+
+    name: str
+    data: Dataset
+    truth: Rig
+    folders: Folders
+    scratch: Path
+    seed: int
+
+    def guess(self, deg: float = GUESS_DEG, m: float = GUESS_M) -> Rig:
+        """The truth, displaced."""
+        return perturb(self.truth, rotation_deg=deg, translation_m=m, seed=self.seed)
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two cameras that look ahead."""
+        first, second = list(self.truth.cameras)[:2]
+        return first, second
+
+
+Case = tuple[Dataset, Rig, dict[str, Any]]
+"""The data, the rig with its guess, and what was drawn for this kind of case."""
+
+
+def with_images(data: Dataset, paths: Callable[[int, Frame], dict[str, Path]]) -> Dataset:
+    """The data with other images."""
+    frames = (replace(f, image_paths=paths(i, f)) for i, f in enumerate(data.frames))
+    return replace(data, frames=tuple(frames))
+
+
+def with_clouds(scene: Scene, change: Callable[[Array], Array]) -> Dataset:
+    """The data with changed clouds, in the scratch folder."""
+    frames = []
+    for frame in scene.data.frames:
+        path = scene.scratch / f"{frame.index:06d}.npy"
+        np.save(path, change(frame.load_cloud()).astype(np.float32))
+        frames.append(replace(frame, cloud_path=path))
+    return replace(scene.data, frames=tuple(frames))
+
+
+def good(scene: Scene, rng: Rng) -> Case:
+    """Nothing is wrong."""
+    return scene.data, scene.guess(), {}
+
+
+def few_frames(scene: Scene, rng: Rng) -> Case:
+    """Two to four frames of one place."""
+    count = min(int(rng.integers(2, 5)), len(scene.data.frames))
+    start = int(rng.integers(len(scene.data.frames) - count + 1))
+    return scene.data.select(f"{start}:{start + count}"), scene.guess(), {"few": count}
+
+
+def far(scene: Scene, rng: Rng) -> Case:
+    """The guess is beyond the matcher's range."""
+    deg, m = rng.uniform(6, 20), rng.uniform(0.5, 1.5)
+    return scene.data, scene.guess(deg, m), {"guess_deg": deg, "guess_m": m}
+
+
+def far_turned(scene: Scene, rng: Rng) -> Case:
+    """All guesses are beyond the matcher's range by one displacement, that of the LiDAR."""
+    deg, m = rng.uniform(6, 20), rng.uniform(0.5, 1.5)
+    axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    step = to_transform(deg * axis, m * way)
+    return scene.data, compose_extrinsics(scene.guess(), step), {"guess_deg": deg, "guess_m": m}
+
+
+def swapped(scene: Scene, rng: Rng, known: bool) -> Case:
+    """Two cameras' images are swapped; their relative pose may be known."""
+    a, b = scene.pair
+    swap = {a: b, b: a}
+
+    def paths(index: int, frame: Frame) -> dict[str, Path]:
+        return {name: frame.image_paths[swap.get(name, name)] for name in frame.image_paths}
+
+    guess = scene.guess()
+    guess = with_stereo(guess, scene.truth, a, b) if known else guess
+    return with_images(scene.data, paths), guess, {}
+
+
+def shuffled(scene: Scene, rng: Rng) -> Case:
+    """Images are of other frames than the clouds."""
+    frames = scene.data.frames
+    order = derangement(len(frames), rng)
+    return (
+        with_images(scene.data, lambda i, frame: frames[order[i]].image_paths),
+        scene.guess(),
+        {"order": order.tolist()},
+    )
+
+
+def shifted(scene: Scene, rng: Rng) -> Case:
+    """Images are of the next frame of the same sequence."""
+    frames = scene.data.frames
+    pairs = [
+        replace(frame, image_paths=after.image_paths)
+        for frame, after in zip(frames[:-1], frames[1:], strict=True)
+        if frame.cloud_path.parent == after.cloud_path.parent
+    ]
+    return replace(scene.data, frames=tuple(pairs)), scene.guess(), {}
+
+
+def focal(scene: Scene, rng: Rng, share: float) -> Case:
+    """The rig's focal lengths are wrong."""
+    factor = 1 + random_sign(rng) * share
+    return scene.data, with_focal(scene.guess(), factor), {"factor": factor}
+
+
+def mirrored(scene: Scene, rng: Rng) -> Case:
+    """The clouds are mirrored: y is -y."""
+    return with_clouds(scene, lambda cloud: cloud * [1, -1, 1, 1]), scene.guess(), {}
+
+
+def wrong_units(scene: Scene, rng: Rng) -> Case:
+    """The clouds are in millimetres."""
+    return with_clouds(scene, lambda cloud: cloud * [1000, 1000, 1000, 1]), scene.guess(), {}
+
+
+def other(scene: Scene, rng: Rng) -> Case:
+    """The images are of another place."""
+    images = scene.folders.images_for(scene.name).frames
+    start = len(images) // 2  # also of its own images, if there is no other place
+
+    def paths(index: int, frame: Frame) -> dict[str, Path]:
+        return images[(index + start) % len(images)].image_paths
+
+    return with_images(scene.data, paths), scene.guess(), {}
+
+
+def covered(scene: Scene, rng: Rng, blurred: bool) -> Case:
+    """One camera's images are black, or blurred beyond use."""
+    name = str(rng.choice(list(scene.truth.cameras)))
+
+    def paths(index: int, frame: Frame) -> dict[str, Path]:
+        image = frame.load_image(name, scene.truth.cameras[name])
+        changed = cv2.GaussianBlur(image, (0, 0), 40) if blurred else np.zeros_like(image)
+        path = scene.scratch / f"{index:06d}.png"
+        cv2.imwrite(str(path), changed)
+        return {**frame.image_paths, name: path}
+
+    return with_images(scene.data, paths), scene.guess(), {"covered": name}
+
+
+def inverted_guess(scene: Scene, rng: Rng) -> Case:
+    """The guess is T_lidar_camera."""
+    return scene.data, invert_extrinsics(scene.guess()), {}
+
+
+KINDS: dict[str, Callable[[Scene, Rng], Case]] = {
+    "good": good,
+    "motorway": good,
+    "few_frames": few_frames,
+    "far": far,
+    "far_turned": far_turned,
+    "swapped": partial(swapped, known=True),
+    "swapped_unknown": partial(swapped, known=False),
+    "shuffled": shuffled,
+    "shifted": shifted,
+    "focal_5": partial(focal, share=0.05),
+    "focal_3": partial(focal, share=0.03),
+    "mirrored": mirrored,
+    "other": other,
+    "covered": partial(covered, blurred=False),
+    "blurred": partial(covered, blurred=True),
+    "wrong_units": wrong_units,
+    "inverted": inverted_guess,
+}
+
+
+def data_for(kind: str, names: list[str], seed: int) -> str | None:
+    """The name of a case's data, or None if there is none."""
+    if kind == "motorway":
+        return MOTORWAY
+    return names[seed % len(names)] if names else None
+
+
+def data_problem(kind: str, name: str, seed: int, folders: Folders, scratch: Path) -> Problem:
+    """One case.
+
+    Args:
+        kind: one of KINDS.
+        name: of the data.
+        seed: of all that is drawn.
+        folders: where the data are.
+        scratch: an empty folder, to be removed after the case has run.
+    """
+    rng = np.random.default_rng([seed, zlib.crc32(kind.encode())])
+    data, truth = folders.load(name)
+    scene = Scene(name, data, truth, folders, scratch, int(rng.integers(2**31)))
+    spoilt, guess, drawn = KINDS[kind](scene, rng)
+    drawn = {"frames": len(spoilt.frames), **drawn}
+    return Problem(truth=truth, calibrate=lambda: calibrate(spoilt, guess), drawn=drawn)

@@ -1,0 +1,202 @@
+"""The matcher `structure` from far guesses: success, errors, verdicts and time.
+
+    python -m benchmarks.accuracy.search --data 00,00+01 --within 20/1.5,2/0.2
+    python -m benchmarks.accuracy.search --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
+    python -m benchmarks.accuracy.search --summary out/search.jsonl
+
+Guesses are drawn uniformly per axis, independently per camera. A run is a success if every camera
+ends within 0.5 deg and 15 cm of the reference. A wrong PASS or WARN is a camera farther off than
+that with this verdict.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.data_cases import Folders, Scene, with_clouds, with_images
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.tables import ROOT, Table, add_record_option
+from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
+
+SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
+BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
+
+
+def main() -> None:
+    """Run cases, print the table."""
+    arguments = parse_options()
+    cases = [
+        Key(within, kind, data, seed)
+        for seed in range(arguments.first, arguments.first + arguments.starts)
+        for within in arguments.within
+        for kind in arguments.kinds
+        for data in arguments.data
+    ]
+    work = partial(run_case, folders=Folders(arguments.realdata, None))
+    records = ledger.records_of(arguments, cases, work)
+    ledger.publish_cases("accuracy.search", [report(records)], records, record=arguments.record)
+    for record in records:
+        print(record.get("crash", ""), end="")
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
+    parser.add_argument("--data", type=words, default=["00", "00+01", "05", "05+06+07+08"])
+    parser.add_argument("--within", type=words, default=["20/1.5", "10/0.5", "5/0.3", "2/0.2"])
+    parser.add_argument("--kinds", type=words, default=["good"], help=", ".join(KINDS))
+    parser.add_argument("--starts", type=int, default=20, help="draws per case")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    parser.add_argument("--jobs", type=int, default=1, help="1 to measure time")
+    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "search.jsonl")
+    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
+    add_record_option(parser)
+    return parser.parse_args()
+
+
+def run_case(case: Key, folders: Folders) -> Record:
+    """Calibrate from one guess."""
+    cv2.setNumThreads(2)
+    data, truth = folders.load(case.data)
+    degrees, metres = (float(number) for number in case.level.split("/"))
+    guess = perturb(truth, rotation_deg=degrees, translation_m=metres, seed=case.seed, uniform=True)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Scene(case.data, data, truth, folders, Path(folder), case.seed)
+        result = calibrate(KINDS[case.kind](scene), guess)
+    pairs = evaluate(result.rig, truth).pairs
+    return {
+        **ledger.to_record(result, truth),
+        "rig": result.verdict.status,
+        "pairs": {
+            name: [pair.rotation_error_deg, pair.translation_error_cm]
+            for name, pair in pairs.items()
+        },
+        "stages_s": {stage: round(seconds, 2) for stage, seconds in result.timings_s.items()},
+    }
+
+
+def _good(scene: Scene) -> Dataset:
+    return scene.data
+
+
+def _no_intensity(scene: Scene) -> Dataset:
+    return with_clouds(scene, lambda cloud: cloud[:, :3])
+
+
+def _half_beams(scene: Scene) -> Dataset:
+    """Every other band of elevation as wide as the spacing of the beams."""
+
+    def every_other(cloud: Any) -> Any:
+        elevation = np.degrees(np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1])))
+        return cloud[np.floor(elevation / BEAM_DEG) % 2 == 0]
+
+    return with_clouds(scene, every_other)
+
+
+def _changed(
+    scene: Scene, change: Callable[[Any], Any], chosen: Callable[[str], bool] = bool
+) -> Dataset:
+    """The images of the chosen cameras, changed."""
+
+    def paths(index: int, frame: Frame) -> dict[str, Path]:
+        found = dict(frame.image_paths)
+        for name in filter(chosen, frame.image_paths):
+            camera: Camera = scene.truth.cameras[name]
+            found[name] = scene.scratch / f"{name}_{frame.index:06d}.png"
+            cv2.imwrite(str(found[name]), change(frame.load_image(name, camera)))
+        return found
+
+    return with_images(scene.data, paths)
+
+
+def _dark(image: Any) -> Any:
+    return (image * 0.15).astype(np.uint8)
+
+
+def _over_exposed(image: Any) -> Any:
+    """So bright that 10 % more of the image is white."""
+    level = np.quantile(image[image < 255], 0.9)  # noqa: PLR2004
+    return np.clip(image * (255.0 / level), 0, 255).astype(np.uint8)
+
+
+KINDS: dict[str, Callable[[Scene], Dataset]] = {
+    "good": _good,
+    "no_intensity": _no_intensity,
+    "half_beams": _half_beams,
+    "dark": partial(_changed, change=_dark),
+    "blurred": partial(_changed, change=lambda image: cv2.GaussianBlur(image, (0, 0), 2.0)),
+    "over_exposed": partial(_changed, change=_over_exposed),
+    "covered": partial(
+        _changed, change=np.zeros_like, chosen=lambda name: name in ("image_3", "CAMERA_09")
+    ),
+}
+
+
+COLUMNS = (
+    "within [deg/m]", "kind", "data", "runs", "successes", "median [deg]", "[cm]",
+    "of each camera [deg, cm]", "pairs [deg]", "[cm]", "wrong PASS", "wrong WARN", "PASS", "WARN",
+    "FAIL", "refused", "time, median [s]", "longest [s]",
+)  # fmt: skip
+
+
+def report(records: list[Record]) -> Table:
+    """A row per range, kind and data."""
+    groups: dict[tuple[str, str, str], list[Record]] = {}
+    for record in records:
+        groups.setdefault((record["level"], record["kind"], record["data"]), []).append(record)
+    rows = [cells(name, groups[name]) for name in sorted(groups, key=_order)]
+    return Table("Recorded KITTI frames, guesses of any size", COLUMNS, tuple(rows))
+
+
+def _order(row: tuple[str, str, str]) -> tuple[float, str, str]:
+    return -float(row[0].split("/")[0]), row[1], row[2]
+
+
+def cells(name: tuple[str, str, str], records: list[Record]) -> tuple[str, ...]:
+    """The row of a range, kind and data."""
+    done = [r for r in records if "cameras" in r]
+    cameras = [camera for r in done for camera in r["cameras"].values()]
+    wrong = [c["status"] for c in cameras if not _is_right(c)]
+    successes = sum(all(_is_right(c) for c in r["cameras"].values()) for r in done)
+    pairs = np.median([p for r in done for p in r["pairs"].values()] or [[np.nan] * 2], axis=0)
+    statuses = [r["rig"] for r in done]
+    seconds = [r["seconds"] for r in records]
+    degrees, centimetres = _median_errors(cameras)
+    names = list(done[0]["cameras"]) if done else []
+    each = (_median_errors([r["cameras"][one] for r in done]) for one in names)
+    return (
+        *name, str(len(records)), str(successes), f"{degrees:.3f}", f"{centimetres:.2f}",
+        "; ".join(f"{deg:.3f}, {cm:.2f}" for deg, cm in each), f"{pairs[0]:.3f}",
+        f"{pairs[1]:.2f}", *(str(wrong.count(status)) for status in ("PASS", "WARN")),
+        *(str(statuses.count(status)) for status in ("PASS", "WARN", "FAIL")),
+        str(len(records) - len(done)), f"{np.median(seconds):.1f}", f"{max(seconds):.1f}",
+    )  # fmt: skip
+
+
+def _is_right(camera: Record) -> bool:
+    return camera["error_deg"] < SUCCESS_DEG and camera["error_cm"] < SUCCESS_CM
+
+
+def _median_errors(cameras: list[Record]) -> tuple[float, float]:
+    """Rotation [deg] and translation [cm]; NaN of no cameras."""
+    if not cameras:
+        return np.nan, np.nan
+    degrees, centimetres = np.median([[c["error_deg"], c["error_cm"]] for c in cameras], axis=0)
+    return float(degrees), float(centimetres)
+
+
+if __name__ == "__main__":
+    main()

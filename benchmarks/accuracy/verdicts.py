@@ -1,0 +1,232 @@
+r"""False PASS and false FAIL: cases that are wrong in many ways, and good ones.
+
+    python -m benchmarks.accuracy.verdicts --set tune --tables 20 --data 8 --out out/tune.jsonl
+    python -m benchmarks.accuracy.verdicts --summary out/tune.jsonl
+
+Thresholds are chosen on the set ``tune``; what is published is counted on ``count``, which shares
+neither recordings (but for the motorway), scenes nor seeds with it. ``--tables`` and ``--data`` are
+the cases per kind, of simulated correspondences and of images and clouds: from there on
+(``--first``) they go through the rigs, and through the set's sequences and scenes, in turn. A
+stopped run continues with the same command. Scenes are simulated beforehand, 20 s each:
+
+    for i in 0 1 2 3 4 5; do
+        calibgraph simulate street --rig sample --beams 32 --frames 8 --step-m 5 \
+            --seed $((100 + i)) --out out/scenes/scene_$i; done
+
+A result is off beyond 0.5 deg or 10 cm, and right within 0.15 deg and 4 cm, of ``evaluate``'s E_R
+and E_t of that camera. Refusals (too few correspondences, say) have no error: they are a column of
+their own, never a PASS, and a false alarm if nothing was wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+from benchmarks.accuracy import data_cases, ledger, table_cases
+from benchmarks.accuracy.data_cases import Folders, data_for, data_problem
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.table_cases import UNDETECTABLE, rig_for, table_problem
+from benchmarks.tables import ROOT, Table, add_record_option
+
+SCENES = ROOT / "out" / "scenes"
+OFF_DEG, OFF_CM = 0.5, 10.0
+RIGHT_DEG, RIGHT_CM = 0.15, 4.0
+FIRST_SEED = {"tune": 0, "count": 1000}
+STATUSES = ("PASS", "WARN", "FAIL")
+CLASSES = ("off", "between", "right")
+GOOD_KINDS = ("good",)
+
+
+def main() -> None:
+    """Run cases, print the summary."""
+    options = parse_options()
+    if options.summary is not None:
+        records = [record for path in options.summary for record in ledger.read(path)]
+    else:
+        folders = Folders(
+            options.realdata if options.realdata.is_dir() else None,
+            options.scenes if options.scenes.is_dir() else None,
+        )
+        cases = [
+            case
+            for case in cases_of(options, folders)
+            if options.kinds is None or case.kind in options.kinds
+        ]
+        work = partial(run_case, folders=folders)
+        records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
+    counted = [record for record in records if record["kind"] not in options.uncounted]
+    tables = [summary(records, counted), figures(counted)]
+    ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
+    print("\n".join(remarks(records, counted)))
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    known = sorted({*table_cases.KINDS, *data_cases.KINDS})
+    parser.add_argument("--set", choices=FIRST_SEED, default="tune")
+    parser.add_argument("--tables", type=int, default=0, help="cases per kind of table")
+    parser.add_argument("--data", type=int, default=0, help="cases per kind of images and clouds")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case of a kind")
+    parser.add_argument("--kinds", type=_names, help=", ".join(known))
+    parser.add_argument(
+        "--uncounted", type=_names, default=UNDETECTABLE, help="left out of the sums"
+    )
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
+    parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "verdicts.jsonl")
+    parser.add_argument("--summary", type=Path, nargs="+", help="summarise files, run nothing")
+    add_record_option(parser)
+    arguments = parser.parse_args()
+    unknown = {*(arguments.kinds or ())} - {*known}
+    if unknown:
+        parser.error(f"unknown kinds {', '.join(sorted(unknown))}; known: {', '.join(known)}")
+    return arguments
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
+
+
+def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
+    """The cases of a set: number by number, so that a stopped run has some of every kind."""
+    first = FIRST_SEED[arguments.set] + arguments.first
+    names = folders.names(arguments.set)
+    for seed in range(first, first + max(arguments.tables, arguments.data)):
+        if seed < first + arguments.tables:
+            for kind in table_cases.KINDS:
+                yield Key("table", kind, rig_for(kind, seed), seed)
+        if seed < first + arguments.data:
+            for kind in data_cases.KINDS:
+                name = data_for(kind, names, seed)
+                missing = name is None or (name == data_cases.MOTORWAY and not folders.realdata)
+                if not missing:
+                    yield Key("data", kind, name, seed)
+
+
+def run_case(case: Key, folders: Folders) -> Record:
+    """Make one case, run calibgraph on it, and compare."""
+    with tempfile.TemporaryDirectory() as scratch:
+        if case.level == "table":
+            problem = table_problem(case.kind, case.data, case.seed)
+        else:
+            problem = data_problem(case.kind, case.data, case.seed, folders, Path(scratch))
+        return {"drawn": problem.drawn, **ledger.to_record(problem.calibrate(), problem.truth)}
+
+
+def class_of(camera: Record) -> str:
+    """How wrong one camera's result is."""
+    if not (camera["error_deg"] <= OFF_DEG and camera["error_cm"] <= OFF_CM):
+        return "off"  # also NaN
+    if camera["error_deg"] <= RIGHT_DEG and camera["error_cm"] <= RIGHT_CM:
+        return "right"
+    return "between"
+
+
+def cameras_of(records: Iterable[Record]) -> Iterator[tuple[str, str]]:
+    """Class and status of every result."""
+    for record in records:
+        for camera in record.get("cameras", {}).values():
+            yield class_of(camera), camera["status"]
+
+
+COLUMNS = (
+    "", "cases", "refused", "results",
+    *(f"{which}: {status}" for which in CLASSES for status in STATUSES),
+)  # fmt: skip
+
+
+def summary(records: list[Record], counted: list[Record]) -> Table:
+    """A row per kind, and the sums of those that count."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in sorted(records, key=_order):
+        groups.setdefault((record["level"], record["kind"]), []).append(record)
+    rows = [cells(f"{level} {kind}", group) for (level, kind), group in groups.items()]
+    left_out = sorted({r["kind"] for r in records} - {r["kind"] for r in counted})
+    total = "all" + (f", without {', '.join(left_out)}" if left_out else "")
+    return Table("Verdicts of results by their error", COLUMNS, (*rows, cells(total, counted)))
+
+
+def cells(name: str, group: list[Record]) -> tuple[str, ...]:
+    """The row of one kind."""
+    found = Counter(cameras_of(group))
+    refused = sum("refusal" in record for record in group)
+    counts = (found[which, status] for which in CLASSES for status in STATUSES)
+    return name, *map(str, (len(group), refused, found.total(), *counts))
+
+
+def _order(record: Record) -> tuple[str, int]:
+    kinds = [*(table_cases if record["level"] == "table" else data_cases).KINDS]
+    return record["level"], kinds.index(record["kind"])
+
+
+def figures(counted: list[Record]) -> Table:
+    """The share of PASS among results that are off, and of FAIL among those that are right."""
+    found = Counter(cameras_of(counted))
+    off, right = (sum(found[which, s] for s in STATUSES) for which in ("off", "right"))
+    wrong_cases = [r for r in counted if any(which == "off" for which, _ in cameras_of([r]))]
+    refused_good = sum("refusal" in r for r in counted if r["kind"] in GOOD_KINDS)
+    calm = found["right", "PASS"] + found["right", "WARN"]
+    off_by = f"off by more than {OFF_DEG} deg or {OFF_CM:g} cm"
+    return Table(
+        "Wrong verdicts",
+        ("", "share"),
+        (
+            (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
+            (f"PASS, of cases with a result {off_by}",
+             share(len(_passed(counted)), len(wrong_cases))),
+            (f"PASS or WARN, of results within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases "
+             "that were refused", share(calm, right + refused_good)),
+        ),
+    )  # fmt: skip
+
+
+def remarks(records: list[Record], counted: list[Record]) -> list[str]:
+    """Cases that PASS although off, reasons of refusals, and crashes."""
+    refusals = Counter(
+        (r["level"], r["kind"], _masked(r["refusal"])) for r in records if "refusal" in r
+    )
+    crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
+    return [
+        *(f"PASS but off: {_line(record)}" for record in _passed(counted)),
+        *(f"refused, {n}: {' '.join(what)}" for what, n in refusals.items()),
+        *(f"CRASHED, {n}: {what}" for what, n in crashes.items()),
+    ]
+
+
+def _passed(counted: list[Record]) -> list[Record]:
+    """Cases with a camera that PASSes although off."""
+    return [r for r in counted if ("off", "PASS") in {*cameras_of([r])}]
+
+
+def _masked(text: str) -> str:
+    """A message without its numbers, so that equal ones can be counted, and not too long."""
+    return re.sub(r"[0-9.]+", "#", text)[:120]
+
+
+def _line(record: Record) -> str:
+    wrong = {
+        name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
+        for name, camera in record["cameras"].items()
+        if class_of(camera) == "off" and camera["status"] == "PASS"
+    }
+    key = ledger.key_of(record)
+    return f"{key.level} {key.kind} {key.data} {key.seed}: {wrong}"
+
+
+def share(part: int, whole: int) -> str:
+    """A part with its share."""
+    return f"{part} of {whole}" + (f" ({part / whole:.1%})" if whole else "")
+
+
+if __name__ == "__main__":
+    main()

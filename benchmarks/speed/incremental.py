@@ -1,0 +1,137 @@
+"""Time and memory of an update, against plain iSAM2 and against solving the batch again.
+
+    python -m benchmarks.speed.incremental [--frames 20000]
+
+2 cameras, 500 correspondences each, 10 % outliers, all in one run. Plain iSAM2 has a block factor
+per camera and frame and keeps them all; it does one pass per frame, ours does two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from benchmarks.accuracy.drives import camera
+from benchmarks.tables import Table, add_record_option, publish
+from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.simulation.correspondences import simulate_drive
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.factor_graph import pose_key, prior_graph, to_values
+from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
+from factors import block_factor
+
+RIG = Rig(
+    cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)},
+)
+GUESS = perturb(RIG, rotation_deg=1.0, translation_m=0.1, seed=0)
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
+POOL = 400
+EARLY, SAMPLE = 100, 100  # medians are of so many updates, around this frame and at the end
+PLAIN_AT = (100, 500, 2000)
+
+
+def frames(count: int) -> Iterator[Correspondences]:
+    """A drive that repeats a pool of different frames."""
+    pool = list(simulate_drive(lambda frame: RIG, frames=POOL, matches=500, errors=ERRORS))
+    for number in range(count):
+        table = pool[number % POOL]
+        yield replace(table, frame=np.full(len(table), number))
+
+
+def resident_mb() -> float:
+    """Resident memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def measure_ours(count: int) -> tuple[dict[int, float], Table]:
+    """Median seconds of the updates around some frames, by their number; and over the run."""
+    tracker = IncrementalCalibrator(GUESS)
+    seconds, memory = [], {}
+    for number, table in enumerate(frames(count)):
+        start = time.perf_counter()
+        tracker.update(table)
+        seconds.append(time.perf_counter() - start)
+        if number + 1 in (1000, count) or (number + 1) % 5000 == 0:
+            memory[number + 1] = resident_mb()
+    early = float(np.median(seconds[EARLY - SAMPLE // 2 : EARLY + SAMPLE // 2]))
+    late = float(np.median(seconds[-SAMPLE:]))
+    rows = [
+        (f"median at frame {EARLY} [ms]", f"{1e3 * early:.2f}"),
+        (f"median at frame {count} [ms]", f"{1e3 * late:.2f}"),
+        ("ratio of the medians", f"{late / early:.2f}"),
+        ("mean rate [1/s]", f"{1 / np.mean(seconds):.0f}"),
+        ("99 % quantile [ms]", f"{1e3 * np.quantile(seconds, 0.99):.1f}"),
+        ("longest [ms]", f"{1e3 * max(seconds):.0f}"),
+        *((f"resident memory at frame {at} [MB]", f"{mb:.1f}") for at, mb in memory.items()),
+    ]
+    at = {n: float(np.median(seconds[n - 50 : n + 50])) for n in PLAIN_AT if n + 50 <= count}
+    return at, Table("Updates", ("", "value"), tuple(rows))
+
+
+def measure_plain_isam2(count: int) -> dict[int, float]:
+    """Median seconds of an update before some frames, with every frame kept."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(1e-7)
+    parameters.relinearizeSkip = 1
+    isam = gtsam.ISAM2(parameters)
+    names = list(RIG.cameras)
+    isam.update(
+        prior_graph(names, RIG.T_camera_lidar, weight=1.0), to_values(names, RIG.T_camera_lidar)
+    )
+    seconds = []
+    for table in frames(count):
+        matches = camera_blocks(RIG, table, Config())
+        start = time.perf_counter()
+        graph = gtsam.NonlinearFactorGraph()
+        for name, m in matches.items():
+            graph.add(
+                block_factor(pose_key(names, name), replace(m.block, scale=CAUCHY_SCALE_SIGMAS))
+            )
+        isam.update(graph, gtsam.Values())
+        isam.calculateBestEstimate()
+        seconds.append(time.perf_counter() - start)
+    return {n: float(np.median(seconds[n - 10 : n])) for n in PLAIN_AT if n <= count}
+
+
+def measure_batch(count: int) -> float:
+    """Seconds of a batch solve over so many frames."""
+    table = concatenate(list(frames(count)))
+    solve(GUESS, table)
+    start = time.perf_counter()
+    solve(GUESS, table)
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=20_000, help="at least 150")
+    add_record_option(parser)
+    options = parser.parse_args()
+    ours, updates = measure_ours(options.frames)
+    plain = measure_plain_isam2(min(options.frames, PLAIN_AT[-1]))
+    rows = []
+    for number, seconds in ours.items():
+        again = measure_batch(number) if number < PLAIN_AT[-1] else np.nan
+        numbers = [1e3 * seconds, 1e3 * plain[number], plain[number] / seconds]
+        batch = ["", ""] if np.isnan(again) else [f"{1e3 * again:.0f}", f"{again / seconds:.0f}"]
+        rows.append((str(number), *(f"{value:.2f}" for value in numbers), *batch))
+    columns = ("frame", "ours [ms]", "plain iSAM2 [ms]", "ratio", "batch again [ms]", "ratio")
+    comparison = Table("An update, beside other ways", columns, tuple(rows))
+    publish("speed.incremental", [updates, comparison], record=options.record)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""Option values to library objects: the dataset, the matcher and the settings of a command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calibgraph.io.dataset import Dataset
+    from calibgraph.matching.protocol import Matcher
+    from calibgraph.model.config import Config, Terms
+
+_SEARCH_OPTIONS = ("search_deg", "search_m")
+
+
+@contextmanager
+def checked_arguments() -> Iterator[None]:
+    """Turn the library's ``ValueError`` for a wrong argument into a one-line error."""
+    from calibgraph.errors import CalibrationError
+
+    try:
+        yield
+    except ValueError as error:
+        raise CalibrationError(str(error)) from error
+
+
+def dataset_from(folders: list[Path], rig: Path | None, frames: str | None) -> Dataset:
+    """The dataset in these folders.
+
+    Args:
+        folders: of one rig.
+        rig: file of the initial guess; the dataset's own if None.
+        frames: positions, ``A:B:STEP``; all if None.
+    """
+    from calibgraph.io.dataset import load_dataset
+    from calibgraph.io.rigs import load_rig
+
+    data = load_dataset(folders, load_rig(rig) if rig else None)
+    with checked_arguments():
+        return data.select(frames) if frames is not None else data
+
+
+def matcher_from(
+    name: str,
+    weights: list[Path] | None,
+    *,
+    seed: int,
+    all_frames: bool = False,
+    **options: Any,
+) -> Matcher:
+    """The matcher of that name, or a table of correspondences.
+
+    Args:
+        name: ``structure``, ``cmrnext`` or a file.
+        weights: of cmrnext.
+        seed: of everything random.
+        all_frames: match all frames, as when the user has selected them.
+        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
+
+    Raises:
+        ValueError: if an option is for another matcher.
+    """
+    given = {key: value for key, value in options.items() if value is not None}
+    search = {key: _parse_range(key, given.pop(key)) for key in _SEARCH_OPTIONS if key in given}
+    if search and name != "structure":
+        raise ValueError(f"{_flag(next(iter(search)))} is for --matcher structure only")
+    if name == "cmrnext" and weights:
+        from calibgraph.matching.cmrnext import CmrNextMatcher
+
+        return CmrNextMatcher(weights, seed=seed, **given)
+    _refuse_cmrnext_options(weights, given)
+    if name == "structure":
+        return _structure_matcher(search, seed=seed, all_frames=all_frames)
+    from calibgraph.matching.named import find_matcher
+
+    return find_matcher(name, seed=seed)
+
+
+def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
+    """Raise if an option of cmrnext was given; ``device`` has a default, so always is."""
+    for option in (*(["weights"] if weights else []), *(given.keys() - {"device"})):
+        raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
+
+
+def _structure_matcher(search: dict[str, float | None], *, seed: int, all_frames: bool) -> Matcher:
+    from calibgraph.matching.structure import StructureMatcher
+
+    if len(search) == len(_SEARCH_OPTIONS) and len({n is None for n in search.values()}) > 1:
+        raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
+    settings: dict[str, Any] = dict(search)
+    if None in search.values():
+        settings = dict.fromkeys(_SEARCH_OPTIONS)
+    if all_frames:
+        settings["most_frames"] = None
+    return StructureMatcher(seed=seed, **settings)
+
+
+def _parse_range(name: str, text: str) -> float | None:
+    """The number in an option's text, None for ``none``."""
+    if text == "none":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{_flag(name)} {text}: give a number, or none") from None
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def config_from(
+    config: Path | None, preset_name: str | None, seed: int | None, bootstrap: int | None = None
+) -> Config:
+    """The settings of a file or of a preset; ``--seed`` and ``--bootstrap`` replace theirs.
+
+    Raises:
+        ValueError: if both a file and a preset are given.
+    """
+    from calibgraph.model.config import load_config, preset
+
+    if config is not None and preset_name is not None:
+        raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
+    settings = load_config(config) if config is not None else preset(preset_name or "auto")
+    given = {"seed": seed, "bootstrap": bootstrap}
+    return settings.changed(**{k: v for k, v in given.items() if v is not None})
+
+
+def terms_from(name: str) -> Terms:
+    """The terms of the objective of that name.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    from calibgraph.model.config import TERMS
+
+    for terms in TERMS:
+        if name == terms:
+            return terms
+    raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")

@@ -1,0 +1,244 @@
+"""The commands that make a calibration: calibrate, match, solve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibgraph.cli.arguments import (
+    checked_arguments,
+    config_from,
+    dataset_from,
+    matcher_from,
+    terms_from,
+)
+from calibgraph.cli.options import (
+    BatchOption,
+    BootstrapOption,
+    ConfigOption,
+    ConfigSeedOption,
+    DatasetArgument,
+    DeviceOption,
+    EstimateOption,
+    FramesOption,
+    HalfOption,
+    IterationsOption,
+    JsonOption,
+    MatcherOption,
+    OcclusionOption,
+    OutOption,
+    PresetOption,
+    RigArgument,
+    RigOption,
+    SearchDegOption,
+    SearchMetresOption,
+    SeedOption,
+    TermsOption,
+    TimeLimitOption,
+    WeightsOption,
+)
+from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+
+if TYPE_CHECKING:
+    from calibgraph.io.dataset import Dataset
+    from calibgraph.model.calibration import Calibration
+    from calibgraph.model.correspondences import Correspondences
+
+
+def calibrate(
+    dataset: DatasetArgument,
+    rig: RigOption = None,
+    matcher: MatcherOption = "structure",
+    frames: FramesOption = None,
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    terms: TermsOption = "full",
+    out: OutOption = Path("calibration"),
+    seed: ConfigSeedOption = None,
+    bootstrap: BootstrapOption = None,
+    time_limit_s: TimeLimitOption = None,
+    as_json: JsonOption = False,
+    search_deg: SearchDegOption = None,
+    search_m: SearchMetresOption = None,
+    weights: WeightsOption = None,
+    estimate: EstimateOption = None,
+    device: DeviceOption = "auto",
+    iterations: IterationsOption = None,
+    half_resolution: HalfOption = None,
+    occlusion_filter: OcclusionOption = None,
+    batch: BatchOption = None,
+) -> None:
+    """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
+    from calibgraph.files import require_place_for_folder
+    from calibgraph.pipeline import calibrate
+
+    require_place_for_folder(out)
+    with checked_arguments():
+        settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
+        chosen = matcher_from(
+            matcher,
+            weights,
+            seed=settings.seed,
+            search_deg=search_deg,
+            search_m=search_m,
+            all_frames=frames is not None,
+            device=device,
+            estimate=estimate,
+            iterations=iterations,
+            half_resolution=half_resolution,
+            occlusion_filter=occlusion_filter,
+            batch=batch,
+        )
+    data = dataset_from(dataset, rig, frames)
+    with progress_bar() as progress:
+        result = calibrate(
+            data,
+            matcher=chosen,
+            config=settings,
+            terms=checked_terms,
+            time_limit_s=time_limit_s,
+            progress=progress,
+        )
+        written = _write_result(result, data, out)
+    _print_frames_used(len(result.frames), data)
+    _print_and_exit(result, written, as_json=as_json)
+
+
+def match(
+    dataset: DatasetArgument,
+    rig: RigOption = None,
+    matcher: MatcherOption = "structure",
+    frames: FramesOption = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
+    ] = Path("correspondences.parquet"),
+    seed: SeedOption = 0,
+    time_limit_s: TimeLimitOption = None,
+    as_json: JsonOption = False,
+    search_deg: SearchDegOption = None,
+    search_m: SearchMetresOption = None,
+    weights: WeightsOption = None,
+    estimate: EstimateOption = None,
+    device: DeviceOption = "auto",
+    iterations: IterationsOption = None,
+    half_resolution: HalfOption = None,
+    occlusion_filter: OcclusionOption = None,
+    batch: BatchOption = None,
+) -> None:
+    """Find correspondences and write them as a table; exit 1 if a camera was not found."""
+    from calibgraph.files import require_place_for_file
+    from calibgraph.rounds import match_in_rounds
+
+    require_place_for_file(out)
+    with checked_arguments():
+        if out.suffix not in (".parquet", ".csv"):
+            raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
+        chosen = matcher_from(
+            matcher,
+            weights,
+            seed=seed,
+            search_deg=search_deg,
+            search_m=search_m,
+            all_frames=frames is not None,
+            device=device,
+            estimate=estimate,
+            iterations=iterations,
+            half_resolution=half_resolution,
+            occlusion_filter=occlusion_filter,
+            batch=batch,
+        )
+    data = dataset_from(dataset, rig, frames)
+    with progress_bar() as progress:
+        run = match_in_rounds(data, matcher=chosen, time_limit_s=time_limit_s, progress=progress)
+    run.correspondences.save(out)
+    _print_frames_used(len(run.dataset.frames), data)
+    _print_table_and_exit(run.correspondences, out, as_json=as_json)
+
+
+def solve(
+    rig: RigArgument,
+    correspondences: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CORRESPONDENCES",
+            help="Table, .parquet or .csv; a .parquet may be larger than memory.",
+        ),
+    ],
+    terms: TermsOption = "full",
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    out: OutOption = Path("calibration"),
+    seed: ConfigSeedOption = None,
+    bootstrap: BootstrapOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate all cameras jointly from a table of correspondences, with a report."""
+    from calibgraph.files import require_place_for_folder, sha256
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.pipeline import solve
+    from calibgraph.report import write_report
+
+    require_place_for_folder(out)
+    with checked_arguments():
+        settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
+    with progress_bar("solving"):
+        result = solve(load_rig(rig), correspondences, settings, checked_terms)
+        result = result.with_inputs({str(correspondences): sha256(correspondences)})
+        written = [result.save(out), write_report(result, out / "report.html")]
+    _print_and_exit(result, written, as_json=as_json)
+
+
+def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path]:
+    """Write the result, an overlay picture per camera and the report."""
+    from calibgraph.report import write_report
+    from calibgraph.report.point_overlay import write_overlays
+
+    middle = data.frames[len(data.frames) // 2]
+    mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
+    return [
+        result.save(folder),
+        folder / "correspondences.parquet",
+        *write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark),
+        write_report(result, folder / "report.html"),
+    ]
+
+
+def _print_frames_used(used: int, data: Dataset) -> None:
+    """Print how many frames were matched, unless all were."""
+    if used < len(data.frames):
+        text = f"{used} of {len(data.frames)} frames, evenly spread; --frames takes others"
+        print_plain(terminal(), text)
+
+
+def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -> None:
+    """Print the counts of a table of correspondences; exit 1 if a camera was not found."""
+    missed = list(table.findings.missed)
+    if as_json:
+        from calibgraph.report.as_json import print_json
+
+        print_json({"out": str(out), "matches": table.counts(), "missed": missed})
+    else:
+        counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
+        print_plain(terminal(), f"{out}: {len(table)} correspondences ({counts})")
+    if missed:
+        names = ", ".join(missed)
+        print_plain(
+            terminal(), f"not found: {names}: a solve of their matches from the guess will FAIL"
+        )
+        raise typer.Exit(1)
+
+
+def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
+    """Print a result; exit 1 if it is FAIL."""
+    if as_json:
+        from calibgraph.report.as_json import print_json, result_summary
+
+        print_json(result_summary(result, written))
+    else:
+        from calibgraph.cli.tables import print_result
+
+        print_result(terminal(), result, written)
+    if result.verdict.status == "FAIL":
+        raise typer.Exit(1)

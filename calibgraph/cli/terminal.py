@@ -1,0 +1,44 @@
+"""Output for humans, all of it on stderr: plain lines and a progress bar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from calibgraph.progress import Progress
+
+
+def terminal() -> Console:
+    """A console on stderr; stdout is for ``--json``."""
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+def print_plain(console: Console, text: str) -> None:
+    """Print a line as it is: no markup, no colours, no line breaks of rich's own."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_bar(first: str = "starting") -> Iterator[Progress]:
+    """A progress bar on stderr, removed when the work is done; none if stderr is no terminal.
+
+    Args:
+        first: description until the callback is called for the first time.
+    """
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    console = terminal()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda what, done, total: bar.update(
+            task, description=what, completed=done, total=total
+        )

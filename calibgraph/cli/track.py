@@ -1,0 +1,97 @@
+"""The command that keeps a rig calibrated while driving: track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibgraph.cli.arguments import checked_arguments, config_from, matcher_from
+from calibgraph.cli.options import (
+    ConfigOption,
+    ConfigSeedOption,
+    DeviceOption,
+    PresetOption,
+    RigArgument,
+    WeightsOption,
+)
+from calibgraph.cli.terminal import print_plain, terminal
+
+if TYPE_CHECKING:
+    from calibgraph.matching.protocol import Matcher
+
+
+def track(
+    rig: RigArgument,
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
+            "standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher: "
+            "dataset folders or KITTI sequences of one rig, as one drive.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the state, the result and a picture. A state in it is resumed.",
+        ),
+    ] = Path("tracking"),
+    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame only.")] = 1,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Wait for new files in the folder, until stopped.")
+    ] = False,
+    matcher: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
+    ] = None,
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    seed: ConfigSeedOption = None,
+    weights: WeightsOption = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Keep all cameras calibrated while driving: one frame in, one line of JSON out.
+
+    Each line on standard output is one update: estimates, covariances, verdicts, and events (what
+    moved, since when, how far). It is printed once the update is on disk: after a crash or kill -9
+    the same command resumes there, and may print the last line again. SIGTERM and Ctrl-C finish
+    the current update first.
+    """
+    from calibgraph.cli.tables import print_result
+    from calibgraph.files import require_place_for_folder
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.tracking.command import Tracking, track
+
+    require_place_for_folder(out)
+    with checked_arguments():
+        settings = config_from(config, preset, seed)
+        chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
+    console = terminal()
+    wanted = Tracking(
+        rig=load_rig(rig), config=settings, out=out, every=every, follow=follow, matcher=chosen
+    )
+    result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
+    print_result(console, result, written)
+    if result.verdict.status == "FAIL":
+        raise typer.Exit(1)
+
+
+def _tracking_matcher(
+    name: str | None, weights: list[Path] | None, source: list[Path], *, seed: int, device: str
+) -> Matcher | None:
+    """The matcher for the frames of datasets; None for a source of correspondences.
+
+    Raises:
+        ValueError: if options need a matcher and there is none.
+    """
+    if name:
+        return matcher_from(name, weights, seed=seed, device=device)
+    if weights:
+        raise ValueError("--weights is for --matcher cmrnext only")
+    if len(source) > 1:
+        raise ValueError(f"{len(source)} sources given; several go with --matcher only")
+    return None

@@ -1,0 +1,168 @@
+"""Matches of one network: images and clouds in, a table of correspondences per image out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from calibgraph.io.dataset import Frame
+from calibgraph.matching.cmrnext import confidence
+from calibgraph.matching.cmrnext.checkpoint import Checkpoint
+from calibgraph.matching.cmrnext.inputs import (
+    LidarImage,
+    View,
+    encode_depth,
+    halve_lidar,
+    lidar_channels,
+    lidar_tensor,
+    rgb_tensor,
+)
+from calibgraph.matching.cmrnext.layers import CELL
+from calibgraph.matching.cmrnext.network import CmrNext, upscale
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Camera
+
+Array = NDArray[np.float64]
+Maps = NDArray[np.float32]
+
+HALVED_FROM_PX = 1400
+"""Images at least this wide are halved unless the weights or the user choose: the networks were
+trained at 1241 pixels, and on larger images halved."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchingJob:
+    """One camera's image of one frame, with an estimate of its extrinsic.
+
+    Attributes:
+        frame: of the dataset.
+        name: of the camera.
+        camera: with its lens.
+        view: the camera without distortion.
+        image: (h, w, 3) RGB without distortion.
+        cloud: (n, 4) x y z [m] in the LiDAR frame, intensity.
+        T_camera_lidar: (4, 4) the estimate.
+    """
+
+    frame: Frame
+    name: str
+    camera: Camera
+    view: View
+    image: NDArray[np.uint8]
+    cloud: NDArray[np.float32]
+    T_camera_lidar: Array
+
+
+def load_job(frame: Frame, name: str, camera: Camera, view: View) -> MatchingJob:
+    """Load image and cloud; the estimate is the camera's extrinsic."""
+    image = view.undistort(frame.load_image(name, camera))
+    return MatchingJob(frame, name, camera, view, image, frame.load_cloud(), camera.T_camera_lidar)
+
+
+@dataclass(frozen=True, eq=False)
+class FlowMatcher:
+    """One network of the schedule.
+
+    Attributes:
+        checkpoint: its weights and config.
+        model: the network, on its device.
+        iterations: of the recurrent update.
+        half_resolution: whether images are halved; None: as the weights choose, or from
+            ``HALVED_FROM_PX`` on.
+        occlusion_filter: leave out points behind nearer ones.
+    """
+
+    checkpoint: Checkpoint
+    model: CmrNext
+    iterations: int
+    half_resolution: bool | None
+    occlusion_filter: bool
+
+    def match(self, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
+        """Match a batch of images of one size; the tables do not depend on a frame's pose."""
+        halved = self._halves(jobs[0].camera)
+        lidar_images = [self._render(job) for job in jobs]
+        full, coarse = self._flow(jobs, lidar_images, halved)
+        cell = CELL * (1 + halved)
+        return [
+            to_table(job, lidar, full[i], coarse[i], cell)
+            for i, (job, lidar) in enumerate(zip(jobs, lidar_images, strict=True))
+        ]
+
+    def _halves(self, camera: Camera) -> bool:
+        """Whether the network reads a camera's images at half their size."""
+        if self.half_resolution is not None:
+            return self.half_resolution
+        trained = self.checkpoint.config.get("half_resolution")
+        return trained if isinstance(trained, bool) else camera.width_px >= HALVED_FROM_PX
+
+    def _render(self, job: MatchingJob) -> LidarImage:
+        lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
+        return lidar.without_occluded() if self.occlusion_filter else lidar
+
+    def _flow(
+        self, jobs: Sequence[MatchingJob], lidar_images: Sequence[LidarImage], halved: bool
+    ) -> tuple[Maps, Maps]:
+        """(B, 2 or 4, H, W) flow and standard deviations, (B, 2, h, w) last step and peak."""
+        checkpoint, device = self.checkpoint, next(self.model.parameters()).device
+        rgbs, lidars = [], []
+        for job, lidar in zip(jobs, lidar_images, strict=True):
+            image = job.image[::2, ::2] if halved else job.image
+            channels = lidar_channels(lidar, checkpoint.architecture, checkpoint.max_depth_m)
+            rgbs.append(rgb_tensor(image, normalize=checkpoint.config["normalize_images"]))
+            lidars.append(lidar_tensor(halve_lidar(channels) if halved else channels))
+        with torch.inference_mode(), _exact():
+            rgb, raw = torch.stack(rgbs).to(device), torch.stack(lidars).to(device)
+            inputs = encode_depth(raw, checkpoint.architecture)
+            flow = self.model(rgb, inputs, iterations=self.iterations)
+            maps = [upscale(flow.flow_px, halved=halved)]
+            if flow.sigma_px is not None:
+                maps.append(upscale(flow.sigma_px, halved=halved, is_flow=False))
+            coarse = torch.stack([flow.step_px * (1 + halved), flow.peak], dim=1)
+            return torch.cat(maps, dim=1).cpu().numpy(), coarse.cpu().numpy()
+
+
+def _exact() -> AbstractContextManager[None]:
+    """Full float32 on a GPU, and the same numbers at every call."""
+    flags = torch.backends.cudnn.flags(
+        enabled=True, benchmark=False, deterministic=True, allow_tf32=False
+    )
+    return cast(AbstractContextManager[None], flags)
+
+
+def to_table(
+    job: MatchingJob, lidar: LidarImage, full: Maps, coarse: Maps, cell: int
+) -> Correspondences:
+    """Matches of one image: exact sub-pixel projections plus the flow at their pixels.
+
+    Args:
+        job: the camera and frame.
+        lidar: the points in the network's input.
+        full: (2 or 4, H, W) flow, and its standard deviations if there are any [px].
+        coarse: (2, h, w) last step [px] and correlation peak.
+        cell: pixels per coarse cell.
+    """
+    rows, columns = lidar.cells.T
+    values = full[:, rows, columns].T.astype(np.float64)
+    pixels, on_image = job.view.distort(lidar.pixels_px + np.nan_to_num(values[:, :2], nan=1e9))
+    kept = on_image & np.isfinite(values).all(axis=1)
+    index = lidar.point_index[kept]
+    step, peak = coarse[:, rows[kept] // cell, columns[kept] // cell].astype(np.float64)
+    sigma = values[kept, 2:] if values.shape[1] > 2 else None  # noqa: PLR2004 - flow and sigmas
+    return Correspondences.from_arrays(
+        camera=job.name,
+        frame=job.frame.index,
+        pixels_px=pixels[kept].reshape(-1, 2),
+        points_lidar_m=job.cloud[index, :3],
+        confidence=confidence.from_flow(step, peak)
+        if sigma is None
+        else confidence.from_sigmas(sigma),
+        information_px=None if sigma is None else confidence.to_information(sigma),
+        point_index=index,
+    )

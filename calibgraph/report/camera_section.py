@@ -1,0 +1,181 @@
+"""What the page shows of one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.calibration import Calibration, degrees_and_centimetres
+from calibgraph.model.metrics import PoseError, pose_error
+from calibgraph.model.verdict import Verdict
+from calibgraph.report import plots
+from calibgraph.report.check_table import CheckRow, check_row
+from calibgraph.report.diagrams import Diagram, camera_diagrams
+from calibgraph.report.page_overlays import Overlays
+from calibgraph.report.reprojection_errors import BeforeAfter
+from calibgraph.report.worked_point import WorkedPoint, worked_point
+
+Array = NDArray[np.float64]
+
+_COUNT_MEANINGS = {
+    "given": "correspondences in the table",
+    "projectable": "in front of the camera and inside the lens' domain",
+    "confident": "confident enough (confidence_min)",
+    "best_in_cell": "the most confident of its grid cell, per frame",
+    "capped": "within the cap per camera and frame (matches_max)",
+    "used": "inside the gate after the first pass; the result is made from these",
+    "left_out": "frames left out, since they disagree with the estimate",
+    "failed": "frames whose matches gave no pose",
+    "frames": "frames with correspondences",
+    "frames_used": "frames with used correspondences",
+    "frames_waiting": "frames that wait for others that agree with them",
+    "outlier_frames": "frames left out, far from where frames are densest",
+    "frames_without_pnp": "frames in which PnP found no pose",
+}
+_FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped", "used")
+_OVERLAY_HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
+_AXES = (
+    ("rotation x (pitch)", "deg", "pitch_deg"),
+    ("rotation y (yaw)", "deg", "yaw_deg"),
+    ("rotation z (roll)", "deg", "roll_deg"),
+    ("translation x (right)", "cm", "x_cm"),
+    ("translation y (down)", "cm", "y_cm"),
+    ("translation z (forward)", "cm", "z_cm"),
+)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of an extrinsic: standard deviation, change from the guess, bootstrap's."""
+
+    name: str
+    sigma: str
+    change: str
+    bootstrap: str
+
+
+@dataclass(frozen=True)
+class Count:
+    """A number of correspondences or frames; the filters also as a share of the given ones."""
+
+    name: str
+    number: int
+    share: float | None
+    meaning: str
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSection:
+    """Everything that the template prints of one camera."""
+
+    name: str
+    anchor: str
+    verdict: Verdict
+    rows: tuple[CheckRow, ...]
+    weaknesses: tuple[str, ...]
+    prior_share: float
+    moved: PoseError
+    has_sigmas: bool
+    numbers: tuple[str, ...]
+    overlays: Overlays | None
+    overlay_width_px: int
+    diagrams: tuple[Diagram, ...]
+    axes: tuple[Axis, ...]
+    counts: tuple[Count, ...]
+    convergence: str | None
+    worked: WorkedPoint
+
+
+def camera_section(
+    result: Calibration,
+    name: str,
+    index: int,
+    overlays: Overlays | None,
+    errors: BeforeAfter | None,
+) -> CameraSection:
+    """Collect what the page shows of a camera.
+
+    Args:
+        result: the calibration.
+        name: of the camera.
+        index: of the camera in the rig, for the anchor.
+        overlays: its pictures; None if the images are missing.
+        errors: of its correspondences; None if there are none.
+    """
+    camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
+    moved = pose_error(result.T_camera_lidar[name], result.initial_rig.T_camera_lidar[name])
+    rounds = [cameras[name] for cameras in result.rounds if name in cameras]
+    return CameraSection(
+        name=name,
+        anchor=f"camera-{index}",
+        verdict=verdict,
+        rows=tuple(check_row(check) for check in verdict.checks),
+        weaknesses=tuple(result.weaknesses.get(name, ())),
+        prior_share=result.prior_share.get(name, 0.0),
+        moved=moved,
+        has_sigmas=result.sigmas(name) is not None,
+        numbers=_overview_cells(result, name, moved),
+        overlays=overlays,
+        overlay_width_px=round(_OVERLAY_HEIGHT_PX * camera.width_px / camera.height_px),
+        diagrams=camera_diagrams(result, name, errors),
+        axes=_axes(result, name, moved),
+        counts=_counts(result.counts.get(name, {})),
+        convergence=plots.convergence(rounds) if len(rounds) > 1 else None,
+        worked=worked_point(camera, None if errors is None else errors.after),
+    )
+
+
+def _overview_cells(result: Calibration, name: str, moved: PoseError) -> tuple[str, ...]:
+    """A camera's cells of the table on top: error bars, change, residuals, counts."""
+    sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+    counts = result.counts.get(name, {})
+    return (
+        "-" if sigmas is None else f"{sigmas[0].max():.3f}",
+        "-" if sigmas is None else f"{sigmas[1].max():.2f}",
+        f"{moved.rotation_error_deg:.2f}",
+        f"{moved.translation_error_cm:.1f}",
+        "-" if residuals is None else f"{residuals.median_px:.2f}",
+        "-" if residuals is None else f"{residuals.inlier_share:.0%}",
+        str(counts.get("used", "-")),
+        str(counts.get("frames_used", "-")),
+    )
+
+
+def _axes(result: Calibration, name: str, moved: PoseError) -> tuple[Axis, ...]:
+    sigmas = _sigma_cells(result.covariance[name])
+    bootstrap = _sigma_cells(result.bootstrap.get(name))
+    return tuple(
+        Axis(
+            name=label,
+            sigma=sigmas[row],
+            change=f"{getattr(moved, key):+.2f} {unit}",
+            bootstrap=bootstrap[row],
+        )
+        for row, (label, unit, key) in enumerate(_AXES)
+    )
+
+
+def _sigma_cells(covariance: Array | None) -> list[str]:
+    """A standard deviation per axis with its unit; empty without a covariance."""
+    if covariance is None:
+        return [""] * len(_AXES)
+    rotation_deg, translation_cm = degrees_and_centimetres(covariance)
+    return [f"{v:.3f} deg" for v in rotation_deg] + [f"{v:.2f} cm" for v in translation_cm]
+
+
+def _counts(counts: Mapping[str, int]) -> tuple[Count, ...]:
+    """The filters in order, then the other counts."""
+    given = max(counts.get("given", 0), 1)
+    order = [key for key in (*_COUNT_MEANINGS, *counts) if key in counts]
+    return tuple(
+        Count(
+            name=key.replace("_", " "),
+            number=counts[key],
+            share=min(counts[key] / given, 1.0) if key in _FILTERS else None,
+            meaning=_COUNT_MEANINGS.get(key, ""),
+        )
+        for key in dict.fromkeys(order)
+    )

@@ -1,0 +1,48 @@
+"""The frames of a result: the one whose images are shown, and where the files are now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from calibgraph.errors import DatasetError
+from calibgraph.io.dataset import Dataset
+from calibgraph.model.calibration import Calibration
+
+
+def middle_frame(result: Calibration) -> Mapping[str, Any] | None:
+    """The entry of the frame whose images are shown; None if the result names no frames."""
+    return result.frames[len(result.frames) // 2] if result.frames else None
+
+
+def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
+    """The result with the paths of its images and clouds taken from a dataset that has moved.
+
+    Args:
+        result: of ``calibrate``, or of a table whose frame numbers are those of the dataset.
+        dataset: the same folders in the same order.
+
+    Raises:
+        DatasetError: if the dataset does not have the result's frames.
+    """
+    available = {frame.index: frame for frame in dataset.frames}
+    names = _frame_names(result)
+    for number, name in names.items():
+        if number not in available or name not in (None, available[number].name):
+            raise DatasetError(
+                f"{', '.join(map(str, dataset.folders))}: has no frame number {number}"
+                f"{'' if name is None else f' named {name!r}'}, which the result was made from; "
+                "give the same folders in the same order",
+                frame=number,
+            )
+    return replace(result, frames=tuple(available[number].entry() for number in names))
+
+
+def _frame_names(result: Calibration) -> dict[int, str | None]:
+    """The name of each frame number; None where only correspondences have the number."""
+    if result.frames or result.correspondences is None:
+        return {entry["frame"]: entry["name"] for entry in result.frames}
+    return dict.fromkeys(np.unique(result.correspondences.frame).tolist())

@@ -1,0 +1,148 @@
+"""The cloud projected into an image, coloured by depth; and before-and-after PNG files of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError
+from calibgraph.files import write_atomically
+from calibgraph.io.dataset import Frame
+from calibgraph.model.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+DEPTH_RANGE_M = (2.0, 60.0)
+_MAX_WIDTH_PX = 1280
+_BAR_PX = 34
+_COVERED_SHARE = 0.2  # of the image, covered by points
+_MAX_DOT_PX = 7
+
+
+def write_overlays(
+    frame: Frame, initial: Rig, final: Rig, folder: Path, *, mark: str = ""
+) -> list[Path]:
+    """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
+
+    Args:
+        frame: the cloud and images to show.
+        initial: the rig before.
+        final: the rig after.
+        folder: to write to.
+        mark: prefix of the title of the second picture, such as that the result is FAIL.
+
+    Returns:
+        The paths.
+
+    Raises:
+        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
+    """
+    cloud = frame.load_cloud()[:, :3].astype(np.float64)
+    paths = []
+    for name, camera in initial.cameras.items():
+        image = frame.load_image(name, camera)
+        after = final.cameras[name]
+        panels = [
+            _titled(draw_points(image, cloud, camera), f"{name}, frame {frame.name}: before"),
+            _titled(draw_points(image, cloud, after), f"{mark}{name}, frame {frame.name}: after"),
+            _depth_bar(image.shape[1]),
+        ]
+        paths.append(folder / f"overlay_{name}.png")
+        write_image(paths[-1], _shrink(np.vstack(panels)))
+    return paths
+
+
+def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
+    """Draw a cloud on an image, near points over far ones, coloured by their distance.
+
+    Args:
+        image: (height, width, 3) BGR.
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        camera: lens and extrinsic.
+    """
+    T = camera.T_camera_lidar
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    pixels, valid = camera.lens.project(points)
+    valid &= camera.in_image(pixels)
+    order = np.argsort(-np.linalg.norm(points[valid], axis=1))
+    points, pixels = points[valid][order], pixels[valid][order]
+    column, row = np.rint(pixels).astype(np.intp).T
+    colours = depth_colours(np.linalg.norm(points, axis=1))
+    drawn = image.copy()
+    side = _dot_side(image.shape[0] * image.shape[1], len(points))
+    for dy, dx in np.ndindex(side, side):
+        rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
+        drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
+    return drawn
+
+
+def _dot_side(pixels: int, points: int) -> int:
+    """Side of a point's square [px]: larger for few points, so that all cover a fixed share."""
+    side = np.sqrt(_COVERED_SHARE * pixels / max(points, 1))
+    return int(np.clip(round(side), 1, _MAX_DOT_PX))
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write a PNG atomically.
+
+    Raises:
+        CalibrationError: if it cannot be encoded or written.
+    """
+    encoded, data = cv2.imencode(".png", image)
+    if not encoded:
+        raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
+
+    def write(part: Path) -> None:
+        part.write_bytes(data.tobytes())
+
+    write_atomically(path, write)
+
+
+def depth_colours(distance_m: Array) -> Image:
+    """(n, 3) BGR: red is near, blue is far, linear in the logarithm of the distance."""
+    if not len(distance_m):  # OpenCV refuses empty arrays
+        return np.empty((0, 3), np.uint8)
+    low, high = np.log(DEPTH_RANGE_M)
+    share = np.clip((np.log(distance_m) - low) / (high - low), 0.0, 1.0)
+    levels = np.rint(255 * (1 - share)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0], dtype=np.uint8)
+
+
+def _titled(image: Image, title: str) -> Image:
+    scale = max(0.5, image.shape[1] / 1600)
+    strip = np.zeros((round(44 * scale), image.shape[1], 3), np.uint8)
+    white, thickness = (255, 255, 255), max(1, round(1.5 * scale))
+    origin = (round(12 * scale), round(30 * scale))
+    cv2.putText(
+        strip, title, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, white, thickness, cv2.LINE_AA
+    )
+    return np.vstack([strip, image])
+
+
+def _depth_bar(width: int) -> Image:
+    """A strip with the colours of the distances, with labels."""
+    scale = max(0.5, width / 1600)
+    low, high = np.log(DEPTH_RANGE_M)
+    distances = np.exp(np.linspace(low, high, width))
+    bar = np.repeat(depth_colours(distances)[None], round(_BAR_PX * scale), axis=0)
+    for tick in (2, 5, 10, 20, 50):
+        x = int((np.log(tick) - low) / (high - low) * (width - 1))
+        for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):  # outlined
+            cv2.putText(
+                bar, f"{tick} m", (x + 4, round(24 * scale)), cv2.FONT_HERSHEY_SIMPLEX,
+                0.7 * scale, colour, max(1, round(thickness * scale)), cv2.LINE_AA,
+            )  # fmt: skip
+    return bar
+
+
+def _shrink(image: Image) -> Image:
+    """The image, at most _MAX_WIDTH_PX wide, so that the files of many cameras stay small."""
+    factor = _MAX_WIDTH_PX / image.shape[1]
+    if factor >= 1:
+        return image
+    size = (_MAX_WIDTH_PX, round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -1,0 +1,127 @@
+"""The reprojection errors of each camera's correspondences, at the guess and at the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.preprocess import preprocess
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReprojectionErrors:
+    """The errors of one camera's preprocessed correspondences at one extrinsic.
+
+    Attributes:
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        pixels_px: (n, 2) matched pixels.
+        projected_px: (n, 2) projections of the points.
+        vectors_px: (n, 2) projected less matched, along the directions that the match constrains:
+            for an edge, across it. The gate compares its length.
+        distances_m: (n,) from the camera to the points.
+        frame: (n,) frame numbers.
+        gate_px: tau of the result.
+    """
+
+    points_lidar_m: Array
+    pixels_px: Array
+    projected_px: Array
+    vectors_px: Array
+    distances_m: Array
+    frame: NDArray[np.int64]
+    gate_px: float
+
+    @property
+    def sizes_px(self) -> Array:
+        """(n,) lengths of ``vectors_px``."""
+        return np.asarray(np.hypot(*self.vectors_px.T))
+
+    @property
+    def is_inlier(self) -> NDArray[np.bool_]:
+        """(n,) whether the error is within the gate."""
+        return np.asarray(self.sizes_px <= self.gate_px)
+
+    def select(self, rows: NDArray[np.bool_]) -> ReprojectionErrors:
+        """The errors of some correspondences.
+
+        Args:
+            rows: (n,) which.
+        """
+        columns: dict[str, Any] = {
+            name: column[rows]
+            for name, column in vars(self).items()
+            if isinstance(column, np.ndarray)
+        }
+        return replace(self, **columns)
+
+
+@dataclass(frozen=True, eq=False)
+class BeforeAfter:
+    """The errors of the same correspondences at the guess and at the result."""
+
+    before: ReprojectionErrors
+    after: ReprojectionErrors
+
+
+def errors_before_after(result: Calibration) -> dict[str, BeforeAfter]:
+    """Errors before and after of each camera with correspondences; empty without a table.
+
+    Raises:
+        CorrespondenceError: if the table does not belong to the result's rig.
+    """
+    if result.correspondences is None:
+        return {}
+    # The last of several rounds of matching started near the result, not at the guess.
+    start = result.rig if len(result.rounds) > 1 else result.initial_rig
+    table = preprocess(start, result.correspondences, result.config).table
+    blocks = camera_blocks(start, table, result.config)
+    guess = result.initial_rig.T_camera_lidar
+    return {
+        name: BeforeAfter(
+            _errors_at(guess[name], block, result.residuals[name].gate_px),
+            _errors_at(result.T_camera_lidar[name], block, result.residuals[name].gate_px),
+        )
+        for name, block in blocks.items()
+        if name in result.residuals
+    }
+
+
+def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> ReprojectionErrors:
+    """The errors of those matches that project into the camera at this extrinsic."""
+    block = matches.block
+    residuals, valid = block.residuals(to_T_lidar_camera(T_camera_lidar))
+    points_camera = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    everything = ReprojectionErrors(
+        points_lidar_m=block.points_lidar_m,
+        pixels_px=block.pixels_px,
+        projected_px=block.pixels_px + residuals,
+        vectors_px=_constrained(residuals, matches.information),
+        distances_m=np.linalg.norm(points_camera, axis=1),
+        frame=matches.frame,
+        gate_px=gate_px,
+    )
+    return everything.select(valid)
+
+
+def _constrained(residuals: Array, information: Array | None) -> Array:
+    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is ``whitening.constrained_error_px``.
+
+    The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).
+    """
+    if information is None:
+        return residuals
+    uu, uv, vv = information.T
+    largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
+    root = np.sqrt(np.maximum(uu * vv - uv**2, 0.0))
+    scale = np.sqrt((uu + vv + 2 * root) * largest)
+    x, y = residuals.T
+    rooted = np.column_stack([(uu + root) * x + uv * y, uv * x + (vv + root) * y])
+    return np.asarray(rooted / scale[:, None])

@@ -1,0 +1,121 @@
+"""Bookkeeping of a frame in the state: absorbed, left out, or without usable matches."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.tracking.cause import squared_sigmas
+from calibgraph.tracking.epoch_summary import step_between
+from calibgraph.tracking.events import Event
+from calibgraph.tracking.outlier_frames import find_outlier_frame
+from calibgraph.tracking.start import count_residuals
+from calibgraph.tracking.state import LiveFrame, State
+
+_LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
+_UNUSUAL = 25.0  # squared sigmas of a six-vector
+_TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
+
+
+def with_open_frame(state: State, frame: LiveFrame) -> State:
+    """The state with a frame in its open epoch, in the place of that of the same number."""
+    last = state.epochs[-1]
+    others = tuple(f for f in last.frames if f.number != frame.number)
+    return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, frame))))
+
+
+def set_aside(state: State, camera: int, block: CameraBlock) -> State:
+    """The state with a camera's block counted as left out.
+
+    It is kept as an outlier frame if another T_lidar_camera explains it; otherwise the matching has
+    failed.
+    """
+    camera_state = state.cameras[camera]
+    number = state.frame or 0
+    own = find_outlier_frame(
+        number,
+        block,
+        state.T_lidar_camera[camera],
+        camera=state.rig.cameras[state.names[camera]],
+        camera_state=camera_state,
+        config=state.config,
+    )
+    kept = camera_state.outlier_frames
+    camera_state = replace(
+        camera_state,
+        outlier_frames=kept if own is None else (*kept, own)[-_LAST_FRAMES:],
+        agreements=(*camera_state.agreements, (number, False))[-_LAST_FRAMES:],
+    )
+    return state.with_camera(camera, camera_state.count(left_out=1, failed=1 if own is None else 0))
+
+
+def count_absorbed(state: State, camera: int, block: CameraBlock, used: int) -> State:
+    """The state with a camera's block counted as absorbed, and its residuals counted.
+
+    Args:
+        state: with the estimate after the block was absorbed.
+        camera: its place in the rig.
+        block: all matches of the frame.
+        used: how many of them are within the gate.
+    """
+    T_lidar_camera = state.T_lidar_camera[camera]
+    camera_state = count_residuals(state.cameras[camera], block, T_lidar_camera)
+    agreements = (*camera_state.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
+    camera_state = replace(camera_state, agreements=agreements)
+    return state.with_camera(
+        camera, camera_state.count(absorbed=1, given=len(block.frame), used=used)
+    )
+
+
+def add_to_totals(state: State, frame: LiveFrame) -> State:
+    """The state with a frame added to the scatter of all frames.
+
+    An unusual frame is down-weighted: it may come after a move that has not been detected yet.
+    """
+    steps = np.array([*map(step_between, state.references, state.T_lidar_camera)])
+    scores = frame.gradient + np.einsum("nij,nj->ni", frame.hessian, steps)
+    for camera in frame.used:
+        noise = state.frame_noise(camera)
+        if noise is not None:
+            unusual = squared_sigmas(scores[camera], noise)
+            scores[camera] *= min(1.0, (_UNUSUAL / unusual) ** 0.5)
+    seen = np.array([camera in frame.used for camera in range(len(steps))])
+    flat = scores.ravel()
+    return replace(
+        state,
+        total=_TOTAL_KEPT * state.total + np.outer(flat, flat),
+        total_hessian=_TOTAL_KEPT * state.total_hessian + frame.hessian,
+        total_frames=_TOTAL_KEPT * state.total_frames + seen,
+    )
+
+
+def count_absent(state: State, used: Collection[int]) -> tuple[State, list[Event]]:
+    """The state with the frames without usable matches counted; events ``blind`` and ``back``.
+
+    Args:
+        state: after a frame.
+        used: the cameras whose matches were absorbed, by their places in the rig.
+    """
+    events = []
+    limit, number = state.config.tracking.blind_frames, state.frame or 0
+    for camera, camera_state in enumerate(state.cameras):
+        if not camera_state.started:
+            continue
+        absent = 0 if camera in used else camera_state.absent + 1
+        name = state.names[camera]
+        if absent == limit:
+            since = _number_of_frame_ago(state, limit)
+            events.append(Event("blind", name, since, number, state.stamp_ns))
+        if absent == 0 and camera_state.absent >= limit:
+            events.append(Event("back", name, number, number, state.stamp_ns))
+        state = state.with_camera(camera, replace(camera_state, absent=absent))
+    return state, events
+
+
+def _number_of_frame_ago(state: State, frames: int) -> int:
+    """Number of the frame so many frames ago, the last one counted; at least a live one."""
+    numbers = [frame.number for frame in state.live_frames]
+    return numbers[-min(frames, len(numbers))]

@@ -1,0 +1,137 @@
+"""The cause of a step: one camera, or the LiDAR under all of them.
+
+If the LiDAR moves by D, every camera shifts by the same D: T_lidar_camera' = D T_lidar_camera, a
+tangent step Ad(T_lidar_camera^-1) log(D) in each. One camera's move leaves the others in place.
+So the steps of all cameras, with their joint covariance, distinguish the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtri
+
+from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
+
+Array = NDArray[np.float64]
+
+ALARM_CHANCE = 1e-8
+"""Probability that one test of a camera that has not moved raises an alarm."""
+
+CLEARLY = 15.0
+"""Squared sigmas by which the LiDAR must explain more than any camera alone."""
+
+_POSE = 6
+
+
+def alarm_limit(frames: float) -> float:
+    """Squared sigmas that a six-vector exceeds by chance with ALARM_CHANCE.
+
+    Its covariance comes from so many frames, so this is Hotelling's distribution, not chi squared.
+    """
+    freedom = max(frames - _POSE, 4.0)
+    quantile = float(fdtri(_POSE, freedom, 1 - ALARM_CHANCE))
+    return _POSE * (freedom + _POSE - 1) / freedom * quantile
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The measured step of each camera.
+
+    Attributes:
+        cameras: those with an estimate before and after, by their places in the rig.
+        step: (6 n,) tangent steps of T_lidar_camera.
+        covariance: (6 n, 6 n).
+        limits: (n,) squared sigmas beyond which a camera has moved.
+        T_lidar_camera: before.
+    """
+
+    cameras: tuple[int, ...]
+    step: Array
+    covariance: Array
+    limits: Array
+    T_lidar_camera: tuple[gtsam.Pose3, ...]
+
+    def of(self, place: int) -> tuple[Array, Array]:
+        """(6,) step and (6, 6) covariance of the camera at that place of ``cameras``."""
+        rows = pose_rows(place)
+        return self.step[rows], self.covariance[rows, rows]
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """What moved.
+
+    Attributes:
+        cameras: by their places in the rig; empty: nothing.
+        lidar: if it was the LiDAR, under all of them: (6,) log(D) in its own frame, and its (6, 6)
+            covariance.
+    """
+
+    cameras: tuple[int, ...]
+    lidar: tuple[Array, Array] | None = None
+
+
+def find_cause(steps: Steps, found_by: Collection[int] = ()) -> Cause:
+    """Decide whether cameras moved, or the LiDAR.
+
+    With a single camera the two cannot be distinguished; the camera is reported.
+
+    Args:
+        steps: of all cameras.
+        found_by: cameras that have moved, whatever the size of their step.
+    """
+    moved = [
+        place
+        for place, camera in enumerate(steps.cameras)
+        if camera in found_by or squared_sigmas(*steps.of(place)) > steps.limits[place]
+    ]
+    alone = Cause(tuple(steps.cameras[place] for place in moved))
+    if not moved or len(steps.cameras) == 1:
+        return alone
+    left, left_by_camera = unexplained(steps)
+    if left < _others_limit(steps) and left < left_by_camera - CLEARLY:
+        return Cause(steps.cameras, _lidar_step(steps))
+    return alone
+
+
+def unexplained(steps: Steps) -> tuple[float, float]:
+    """Squared sigmas that are left by a move of the LiDAR, and by one of the best camera."""
+    step, _ = _lidar_step(steps)
+    by_lidar = squared_sigmas(steps.step - _by_lidar(steps) @ step, steps.covariance)
+    places = range(len(steps.cameras))
+    return by_lidar, min(_left_by_camera(steps, place) for place in places)
+
+
+def _by_lidar(steps: Steps) -> Array:
+    """(6 n, 6) Jacobian of all cameras' steps with respect to a step of the LiDAR."""
+    return np.vstack([adjoint_camera_lidar(T) for T in steps.T_lidar_camera])
+
+
+def _lidar_step(steps: Steps) -> tuple[Array, Array]:
+    """(6,) log(D) of the LiDAR's move that explains the steps best, and its (6, 6) covariance."""
+    design = _by_lidar(steps)
+    whitened = np.linalg.solve(steps.covariance, design)
+    covariance: Array = np.asarray(np.linalg.inv(design.T @ whitened), dtype=np.float64)
+    return covariance @ (whitened.T @ steps.step), covariance
+
+
+def _left_by_camera(steps: Steps, place: int) -> float:
+    """Squared sigmas of all other cameras' steps: zero if only this one moved."""
+    rows = np.ones(len(steps.step), dtype=np.bool_)
+    rows[pose_rows(place)] = False
+    return squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)])
+
+
+def _others_limit(steps: Steps) -> float:
+    """Squared sigmas that one move of the LiDAR may leave unexplained."""
+    return float(np.sort(steps.limits)[1:].sum())
+
+
+def squared_sigmas(step: Array, covariance: Array) -> float:
+    """A vector's squared length in units of its covariance."""
+    return float(step @ np.linalg.solve(covariance, step))

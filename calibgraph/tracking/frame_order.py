@@ -1,0 +1,54 @@
+"""Frames come in the order of their numbers, and of their times if they have them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.tracking.state import State
+
+
+def number_and_stamp(
+    table: Correspondences, frame: int | None, state: State
+) -> tuple[int, int | None]:
+    """The number and the time stamp [ns] of the frame that a table holds.
+
+    Args:
+        table: the correspondences of one frame.
+        frame: its number, which an empty table does not have.
+        state: of the frames before.
+
+    Raises:
+        CorrespondenceError: if the table holds several frames, or one that is not after the last.
+    """
+    numbers = np.unique(table.frame)
+    if len(numbers) > 1:
+        raise CorrespondenceError(
+            f"an update takes one frame, found {len(numbers)} (from {numbers[0]} to "
+            f"{numbers[-1]}); give them one by one"
+        )
+    if frame is None and not len(numbers):
+        raise CorrespondenceError("the table is empty; name which frame it is: frame=...")
+    number = int(numbers[0]) if len(numbers) else int(frame or 0)
+    if frame is not None and number != frame:
+        raise CorrespondenceError(f"the table is of frame {number}, not {frame}", frame=number)
+    stamp = int(table.stamp_ns.max()) if table.stamp_ns is not None and len(table) else None
+    _require_after(state, number, stamp)
+    return number, stamp
+
+
+def _require_after(state: State, number: int, stamp: int | None) -> None:
+    last, last_stamp = state.frame, state.stamp_ns
+    if last is not None and number <= last:
+        what = "comes again" if number == last else f"comes after frame {last}"
+        raise CorrespondenceError(
+            f"frame {number} {what}; frames must be in the order of their numbers: it is left out",
+            frame=number,
+        )
+    if stamp is not None and last_stamp is not None and stamp <= last_stamp:
+        raise CorrespondenceError(
+            f"frame {number}: its stamp_ns {stamp} is not after {last_stamp} of the frame "
+            "before; correct the clock: it is left out",
+            frame=number,
+        )

@@ -1,0 +1,300 @@
+"""A tracker's state on disk: an SQLite database of snapshots and of the inputs since.
+
+``state.sqlite`` has three tables. ``journal`` holds the inputs in order, each with its number.
+``snapshot`` holds the state after a number of inputs. Their rows have checksums, since SQLite
+checks its log but not its pages. ``status`` holds the number of the last input, by which missing
+rows are noticed, and whether a log is in use, by which a missing log is noticed.
+
+With a write-ahead log and ``synchronous=FULL``, a row is on disk when its transaction returns, and
+a crash leaves all of a transaction or none.
+
+Two snapshots are kept, and the inputs since the older one, which replaces a damaged newer one.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import os
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+
+from calibgraph.errors import FileError
+from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
+
+DATABASE = "state.sqlite"
+LAYOUT = 2  # 1 was a folder of files snapshot-*.state and journal-*.log
+
+_APPLICATION = 0x43474254  # "CGBT", in the header of the database
+_HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
+_EARLIER_FILES = ("snapshot-*.state", "journal-*.log")
+_TABLES = f"""
+    PRAGMA journal_mode=WAL;
+    PRAGMA application_id={_APPLICATION};
+    PRAGMA user_version={LAYOUT};
+    CREATE TABLE snapshot (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
+    CREATE TABLE journal (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
+    CREATE TABLE status (number INTEGER NOT NULL, is_open INTEGER NOT NULL);
+    INSERT INTO status VALUES (0, 0);
+"""
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What a database holds.
+
+    Attributes:
+        snapshot: the newest undamaged snapshot; None if there is none yet.
+        inputs: the inputs after it, in order; the last may be one that was not acknowledged.
+        damages: one line for each damaged snapshot, and for a log that is missing.
+    """
+
+    snapshot: bytes | None
+    inputs: tuple[bytes, ...]
+    damages: tuple[str, ...]
+
+
+class StateDatabase:
+    """The state of one tracker in a folder, locked against a second process.
+
+    After a write has failed, every further one is refused.
+
+    Args:
+        folder: where the state is kept; made if it is not there.
+
+    Attributes:
+        recovered: what the database held when it was opened.
+
+    Raises:
+        FileError: if another process uses the folder, or its state is damaged, foreign, of the
+            earlier layout or of a newer one. The folder is left as it was.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / DATABASE
+        _make_folder(folder)
+        self._lock: int | None = _lock(folder)
+        self._connection: sqlite3.Connection | None = None  # opened by the first write
+        self._failed = False
+        try:
+            _require_layout(folder)
+            if not self._path.exists():
+                _create(self._path)
+            self.recovered, self._number = _read(self._path)
+        except BaseException:
+            self.close()
+            raise
+
+    def append(self, content: bytes) -> None:
+        """Add an input to the journal; it is durable when this returns.
+
+        Raises:
+            OSError: if it cannot be written; the earlier inputs are safe.
+        """
+        number = self._number + 1
+        with self._writing() as connection:
+            row = number, content, _digest(number, content)
+            connection.execute("INSERT INTO journal VALUES (?, ?, ?)", row)
+            connection.execute("UPDATE status SET number = ?", (number,))
+        self._number = number
+
+    def snapshot(self, state: bytes) -> None:
+        """Keep ``state``, which all inputs so far led to; it is durable when this returns.
+
+        Snapshots and inputs older than the snapshot before this one are removed.
+
+        Raises:
+            OSError: if it cannot be written; the earlier snapshot and the inputs are safe.
+        """
+        row = self._number, state, _digest(self._number, state)
+        with self._writing() as connection:
+            connection.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", row)
+            (kept,) = connection.execute(
+                "SELECT min(number) FROM (SELECT number FROM snapshot ORDER BY number DESC LIMIT 2)"
+            ).fetchone()
+            connection.execute("DELETE FROM snapshot WHERE number < ?", (kept,))
+            connection.execute("DELETE FROM journal WHERE number <= ?", (kept,))
+
+    def close(self) -> None:
+        """Release the folder; nothing is left to write."""
+        connection, self._connection = self._connection, None
+        lock, self._lock = self._lock, None
+        if connection is not None:
+            with suppress(sqlite3.Error):  # of a full disk: then the next one warns in vain
+                connection.rollback()
+                connection.execute("UPDATE status SET is_open = 0")
+            connection.close()  # copies the log into the database and removes it
+        if lock is not None:
+            os.close(lock)
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """A transaction. An error ends all writing: whether it is on disk is unknown then."""
+        if self._lock is None or self._failed:
+            raise ValueError(f"{self._path}: is closed; open its folder anew")
+        try:
+            self._connection = self._connection or _connect(self._path)
+            self._connection.execute("BEGIN")
+            yield self._connection
+            self._connection.execute("COMMIT")
+        except BaseException as error:
+            self._failed = True
+            if isinstance(error, sqlite3.Error):
+                raise _cannot_write(self._path, error) from error
+            raise
+
+
+def _make_folder(folder: Path) -> None:
+    require_place_for_folder(folder)
+    new = [part for part in (folder, *folder.parents) if not part.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for part in new:
+        sync_folder(part.parent)
+
+
+def _lock(folder: Path) -> int:
+    """A descriptor that holds the folder's lock until it is closed, or the process ends."""
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException as error:
+        os.close(descriptor)
+        if isinstance(error, BlockingIOError):
+            message = "is in use by another process; stop that one, or choose another folder"
+            raise FileError(folder, message) from None
+        raise
+    return descriptor
+
+
+def _require_layout(folder: Path) -> None:
+    """Refuse a folder that anything but this layout has written, before a byte is changed."""
+    path = folder / DATABASE
+    for pattern in _EARLIER_FILES:
+        for found in folder.glob(pattern):
+            message = "is state of the earlier layout calibgraph-tracker/1; choose another folder"
+            raise FileError(found, f"{message}, or continue with the calibgraph that wrote it")
+    if not path.exists():
+        if _log_of(path).exists():
+            raise FileError(path, "is missing, and its log is there; restore it from a copy")
+        return
+    with path.open("rb") as file:
+        header = file.read(_HEADER.size)
+    if len(header) < _HEADER.size or not header.startswith(b"SQLite format 3\0"):
+        raise FileError(path, "is damaged or no tracker's state; choose another folder")
+    _, layout, application = _HEADER.unpack(header)
+    if application != _APPLICATION:
+        raise FileError(path, "is a database of another program; choose another folder")
+    if layout != LAYOUT:
+        message = f"is state of layout {layout}, expected {LAYOUT}; choose another folder"
+        raise FileError(path, f"{message}, or continue with the calibgraph that wrote it")
+
+
+def _log_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}-wal")
+
+
+def _create(path: Path) -> None:
+    """Put an empty database in place, whole or not at all."""
+    for leftover in path.parent.glob(f".writing-*{path.suffix}*"):
+        leftover.unlink()
+
+    def write(part: Path) -> None:
+        with closing(sqlite3.connect(part, isolation_level=None)) as connection:
+            connection.executescript(_TABLES)
+
+    write_atomically(path, write)
+
+
+_OPEN_FOR_WRITING = """
+    PRAGMA locking_mode=EXCLUSIVE;
+    PRAGMA journal_mode=WAL;
+    PRAGMA synchronous=FULL;
+    UPDATE status SET is_open = 1;
+    PRAGMA wal_checkpoint(PASSIVE);
+"""
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """A connection for writing, which no other can share; it is noted in the database itself."""
+    connection = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
+    try:
+        connection.executescript(_OPEN_FOR_WRITING)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _read(path: Path) -> tuple[Recovered, int]:
+    """What the database holds, and the number of its last input; no file is changed.
+
+    Raises:
+        FileError: if it is damaged.
+    """
+    log = _log_of(path)
+    had_log = log.exists() and log.stat().st_size > 0
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
+            if state != "ok":
+                raise _damaged(path, state)
+            number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
+            recovered = _recover(database, path, number)
+    except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
+        raise _damaged(path, error) from error
+    finally:
+        _remove_index(path, had_log=had_log)
+    if is_open and not had_log:
+        line = f"{log}: is missing, updates may be lost; went on after update {number}"
+        recovered = replace(recovered, damages=(*recovered.damages, line))
+    return recovered, number
+
+
+def _remove_index(path: Path, *, had_log: bool) -> None:
+    """Remove what reading leaves beside a database: the index of the log, and an empty log."""
+    path.with_name(f"{path.name}-shm").unlink(missing_ok=True)
+    if not had_log:
+        _log_of(path).unlink(missing_ok=True)
+
+
+def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered:
+    """The newest undamaged snapshot, and all inputs after it up to the newest."""
+    damages: list[str] = []
+    start, snapshot = 0, None
+    query = "SELECT number, content, digest FROM snapshot ORDER BY number DESC"
+    for number, content, digest in database.execute(query):
+        if digest == _digest(number, content):
+            start, snapshot = number, content
+            break
+        damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
+    if damages and snapshot is None:
+        raise _damaged(path, "no snapshot has the right checksum")
+    query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
+    rows = database.execute(query, (start,)).fetchall()
+    for expected, row in zip_longest(range(start + 1, newest + 1), rows):
+        if row is None or row[0] != expected or row[2] != _digest(*row[:2]):
+            raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
+    return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
+
+
+def _digest(number: int, content: object) -> bytes:
+    if not isinstance(content, bytes):
+        return b""
+    return hashlib.sha256(str(number).encode() + b" " + content).digest()
+
+
+def _damaged(path: Path, why: object) -> FileError:
+    advice = "restore its folder from a copy, or choose another folder"
+    return FileError(path, f"is damaged ({why}); {advice}")
+
+
+def _cannot_write(path: Path, error: sqlite3.Error) -> OSError:
+    full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+    message = f"cannot be written ({error}); free or mend the disk and start again"
+    return OSError(errno.ENOSPC if full else errno.EIO, message, str(path))

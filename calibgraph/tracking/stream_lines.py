@@ -1,0 +1,230 @@
+"""Frames of correspondences from JSON lines.
+
+A line holds a frame::
+
+    {"frame": 7, "cameras": {"left": {"u_px": [...], "v_px": [...],
+                                      "x_m": [...], "y_m": [...], "z_m": [...]}}}
+
+Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``; ``point_index``.
+Optional beside ``frame``: ``stamp_ns`` and ``metadata``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import reprlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.files import describe
+from calibgraph.model.correspondences import Correspondences, as_confidence, concatenate
+from calibgraph.model.table_columns import COORDINATES, INFORMATION
+from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
+
+MAX_CAMERAS = 1000
+MAX_LINE_BYTES = 64 * 2**20
+_MAX_METADATA_LEVELS = 32
+
+
+def _require_shallow(metadata: dict[str, Any]) -> dict[str, Any]:
+    if not _is_shallow(metadata, _MAX_METADATA_LEVELS):
+        raise ValueError(f"has more than {_MAX_METADATA_LEVELS} levels")
+    return metadata
+
+
+def _is_shallow(value: object, levels: int) -> bool:
+    if not isinstance(value, (dict, list)):
+        return True
+    children = value.values() if isinstance(value, dict) else value
+    return levels > 0 and all(_is_shallow(child, levels - 1) for child in children)
+
+
+Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Metadata = Annotated[dict[str, Any], AfterValidator(_require_shallow)]
+
+
+class CameraColumns(BaseModel):
+    """One camera's correspondences as lists of one length; see the table of correspondences."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    u_px: list[float]
+    v_px: list[float]
+    x_m: list[float]
+    y_m: list[float]
+    z_m: list[float]
+    confidence: list[float] = []
+    i_uu_px: list[float] = []
+    i_uv_px: list[float] = []
+    i_vv_px: list[float] = []
+    point_index: list[Int64] = []
+
+    @model_validator(mode="after")
+    def _require_whole_table(self) -> Self:
+        partial = sorted(self.model_fields_set.intersection(INFORMATION))
+        if partial and len(partial) < len(INFORMATION):
+            raise ValueError(f"has only {partial} of {list(INFORMATION)}; add all")
+        lengths = {key: len(getattr(self, key)) for key in self.given}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"the lists differ in length: {lengths}")
+        return self
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The columns that the line has, in the order of the model."""
+        return tuple(key for key in type(self).model_fields if key in self.model_fields_set)
+
+    def table(self, camera: str, frame: int, stamp_ns: int | None) -> Correspondences:
+        """The correspondences of this camera.
+
+        Raises:
+            CorrespondenceError: if a value is out of its range.
+        """
+        n = len(self.u_px)
+        confidence = self.confidence if "confidence" in self.given else np.ones(n)
+        informed = INFORMATION[0] in self.given
+        return Correspondences(
+            cameras=(camera,),
+            camera_index=np.zeros(n, np.int32),
+            frame=np.full(n, frame, np.int64),
+            pixels_px=self._stack(COORDINATES[:2]),
+            points_lidar_m=self._stack(COORDINATES[2:]),
+            confidence=as_confidence(np.array(confidence, np.float64)),
+            information_px=self._stack(INFORMATION) if informed else None,
+            stamp_ns=None if stamp_ns is None else np.full(n, stamp_ns, np.int64),
+            point_index=np.array(self.point_index or [-1] * n, np.int64),
+        )
+
+    def _stack(self, keys: Sequence[str]) -> NDArray[np.float64]:
+        return np.stack([np.array(getattr(self, key), np.float64) for key in keys], axis=1)
+
+
+class FrameLine(BaseModel):
+    """One line: the correspondences of one frame."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    frame: Int64
+    stamp_ns: Int64 = 0
+    cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
+    metadata: Metadata = {}
+
+    def to_frame(self) -> StreamFrame:
+        """The frame with the correspondences of all its cameras.
+
+        Raises:
+            CorrespondenceError: if a value is out of its range.
+        """
+        stamp_ns = self.stamp_ns if "stamp_ns" in self.model_fields_set else None
+        tables = [
+            columns.table(camera, self.frame, stamp_ns) for camera, columns in self.cameras.items()
+        ]
+        if not any("point_index" in columns.given for columns in self.cameras.values()):
+            tables = [replace(table, point_index=None) for table in tables]
+        table = concatenate([_empty_table(self.metadata), *tables])
+        return StreamFrame(self.frame, stamp_ns, table)
+
+
+def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
+    """The frames of JSON lines, each as soon as its line is complete.
+
+    Args:
+        chunks: the bytes, cut anywhere.
+        where: the name of their source in messages.
+    """
+    for number, line in enumerate(_lines(chunks), start=1):
+        place = f"{where}, line {number}"
+        if line is None:
+            found = f"is longer than {MAX_LINE_BYTES} bytes"
+            yield refused(place, f"{found}; send one frame a line, or fewer correspondences")
+        elif line.strip():
+            yield _parse(line, place)
+
+
+def _lines(chunks: Iterable[bytes]) -> Iterator[bytes | None]:
+    """Lines without their ends; None, at once, for one that is too long: its rest is skipped."""
+    kept, too_long = bytearray(), False
+    for chunk in chunks:
+        *ends, rest = chunk.split(b"\n")
+        for end in ends:
+            kept += end
+            if not too_long:
+                yield bytes(kept) if len(kept) <= MAX_LINE_BYTES else None
+            kept, too_long = bytearray(), False
+        kept += rest
+        if len(kept) > MAX_LINE_BYTES:
+            if not too_long:
+                yield None
+            kept, too_long = bytearray(), True
+    if kept and not too_long:
+        yield bytes(kept)
+
+
+def _parse(line: bytes, where: str) -> Item:
+    try:
+        return FrameLine.model_validate(_json(line)).to_frame()
+    except ValidationError as error:
+        found = re.sub(" or instance of [A-Za-z]+", "", describe(error))
+        return refused(where, found.replace("valid dictionary", "JSON object"))
+    except CorrespondenceError as error:
+        return refused(where, str(error))
+
+
+def _json(line: bytes) -> Any:
+    try:
+        return json.loads(
+            line.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique
+        )
+    except UnicodeDecodeError as error:
+        found = f"is not UTF-8 ({error.reason} at byte {error.start})"
+    except json.JSONDecodeError as error:
+        found = f"is not JSON ({error.msg} at column {error.colno})"
+    except RecursionError:
+        found = "is nested too deeply"
+    except ValueError as error:  # Also Python's error about a number of thousands of digits.
+        found = f"cannot be read: {error}"
+    raise CorrespondenceError(f"{found}; send one frame a line, as JSON")
+
+
+def _refuse_constant(token: str) -> None:
+    raise ValueError(f"{token} is no number")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    mapping: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in mapping:
+            raise ValueError(f"key {_short(key)} is given twice")
+        mapping[key] = value
+    return mapping
+
+
+def _empty_table(metadata: dict[str, Any]) -> Correspondences:
+    """A table without rows that holds the metadata."""
+    return Correspondences(
+        cameras=(),
+        camera_index=np.empty(0, np.int32),
+        frame=np.empty(0, np.int64),
+        pixels_px=np.empty((0, 2)),
+        points_lidar_m=np.empty((0, 3)),
+        confidence=np.empty(0, np.float32),
+        metadata=metadata,
+    )
+
+
+def _short(value: object) -> str:
+    return reprlib.repr(value)

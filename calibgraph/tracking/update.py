@@ -1,0 +1,83 @@
+"""The result of one frame: estimates, covariances, verdicts, events."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Verdict
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.tracking.assessment import Assessment, covariance_by_camera
+from calibgraph.tracking.events import Event
+from calibgraph.tracking.state import State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """The estimates after a frame.
+
+    Attributes:
+        frame: its number.
+        stamp_ns: its time, or that of the last frame that had one, or None.
+        T_camera_lidar: per camera, (4, 4): p_camera = T_camera_lidar * p_lidar. The guess, as long
+            as the camera has no estimate.
+        covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+            [rad], translation [m]) in the camera's axes; None with too few frames.
+        verdicts: per camera, whether its estimate can be used now, with reasons.
+        events: the events detected with this frame.
+        used: per camera whose matches were absorbed, how many.
+        left_out: cameras whose matches disagree with the estimate, and were not absorbed.
+    """
+
+    frame: int
+    stamp_ns: int | None
+    T_camera_lidar: dict[str, Array]
+    covariance: dict[str, Array | None]
+    verdicts: dict[str, Verdict]
+    events: tuple[Event, ...]
+    used: dict[str, int]
+    left_out: tuple[str, ...]
+
+
+def make_update(
+    state: State,
+    assessment: Assessment,
+    events: tuple[Event, ...],
+    used: Mapping[int, CameraBlock],
+) -> Update:
+    """The update after the last frame of a state.
+
+    Args:
+        state: after the frame.
+        assessment: of its estimates.
+        events: detected with the frame.
+        used: per camera, by its place in the rig, the absorbed matches.
+    """
+    names = state.names
+    return Update(
+        frame=state.frame or 0,
+        stamp_ns=state.stamp_ns,
+        T_camera_lidar=current_rig(state).T_camera_lidar,
+        covariance=covariance_by_camera(assessment, names),
+        verdicts=assessment.verdicts,
+        events=events,
+        used={names[c]: len(block.frame) for c, block in used.items()},
+        left_out=tuple(
+            name
+            for name, camera_state in zip(names, state.cameras, strict=True)
+            if camera_state.agreements[-1:] == ((state.frame, False),)
+        ),
+    )
+
+
+def current_rig(state: State) -> Rig:
+    """The rig with the present estimates."""
+    estimates = zip(state.names, state.T_lidar_camera, strict=True)
+    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})

@@ -1,0 +1,264 @@
+"""What several checks share, each computed once, when the first check needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.matching.run import MatchingRun
+from calibgraph.model.calibration import Residuals
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import pose_difference, relative_transform
+from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Check
+from calibgraph.progress import Progress, no_progress
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
+from calibgraph.solver.factor_graph import relative_pose_graph
+from calibgraph.solver.objective import Objective, Scales, Transforms
+from calibgraph.solver.solution import Solution
+from calibgraph.trust.bootstrap import bootstrap_covariance
+from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
+from calibgraph.trust.observability import prior_shares
+from calibgraph.trust.thresholds import limit
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+
+Checks = Mapping[str, Sequence[Check]]
+"""Per camera, its checks; a camera without any may be left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class DataOnly:
+    """The solution of the correspondences alone, without priors and relative poses.
+
+    Attributes:
+        T_camera_lidar: per camera that has correspondences, (4, 4).
+        covariance: (6 M, 6 M) in the order of ``T_camera_lidar``, or None.
+    """
+
+    T_camera_lidar: Transforms
+    covariance: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A solution and what its checks compute from it.
+
+    Attributes:
+        solution: of the joint solve.
+        guess: the rig as it was first guessed.
+    """
+
+    solution: Solution
+    guess: Rig
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names, in the rig's order."""
+        return tuple(self.solution.T_camera_lidar)
+
+    @property
+    def findings(self) -> MatcherFindings:
+        """What the matcher reported."""
+        return self.solution.correspondences.findings
+
+    @cached_property
+    def fitted_blocks(self) -> Mapping[str, CameraBlock]:
+        """Per camera, the correspondences that the solution was fitted to, with outliers."""
+        objective = self.solution.objective
+        return objective.blocks if objective.uses_correspondences else {}
+
+    @cached_property
+    def residuals(self) -> dict[str, Residuals]:
+        """Per camera that has correspondences, of all of them, not only the inliers."""
+        solution = self.solution
+        return {
+            name: block.at(solution.T_camera_lidar[name]).summary(solution.scales[name])
+            for name, block in solution.objective.blocks.items()
+        }
+
+    @cached_property
+    def scatter(self) -> Array | None:
+        """(6 N, 6 N) covariance by the scatter between frames, or None."""
+        solution = self.solution
+        return scatter_covariance(solution.inliers, solution.T_camera_lidar, solution.scales)
+
+    @cached_property
+    def joint_covariance(self) -> Array | None:
+        """(6 N, 6 N) by the scatter, plus the error that all the matcher's frames share."""
+        if self.scatter is None:
+            return None
+        return self.scatter + shared_covariance(self.findings, len(self.cameras))
+
+    def scatter_of(self, camera: str) -> Array | None:
+        """(6, 6) of one camera, by the scatter between frames."""
+        return self._block(self.scatter, camera)
+
+    def covariance_of(self, camera: str) -> Array | None:
+        """(6, 6) of one camera, with the error that all the matcher's frames share."""
+        return self._block(self.joint_covariance, camera)
+
+    def _block(self, joint: Array | None, camera: str) -> Array | None:
+        rows = slice(6 * self.cameras.index(camera), 6 * self.cameras.index(camera) + 6)
+        return None if joint is None else joint[rows, rows]
+
+    @cached_property
+    def bootstrap(self) -> dict[str, Array]:
+        """Per camera (6, 6) scatter of re-solves from frames drawn again; empty if not wanted."""
+        return bootstrap_covariance(self.solution)
+
+    @cached_property
+    def prior_shares(self) -> dict[str, float]:
+        """Per camera, which share of its result comes from priors and relative poses."""
+        return prior_shares(self.solution)
+
+    @cached_property
+    def data_sigmas(self) -> Array | None:
+        """(N, 6) standard deviations if every correspondence were independent."""
+        solution = self.solution
+        if not solution.inliers.uses_correspondences:
+            return None
+        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
+        known = relative_pose_graph(solution.inliers.cameras, solution.rig.relative_poses)
+        return data_sigmas(blocks, known, solution.T_camera_lidar)
+
+    @cached_property
+    def even_frames(self) -> NDArray[np.int64]:
+        """Every other one of the frames that any camera has inliers in."""
+        blocks = self.solution.inliers.blocks.values()
+        return np.unique(np.concatenate([block.frame for block in blocks]))[::2]
+
+    @cached_property
+    def halves(self) -> dict[str, tuple[Array, Array]]:
+        """Per camera (4, 4) T_camera_lidar from the even and from the odd frames, if possible."""
+        inliers = self.solution.inliers
+        if not inliers.uses_correspondences:
+            return {}
+        solutions = []
+        for odd in (False, True):
+            half = {
+                name: block.select(np.isin(block.frame, self.even_frames, invert=odd))
+                for name, block in inliers.blocks.items()
+            }
+            if any(len(block.frame) < MIN_MATCHES for block in half.values()):
+                return {}
+            optimum = inliers.with_blocks(half).minimize(
+                self.solution.T_camera_lidar, self.solution.scales
+            )
+            solutions.append(optimum.T_camera_lidar)
+        return {name: (solutions[0][name], solutions[1][name]) for name in inliers.blocks}
+
+    @cached_property
+    def data_only(self) -> DataOnly | None:
+        """The solution of the correspondences alone; None where there is nothing else."""
+        solution = self.solution
+        if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
+            return None
+        free = solution.inliers.data_only()
+        start = {name: solution.T_camera_lidar[name] for name in free.cameras}
+        T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
+        scatter = scatter_covariance(free, T_camera_lidar, solution.scales)
+        shared = shared_covariance(self.findings, len(free.cameras))
+        return DataOnly(T_camera_lidar, None if scatter is None else scatter + shared)
+
+    @cached_property
+    def conflicts(self) -> tuple[Conflict, ...]:
+        """Of the relative poses between cameras that both have correspondences."""
+        if self.data_only is None:
+            return ()
+        T_camera_lidar, covariance = self.data_only.T_camera_lidar, self.data_only.covariance
+        cameras = tuple(self.solution.inliers.blocks)
+        return tuple(
+            relative_pose_conflict(pair, cameras, T_camera_lidar, covariance)
+            for pair in self.solution.rig.relative_poses
+            if pair.a in cameras and pair.b in cameras
+        )
+
+    def pull_of(self, camera: str) -> tuple[float, float] | None:
+        """How far priors and relative poses pull a camera from its own solution: deg, cm.
+
+        None where they do not, or within what that solution leaves open.
+        """
+        if self.data_only is None or camera not in self.solution.inliers.blocks:
+            return None
+        own, covariance = self.data_only.T_camera_lidar[camera], self.data_only.covariance
+        joint = self.solution.T_camera_lidar[camera]
+        if covariance is not None:
+            first = 6 * tuple(self.solution.inliers.blocks).index(camera)
+            sigmas = np.sqrt(np.diag(covariance))[first : first + 6]
+            step = gtsam.Pose3.Logmap(gtsam.Pose3(relative_transform(joint, own)))
+            if np.abs(step / sigmas).max() < limit("pull_sigmas"):
+                return None
+        return pose_difference(joint, own)
+
+    def estimate(self, camera: str) -> Estimate:
+        """What the checks of one camera's estimate need."""
+        solution, block = self.solution, self.solution.inliers.blocks.get(camera)
+        sigmas = self.data_sigmas
+        return Estimate(
+            camera=solution.rig.cameras[camera],
+            residuals=self.residuals.get(camera),
+            used=0 if block is None else len(block.frame),
+            frames=0 if block is None else len(np.unique(block.frame)),
+            covariance=self.covariance_of(camera),
+            data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
+            halves=self.halves.get(camera),
+            conflicts=tuple(c for c in self.conflicts if camera in (c.pair.a, c.pair.b)),
+            pull=self.pull_of(camera),
+            converged=solution.optimum.converged,
+            terms=solution.terms,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RunEvidence:
+    """All rounds of matching and solving, and the files they read.
+
+    Attributes:
+        run: the outcome of the rounds.
+        hashes: SHA-256 of the files, by path.
+        progress: called as the images are checked.
+    """
+
+    run: MatchingRun
+    hashes: Mapping[str, str]
+    progress: Progress = no_progress
+
+    @cached_property
+    def solution(self) -> Evidence:
+        """Of the solution of the last round."""
+        return Evidence(self.run.solution, self.run.guess)
+
+
+def scatter_covariance(
+    inliers: Objective, T_camera_lidar: Transforms, scales: Scales
+) -> Array | None:
+    """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
+    if not inliers.uses_correspondences:
+        return None
+    return cluster_robust_covariance(
+        {name: block.with_scale(scales[name]) for name, block in inliers.blocks.items()},
+        {name: block.frame for name, block in inliers.blocks.items()},
+        inliers.pose_graph,
+        T_camera_lidar,
+        gate_hessian=inliers.gate_hessian,
+    )
+
+
+def shared_covariance(findings: MatcherFindings, cameras: int) -> Array:
+    """(6 N, 6 N) covariance of the error that all frames of a matcher share."""
+    rotation_rad, translation_m = findings.systematic_sigmas
+    sigmas = pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m)
+    return np.diag(np.tile(sigmas**2, cameras))
+
+
+def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:
+    """Per camera the checks of all parts, one part after the other."""
+    return {name: [check for part in parts for check in part.get(name, ())] for name in cameras}

@@ -1,0 +1,79 @@
+"""Checks of what the matcher reported beside its correspondences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.verdict import Check, Threshold
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.solution_checks import check_sigmas
+from calibgraph.trust.thresholds import threshold
+
+
+def matcher_checks(evidence: Evidence) -> Checks:
+    """The checks of every camera's matches.
+
+    The error that all frames share is part of the error bar; it is checked where there is none.
+    """
+    findings = evidence.findings
+    alone = evidence.joint_covariance is None
+    shared_sigmas = findings.systematic_sigmas if alone else (0.0, 0.0)
+    return {name: check_findings(findings, name, shared_sigmas) for name in evidence.cameras}
+
+
+def check_findings(
+    findings: MatcherFindings, camera: str, shared_sigmas: tuple[float, float] = (0.0, 0.0)
+) -> list[Check]:
+    """The checks of one camera's matches.
+
+    Args:
+        findings: of the matcher.
+        camera: whose.
+        shared_sigmas: rotation [rad], translation [m] of the error that all its frames share.
+    """
+    z_score = findings.z_score.get(camera)
+    return [
+        *_search_checks(findings, camera),
+        *_share_checks(findings, camera),
+        *check_sigmas("error that the matcher's frames share", np.repeat(shared_sigmas, 3)),
+        *([] if z_score is None else [threshold("z_score").check(z_score)]),
+    ]
+
+
+def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+    """Whether the matcher's global search found the camera, if it searched."""
+    missed, found = findings.missed.get(camera), findings.found.get(camera)
+    if missed is not None:
+        text = (
+            "no extrinsic within the matcher's range explains the images (best z-score "
+            f"{missed:.1f} of image and cloud): check the guess, the intrinsics and the pairing, "
+            "widen --search-deg and --search-m, or give more frames from more places"
+        )
+        return [Check("search", "FAIL", text, missed)]
+    if found is not None:
+        text = f"z-score {found:.1f} of image and cloud where the rounds began"
+        return [Check("search", "PASS", text, found)]
+    return []
+
+
+def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+    """What a learned matcher does with its start, without its image, and with its frames."""
+    shares = (
+        (threshold("start_dependence"), findings.start_dependence.get(camera),
+         "of a displaced start remains in the matches"),
+        (threshold("recall"), findings.recall.get(camera),
+         "of a displaced start is undone even without the image"),
+        (threshold("failed_frames"), findings.failed_share.get(camera, 0.0),
+         "of the frames failed to be matched"),
+    )  # fmt: skip
+    return [_check_share(row, share, text) for row, share, text in shares if share is not None]
+
+
+def _check_share(row: Threshold, share: float, text: str) -> Check:
+    found = "an unknown share" if math.isnan(share) else f"{share:.0%}"
+    status = row.grade(share)
+    advice = f": {row.advice}" if row.advice and status != "PASS" else ""
+    return row.describe(share, status, f"{found} {text}{advice}")

@@ -1,0 +1,53 @@
+"""What `mkdocs build` adds to the pages: generated tables, formulas as MathML, pictures."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from tables import GENERATED
+
+ROOT = Path(__file__).resolve().parents[1]
+PICTURES = ("data/overlay.png", "data/track.png")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pictures that the README shows too."""
+    for name in PICTURES:
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Fill in the generated tables, and point to the pictures where the site has them."""
+    for name, generate in GENERATED.items():
+        line = f"<!-- generated: {name} -->"
+        if line in markdown:
+            markdown = markdown.replace(line, generate())
+    return markdown.replace("](../data/", "](data/")
+
+
+def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn formulas into MathML, which browsers show without a script, and wrap tables."""
+    content = _ROLE.sub("", _FORMULA.sub(_to_mathml, content))
+    return content.replace("<table>", '<div class="wide"><table>').replace(
+        "</table>", "</table></div>"
+    )
+
+
+_FORMULA = re.compile(
+    r'<(?P<tag>span|div) class="arithmatex">\\[\[(](?P<latex>.*?)\\[\])]</(?P=tag)>', re.DOTALL
+)
+
+
+_ROLE = re.compile(r":(?:func|class|meth|mod):(?=<code>)")  # docstrings are written for Sphinx
+
+
+def _to_mathml(match: re.Match[str]) -> str:
+    display = "block" if match["tag"] == "div" else "inline"
+    return convert(html.unescape(match["latex"]).strip(), display=display)

@@ -1,0 +1,163 @@
+"""Tables for the pages, in place of a line ``<!-- generated: NAME -->``, from the code itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import click
+from pydantic import BaseModel
+from typer.main import get_command
+
+
+def thresholds() -> str:
+    """The thresholds of all checks."""
+    from calibgraph.trust.thresholds import thresholds_markdown
+
+    return thresholds_markdown()
+
+
+def settings() -> str:
+    """The settings of the solve: name, values, default, meaning."""
+    from calibgraph.model.config import Config
+
+    return settings_table(Config, leave_out={"preset", "tracking"})
+
+
+def tracking_settings() -> str:
+    """The settings under ``tracking``."""
+    from calibgraph.model.config import Tracking
+
+    return settings_table(Tracking)
+
+
+def training_settings() -> str:
+    """The settings of `calibgraph train`."""
+    from calibgraph.matching.cmrnext.training.settings import TrainSettings
+
+    return settings_table(TrainSettings)
+
+
+def presets() -> str:
+    """The settings in which the presets differ."""
+    from calibgraph.model.config import PRESETS, preset
+
+    values = {name: preset(name).model_dump(exclude={"preset"}) for name in PRESETS}
+    rows = [
+        [f"`{key}`", *(_default(of_preset[key]) for of_preset in values.values())]
+        for key in next(iter(values.values()))
+        if len({str(of_preset[key]) for of_preset in values.values()}) > 1
+    ]
+    return table(["setting", *(f"`{name}`" for name in PRESETS)], rows)
+
+
+def commands() -> str:
+    """Every command with its arguments and options, from the program itself."""
+    from calibgraph.cli.app import app
+
+    return "\n\n".join(_command(name, command) for name, command in _walk(get_command(app)))
+
+
+GENERATED: Mapping[str, Callable[[], str]] = {
+    "thresholds": thresholds,
+    "settings": settings,
+    "tracking settings": tracking_settings,
+    "training settings": training_settings,
+    "presets": presets,
+    "commands": commands,
+}
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table."""
+    head = list(header)
+    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def settings_table(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
+    """The fields of a model with their meaning: their descriptions, or the docstring's."""
+    schema = model.model_json_schema()["properties"]
+    meanings = attributes_of(model.__doc__ or "")
+    rows = [
+        [
+            f"`{name}`",
+            _cell(field.description or meanings[name]),
+            _default(field.default),
+            _values(schema[name]),
+        ]
+        for name, field in model.model_fields.items()
+        if name not in set(leave_out)
+    ]
+    return table(["setting", "meaning", "default", "values"], rows)
+
+
+def attributes_of(docstring: str) -> dict[str, str]:
+    """What the section "Attributes" of a docstring has to each name."""
+    section = docstring.partition("Attributes:\n")[2]
+    found: dict[str, str] = {}
+    for names, text in re.findall(r"^ {8}([\w, ]+): (.*?)(?=^ {8}\S|\Z)", section, re.M | re.S):
+        for name in names.split(", "):
+            found[name] = _cell(text)
+    return found
+
+
+def _cell(text: str) -> str:
+    """Text on one line, fit for a table."""
+    return " ".join(text.replace("``", "`").split()).replace("|", r"\|")
+
+
+def _values(schema: Mapping[str, Any]) -> str:
+    """The values that a setting may have, from its JSON schema."""
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(_values(part) for part in schema["anyOf"]))
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    if schema["type"] == "null":
+        return "`null`"
+    low = schema.get("minimum", schema.get("exclusiveMinimum"))
+    high = schema.get("maximum", schema.get("exclusiveMaximum"))
+    if low is not None and high is not None:
+        above = "above " if "exclusiveMinimum" in schema else ""
+        return f"{above}{low:.10g} to {high:.10g}"
+    if low is not None:
+        return f"above {low:.10g}" if "exclusiveMinimum" in schema else f"from {low:.10g}"
+    words = {"boolean": "`true`, `false`", "array": "`[height, width]`", "integer": "whole number"}
+    return words.get(schema["type"], schema["type"])
+
+
+def _default(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "`null`", True: "`true`", False: "`false`"}[value]
+    return f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+def _walk(command: click.Command, name: str = "calibgraph") -> Iterable[tuple[str, click.Command]]:
+    """All commands that do something, with their full names."""
+    children = getattr(command, "commands", None)
+    if children is None:
+        yield name, command
+        return
+    for child, inner in children.items():
+        yield from _walk(inner, f"{name} {child}")
+
+
+def _command(name: str, command: click.Command) -> str:
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    options = [p for p in command.params if p.param_type_name == "option"]
+    usage = " ".join([name, *(p.metavar or p.name.upper() for p in arguments), "[options]"])
+    rows = [[f"`{p.metavar or p.name.upper()}`", _cell(p.help or ""), ""] for p in arguments]
+    rows += [[_flags(p), _cell(p.help or ""), _shown_default(p)] for p in options]
+    parts = [f"### {name}", _cell(command.help or ""), f"```text\n{usage}\n```"]
+    return "\n\n".join([*parts, table(["option", "meaning", "default"], rows)])
+
+
+def _flags(option: click.Parameter) -> str:
+    names = "`, `".join([*option.opts, *option.secondary_opts])
+    return f"`{names} {option.metavar}`" if option.metavar else f"`{names}`"
+
+
+def _shown_default(option: click.Parameter) -> str:
+    shown = getattr(option, "show_default", False)
+    return f"`{option.default}`" if shown and option.default not in (None, False) else ""

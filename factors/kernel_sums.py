@@ -1,0 +1,223 @@
+"""The sums over a tile: whitening, the loss and its weights, and the 28 sums of H, b and c."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from factors.loss import CAUCHY, loss_and_weight
+from factors.tile import FAST, PRODUCT, PSI, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
+
+_SMALL = 1e-100  # far from the smallest float by more than four factors
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
+    """Multiply residuals and derivatives by the whitening matrices, or by numbers."""
+    if whitening.shape[0] == 0:
+        return
+    diagonal = whitening.shape[0] == 1
+    for i in range(n):
+        s00 = whitening[0, start + i]
+        s01 = 0.0 if diagonal else whitening[1, start + i]
+        s11 = s00 if diagonal else whitening[2, start + i]
+        tile[RU, i] = s00 * tile[RU, i] + s01 * tile[RV, i]
+        tile[UX, i] = s00 * tile[UX, i] + s01 * tile[VX, i]
+        tile[UY, i] = s00 * tile[UY, i] + s01 * tile[VY, i]
+        tile[UZ, i] = s00 * tile[UZ, i] + s01 * tile[VZ, i]
+        tile[RV, i] *= s11
+        tile[VX, i] *= s11
+        tile[VY, i] *= s11
+        tile[VZ, i] *= s11
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
+    """Multiply residuals by their weights w, if these are numbers."""
+    if whitening.shape[0] == 0:
+        return
+    ru, rv, weights = tile[RU], tile[RV], whitening[0][start:]
+    for i in range(n):
+        ru[i] *= weights[i]
+        rv[i] *= weights[i]
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
+    """Fill in the weights psi; return the sum of rho."""
+    if loss != CAUCHY:
+        cost = 0.0
+        for i in range(n):
+            rho, tile[PSI, i] = loss_and_weight(
+                loss, scale, tile[RU, i] * tile[RU, i] + tile[RV, i] * tile[RV, i]
+            )
+            cost += rho
+        return cost
+    k = 1.0 / (scale * scale)
+    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
+    for i in range(n):
+        psi[i] = 1.0 / (1.0 + k * (ru[i] * ru[i] + rv[i] * rv[i]))
+    return -_sum_of_logarithms(psi, n, tile[PRODUCT]) / k
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
+    """The logarithm of the product of ``n`` values, taken before it leaves the range of a float.
+
+    A multiplication each, most of them vectorized, instead of a logarithm.
+    """
+    quarter = n // 4
+    second, third, fourth = values[quarter:], values[2 * quarter :], values[3 * quarter :]
+    for i in range(quarter):
+        products[i] = (values[i] * second[i]) * (third[i] * fourth[i])
+    logarithms, even, odd = 0.0, 1.0, 1.0  # two, because one would wait for itself
+    for i in range(quarter // 2):
+        even *= products[2 * i]
+        odd *= products[2 * i + 1]
+        if even < _SMALL or odd < _SMALL:
+            logarithms += math.log(even) + math.log(odd)
+            even = odd = 1.0
+    if quarter % 2:
+        odd *= products[quarter - 1]
+    for i in range(4 * quarter, n):
+        even *= values[i]
+    return logarithms + math.log(even) + math.log(odd)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
+    """Add J^T psi J and J^T psi r of a tile to the 27 sums of a segment."""
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
+    h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    res_u, res_v = tile[RU], tile[RV]
+    for i in range(n):
+        # q = X^-1 p:  dq / d(rotation, translation) = ([q]x, -I);  g^T [q]x = (g x q)^T.
+        x, y, z, psi = rx[i], ry[i], rz[i], rp[i]
+        u3, u4, u5 = -ux[i], -uy[i], -uz[i]
+        v3, v4, v5 = -vx[i], -vy[i], -vz[i]
+        u0, u1, u2 = u5 * y - u4 * z, u3 * z - u5 * x, u4 * x - u3 * y
+        v0, v1, v2 = v5 * y - v4 * z, v3 * z - v5 * x, v4 * x - v3 * y
+        a0, a1, a2, a3, a4, a5 = psi * u0, psi * u1, psi * u2, psi * u3, psi * u4, psi * u5
+        c0, c1, c2, c3, c4, c5 = psi * v0, psi * v1, psi * v2, psi * v3, psi * v4, psi * v5
+        ru, rv = res_u[i], res_v[i]
+        h00 += a0 * u0 + c0 * v0
+        h01 += a0 * u1 + c0 * v1
+        h02 += a0 * u2 + c0 * v2
+        h03 += a0 * u3 + c0 * v3
+        h04 += a0 * u4 + c0 * v4
+        h05 += a0 * u5 + c0 * v5
+        h11 += a1 * u1 + c1 * v1
+        h12 += a1 * u2 + c1 * v2
+        h13 += a1 * u3 + c1 * v3
+        h14 += a1 * u4 + c1 * v4
+        h15 += a1 * u5 + c1 * v5
+        h22 += a2 * u2 + c2 * v2
+        h23 += a2 * u3 + c2 * v3
+        h24 += a2 * u4 + c2 * v4
+        h25 += a2 * u5 + c2 * v5
+        h33 += a3 * u3 + c3 * v3
+        h34 += a3 * u4 + c3 * v4
+        h35 += a3 * u5 + c3 * v5
+        h44 += a4 * u4 + c4 * v4
+        h45 += a4 * u5 + c4 * v5
+        h55 += a5 * u5 + c5 * v5
+        b0 += a0 * ru + c0 * rv
+        b1 += a1 * ru + c1 * rv
+        b2 += a2 * ru + c2 * rv
+        b3 += a3 * ru + c3 * rv
+        b4 += a4 * ru + c4 * rv
+        b5 += a5 * ru + c5 * rv
+    sums = (
+        h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25, h33, h34, h35,
+        h44, h45, h55, b0, b1, b2, b3, b4, b5,
+    )  # fmt: skip
+    for k in range(27):
+        out[segment, k] += sums[k]
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
+    """Turn the residuals w r into psi w^2 r, and psi into psi w^2, if the weights are numbers."""
+    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
+    if whitening.shape[0] == 0:
+        for i in range(n):
+            ru[i] *= psi[i]
+            rv[i] *= psi[i]
+        return
+    weights = whitening[0][start:]
+    for i in range(n):
+        w = weights[i]
+        ru[i] *= psi[i] * w
+        rv[i] *= psi[i] * w
+        psi[i] *= w * w
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def sum_rays(lens, n, tile, out, segment):  # type: ignore[no-untyped-def]
+    """Add the 27 sums of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
+
+    The rows of the Jacobian are fx (ab, -A, b, -w, 0, aw) and fy (B, -ab, -a, 0, -w, bw) with
+    A = 1 + a^2 and B = 1 + b^2: their 21 products share most of their terms, and the focal lengths
+    come in at the end. ``u05``: of the first row's entries 0 and 5, without sign and focal length.
+    """
+    pull_u, pull_v = tile[RU], tile[RV]
+    ray_a, ray_b, ray_w, weight = tile[A], tile[B], tile[W], tile[PSI]
+    u00 = v00 = u11 = u01 = v01 = u02 = v02 = u12 = v12 = u22 = v22 = 0.0
+    for i in range(n):
+        a, b, psi = ray_a[i], ray_b[i], weight[i]
+        big_a, big_b, ab = 1.0 + a * a, 1.0 + b * b, a * b
+        psi_ab, psi_a, psi_b = psi * ab, psi * big_a, psi * big_b
+        u00 += psi_ab * ab
+        v00 += psi_b * big_b
+        u11 += psi_a * big_a
+        u01 += psi_ab * big_a
+        v01 += psi_ab * big_b
+        u02 += psi_ab * b
+        v02 += psi_b * a
+        u12 += psi_a * b
+        v12 += psi_ab * a
+        u22 += psi * b * b
+        v22 += psi * a * a
+    u03 = v04 = u13 = u05 = v15 = v05 = u15 = v24 = u23 = u33 = u35 = v45 = u55 = v55 = 0.0
+    for i in range(n):
+        a, b, w, psi = ray_a[i], ray_b[i], ray_w[i], weight[i]
+        psi_ab, psi_a, psi_b = psi * a * b, psi * (1.0 + a * a), psi * (1.0 + b * b)
+        aw, bw = a * w, b * w
+        u03 += psi_ab * w
+        v04 += psi_b * w
+        u13 += psi_a * w
+        u05 += psi_ab * aw
+        v15 += psi_ab * bw
+        v05 += psi_b * bw
+        u15 += psi_a * aw
+        v24 += psi * aw
+        u23 += psi * bw
+        u33 += psi * w * w
+        u35 += psi * w * aw
+        v45 += psi * w * bw
+        u55 += psi * aw * aw
+        v55 += psi * bw * bw
+    fx, fy = lens[0], lens[1]
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for i in range(n):
+        a, b, w, u, v = ray_a[i], ray_b[i], ray_w[i], fx * pull_u[i], fy * pull_v[i]
+        both = a * u + b * v
+        b0 += b * both + v
+        b1 -= a * both + u
+        b2 += b * u - a * v
+        b3 -= w * u
+        b4 -= w * v
+        b5 += w * both
+    p, q = fx * fx, fy * fy
+    sums = (
+        p * u00 + q * v00, -p * u01 - q * v01, p * u02 - q * v02, -p * u03, -q * v04,
+        p * u05 + q * v05, p * u11 + q * u00, -p * u12 + q * v12, p * u13, q * u03,
+        -p * u15 - q * v15, p * u22 + q * v22, -p * u23, q * v24, (p - q) * u03,
+        p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55, b0, b1, b2, b3, b4, b5,
+    )  # fmt: skip
+    for k in range(27):
+        out[segment, k] += sums[k]

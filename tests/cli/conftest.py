@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calibgraph import MatcherErrors, perturb, simulate_correspondences
+from tests.conftest import make_pair
+
+
+def save_problem(folder: Path) -> Path:
+    """A folder with a rig, its truth, and a table of correspondences."""
+    pair = make_pair()
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.15)
+    table = simulate_correspondences(pair, frames=8, matches=200, errors=errors)
+    table.save(folder / "table.parquet")
+    pair.save(folder / "truth.yaml")
+    perturb(pair, rotation_deg=2, translation_m=0.2).save(folder / "rig.yaml")
+    return folder
+
+
+@pytest.fixture
+def problem(tmp_path: Path) -> Path:
+    """See :func:`save_problem`."""
+    return save_problem(tmp_path)
+
+
+def error_line(code: int, out: str, err: str) -> str:
+    """The message of bad input: exit code 2, nothing on stdout, one line on stderr."""
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith("calibgraph: ")
+    return err

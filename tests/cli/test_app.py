@@ -1,0 +1,138 @@
+"""One line for bad input, exit codes, and a fast ``--help``."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import load_rig
+from calibgraph.cli import app
+from tests.cli.conftest import error_line
+from tests.conftest import SAMPLE, Call
+
+
+def test_bad_rigs_and_tables_are_one_line(problem: Path, call: Call) -> None:
+    rig, table = problem / "rig.yaml", problem / "table.parquet"
+    (problem / "half.parquet").write_bytes(table.read_bytes()[:1000])
+    (problem / "bad.yaml").write_text("format: calibgraph-rig/1\ncameras: {a: {fov: 3}}\n")
+    (problem / "config.yaml").write_text("preset: kitti\nlambda: 3\n")
+    (problem / "negative.yaml").write_text("gate_px: -1\n")
+    cases: dict[str, tuple[object, ...]] = {
+        "no such file": ("solve", problem / "nothing.yaml", table),
+        "cannot be read as Parquet": ("solve", rig, problem / "half.parquet"),
+        "unknown key": ("solve", problem / "bad.yaml", table),
+        "unknown key 'lambda'": ("solve", rig, table, "--config", problem / "config.yaml"),
+        "gate_px": ("solve", rig, table, "--config", problem / "negative.yaml"),
+        "unknown preset 'best'": ("solve", rig, table, "--preset", "best"),
+        "--terms 'all'": ("solve", rig, table, "--terms", "all"),
+        "exclude each other": (
+            "solve", rig, table, "--preset", "kitti", "--config", problem / "config.yaml",
+        ),
+        "not in the reference": ("evaluate", rig, SAMPLE / "reference.yaml"),
+        "unknown matcher 'magic'": ("calibrate", SAMPLE, "--matcher", "magic"),
+        "no such folder": ("calibrate", problem / "nothing"),
+        "frames '9:'": ("calibrate", SAMPLE, "--frames", "9:"),
+        "must end in": ("match", SAMPLE, "--out", problem / "table.txt"),
+    }  # fmt: skip
+    for message, arguments in cases.items():
+        extra = () if arguments[0] in ("evaluate", "match") else ("--out", problem / "never")
+        assert message in error_line(*call(*arguments, *extra))
+    assert not (problem / "never").exists()
+
+
+@pytest.mark.slow
+def test_cameras_that_see_nothing_of_the_cloud_are_one_line(call: Call, tmp_path: Path) -> None:
+    rig = load_rig(SAMPLE)
+    backwards = np.diag([-1.0, 1.0, -1.0, 1.0]) @ rig.T_camera_lidar["front_left"]
+    # Behind the rig the sample's LiDAR returns nothing at all.
+    rig.moved_to({"front_left": backwards}).save(tmp_path / "rig.yaml")
+    message = error_line(*call("calibrate", SAMPLE, "--rig", tmp_path / "rig.yaml",
+                               "--out", tmp_path / "out"))  # fmt: skip
+    assert "'front_left'" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_image_writes_nothing(call: Call, tmp_path: Path) -> None:
+    sample = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+    broken = sample / "cameras" / "left" / "000005.jpg"
+    broken.write_bytes(broken.read_bytes()[:9000])
+    message = error_line(*call("calibrate", sample, "--out", tmp_path / "out"))
+    assert "000005.jpg" in message
+    assert "truncated" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unwritable_folder_is_one_line(problem: Path, call: Call) -> None:
+    (problem / "occupied").write_text("a file, not a folder")
+    message = error_line(*call("solve", problem / "rig.yaml", problem / "table.parquet",
+                               "--out", problem / "occupied"))  # fmt: skip
+    assert "occupied" in message
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("calibrate",),
+        ("calibrate", SAMPLE, "--seed", -1),
+        ("calibrate", SAMPLE, "--seed", 10**30),
+        ("calibrate", SAMPLE, "--colour", "red"),
+        ("guess", SAMPLE),
+        ("perturb", SAMPLE, "--out", "never.yaml", "--translation-m", "inf"),
+        ("perturb", SAMPLE, "--out", "never.yaml", "--rotation-deg", "nan"),
+        ("perturb", SAMPLE, "--out", SAMPLE),
+        ("perturb", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+        ("perturb", SAMPLE, "--out", SAMPLE / "reference.yaml"),
+        ("perturb", SAMPLE, "--out", SAMPLE / "lidar" / "000000.npy"),
+        ("report", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+        ("calibrate", SAMPLE, "--search-deg", "none", "--search-m", 1.5),
+        ("calibrate", SAMPLE, "--out", SAMPLE / "rig.yaml"),
+    ],
+)
+def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -> None:
+    error_line(*call(*arguments))
+
+
+def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None:
+    def interrupt(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("calibgraph.io.rigs.load_rig", interrupt)
+    code, out, err = call("perturb", SAMPLE, "--out", "never.yaml")
+    assert (code, out, err) == (130, "", "calibgraph: interrupted\n")
+
+
+def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    missing = str(tmp_path / "nothing.yaml")
+    monkeypatch.setattr(sys, "argv", ["calibgraph", "--debug", "evaluate", missing, missing])
+    with pytest.raises(Exception, match="no such file"):
+        app.main()
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; sys.argv = ['calibgraph', '--help']\n"
+        "from calibgraph.cli.app import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'gtsam', 'numpy', 'numba', 'cv2', 'scipy', 'pyarrow', 'pydantic', 'jinja2'}\n"
+        "sys.exit(str(heavy & set(sys.modules)) if heavy & set(sys.modules) else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for command in (
+        "calibrate", "match", "solve", "report", "evaluate", "perturb", "simulate", "weights",
+        "train", "bench", "tune", "track",
+    ):  # fmt: skip
+        assert command in done.stdout
+
+
+def test_it_runs_as_a_module_too() -> None:
+    command = [sys.executable, "-m", "calibgraph", "evaluate", "nothing.yaml", "nothing.yaml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("calibgraph: nothing.yaml") and done.stderr.count("\n") == 1

@@ -1,0 +1,135 @@
+"""calibrate, match and solve: what they print and write, and the exit code of a FAIL."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from calibgraph import (
+    MatcherErrors,
+    Rig,
+    load_calibration,
+    load_correspondences,
+    load_rig,
+    simulate_correspondences,
+)
+from tests.cli.conftest import save_problem
+from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
+    """``solve`` of the problem, with seed 3."""
+    problem = save_problem(tmp_path_factory.mktemp("problem"))
+    out = problem / "result"
+    return run_command(
+        "solve", problem / "rig.yaml", problem / "table.parquet", "--out", out, "--seed", 3,
+        folder=out,
+    )  # fmt: skip
+
+
+def test_solve_then_evaluate(solved: CommandRun, call: Call) -> None:
+    assert solved.code == 0
+    assert solved.stdout == ""
+    assert "PASS" in solved.stderr
+    assert "p_camera = T_camera_lidar * p_lidar" in solved.stderr
+    out, truth = solved.folder, solved.folder.parent / "truth.yaml"
+    code, stdout, _ = call("evaluate", out, truth, "--json")
+    assert code == 0
+    errors = json.loads(stdout)
+    keys = {
+        "rotation_error_deg", "translation_error_cm", "x_cm", "y_cm", "z_cm",
+        "roll_deg", "pitch_deg", "yaw_deg",
+    }  # fmt: skip
+    assert set(errors["cameras"]) == {"left", "right"}
+    assert set(errors["pairs"]) == {"left->right"}
+    for error in (*errors["cameras"].values(), *errors["pairs"].values()):
+        assert set(error) == keys
+        assert error["rotation_error_deg"] < 0.1
+    _, _, table = call("evaluate", out / "calibration.yaml", truth)
+    assert "left->right" in table
+
+
+def test_the_result_file_is_complete_and_returns_the_result(solved: CommandRun) -> None:
+    out = solved.folder
+    content = yaml.safe_load((out / "calibration.yaml").read_text())
+    assert content["format"] == "calibgraph-calibration/1"
+    assert content["frames"] == "p_camera = T_camera_lidar * p_lidar"
+    assert content["config"]["seed"] == 3
+    assert list(content["inputs"]) == [str(out.parent / "table.parquet")]
+    assert {"gtsam", "numpy", "calibgraph"} <= set(content["versions"])
+    result = load_calibration(out)
+    assert result.verdict.status == "PASS"
+    assert result.covariance["left"].shape == (6, 6)
+    rig = load_rig(out)
+    for name, T in result.T_camera_lidar.items():
+        np.testing.assert_array_equal(rig.T_camera_lidar[name], T)
+
+
+def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
+    code, stdout, stderr = call(
+        "solve", problem / "rig.yaml", problem / "table.parquet",
+        "--out", problem / "result", "--json",
+    )  # fmt: skip
+    assert code == 0
+    assert stderr == ""
+    summary = json.loads(stdout)
+    assert set(summary) == {"verdict", "reasons", "cameras", "pairs", "timings_s", "files"}
+    assert summary["verdict"] == "PASS"
+    assert np.array(summary["cameras"]["left"]["T_camera_lidar"]).shape == (4, 4)
+    assert len(summary["cameras"]["left"]["rotation_sigma_deg"]) == 3
+
+
+def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, call: Call) -> None:
+    rig = load_rig(problem / "rig.yaml")
+    nonsense = MatcherErrors(outlier_share=1.0)
+    simulate_correspondences(rig, errors=nonsense).save(problem / "bad.parquet")
+    out = problem / "result"
+    code, _, stderr = call("solve", problem / "rig.yaml", problem / "bad.parquet", "--out", out)
+    assert code == 1
+    assert "FAIL" in stderr
+    assert load_calibration(out).verdict.status == "FAIL"
+
+
+def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:
+    assert calibrated_sample.code == 0, calibrated_sample.stderr
+    assert {path.name for path in calibrated_sample.folder.iterdir()} == {
+        "calibration.yaml", "correspondences.parquet", "overlay_front_left.png",
+        "overlay_front_right.png", "overlay_left.png", "report.html",
+    }  # fmt: skip
+    assert len(load_calibration(calibrated_sample.folder).inputs) == 6 * 4
+
+
+def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:
+    rig = Rig(cameras={"[red]": make_camera(), "[bold]b": make_camera((0, 0.5, 0))})
+    rig.save(tmp_path / "rig.yaml")
+    simulate_correspondences(rig, frames=6).save(tmp_path / "table.parquet")
+    code, _, stderr = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet",
+                           "--out", tmp_path / "out")  # fmt: skip
+    assert code == 0
+    assert "[red]" in stderr
+    assert "[bold]b" in stderr
+
+
+def test_a_rig_of_one_camera_is_solved(tmp_path: Path, call: Call) -> None:
+    rig = Rig(cameras={"only": make_camera()})
+    rig.save(tmp_path / "rig.yaml")
+    simulate_correspondences(rig, frames=6).save(tmp_path / "table.parquet")
+    code, _, _ = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet",
+                      "--out", tmp_path / "out")  # fmt: skip
+    assert code == 0
+    code, stdout, _ = call("evaluate", tmp_path / "out", tmp_path / "rig.yaml", "--json")
+    assert json.loads(stdout)["pairs"] == {}
+
+
+def test_match_writes_a_table(call: Call, tmp_path: Path) -> None:
+    truth = load_rig(SAMPLE / "reference.yaml")
+    simulate_correspondences(truth, frames=6).save(tmp_path / "table.parquet")
+    code, _, _ = call("match", SAMPLE, "--matcher", tmp_path / "table.parquet",
+                      "--frames", "0:3", "--out", tmp_path / "part.csv")  # fmt: skip
+    assert code == 0
+    assert set(load_correspondences(tmp_path / "part.csv").frame.tolist()) == {0, 1, 2}

@@ -1,0 +1,216 @@
+"""Tables from disk: what was written is read, what is wrong is named in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from calibgraph import (
+    CorrespondenceError,
+    FileError,
+    load_correspondences,
+)
+from calibgraph.io.correspondence_tables import from_arrow
+from tests.model.test_correspondences import table, to_arrow
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
+    given = table(
+        information_px=[[1, 0, 1], [2, 0.5, 1], [1, 1, 1], [4, 0, 0]],
+        stamp_ns=[1, 2, 2, 1_700_000_000_123_456_789],
+        point_index=[7, -1, 0, 2**40],
+        metadata={"matcher": "by hand", "settings": {"k": 1}},
+    )
+    path = tmp_path / f"table{suffix}"
+    given.save(path)
+    read = load_correspondences(path)
+    assert [read.cameras[i] for i in read.camera_index] == ["left", "left", "right", "left"]
+    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns", "point_index"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
+    np.testing.assert_array_equal(read.information_px, given.information_px)
+    if suffix == ".parquet":
+        assert read.metadata == given.metadata
+        assert parquet.read_schema(path).metadata[b"format"] == b"calibgraph-correspondences/1"
+
+
+def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
+    """Plain strings, float32, no confidence, no metadata, columns in another order."""
+    columns = {
+        "x_m": np.float32([1.5, 2]), "y_m": np.float32([0, 1]), "z_m": np.float32([0, 1]),
+        "u_px": np.float32([5, 6]), "v_px": np.float32([7, 8]),
+        "frame": [3, 4], "camera": ["a", "b"],
+    }  # fmt: skip
+    path = tmp_path / "table.parquet"
+    parquet.write_table(pa.table(columns), path)
+    read = load_correspondences(path)
+    assert read.points_lidar_m[0].tolist() == [1.5, 0, 0]
+    assert read.confidence.tolist() == [1, 1]
+    assert read.counts() == {"a": 1, "b": 1}
+
+
+def test_bad_files_are_named(tmp_path: Path) -> None:
+    good = tmp_path / "good.parquet"
+    table().save(good)
+    for name, data in {
+        "truncated.parquet": good.read_bytes()[:-200],
+        "head.parquet": good.read_bytes()[:100],
+        "empty.parquet": b"",
+        "text.parquet": b"hello",
+        "empty.csv": b"",
+        "ragged.csv": b"camera,frame\nleft\n",
+        "short.csv": b"camera,frame\nleft,3\n",
+        "words.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,zero,1,2,3,4,5\n",
+        "half.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,0,1.5,2,3,4,\n",
+        "header.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\n",
+        "twice.csv": b"camera,camera,frame,u_px,v_px,x_m,y_m,z_m\na,a,0,1,2,3,4,5\n",
+        "fraction.csv": b"camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,0.5,1,2,3,4,5\n",
+    }.items():
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(FileError, match=name) as caught:
+            load_correspondences(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(FileError, match="no such file"):
+        load_correspondences(tmp_path / "missing.parquet")
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="cannot be read .*name too long.*; check the path"):
+        load_correspondences(tmp_path / ("x" * 300 + ".parquet"))
+
+
+def test_unknown_and_missing_columns_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    arrow = to_arrow(table())
+    parquet.write_table(arrow.append_column("weight", pa.array([1.0] * 4)), path)
+    with pytest.raises(FileError, match="unknown column 'weight'"):
+        load_correspondences(path)
+    parquet.write_table(arrow.drop_columns(["u_px"]), path)
+    with pytest.raises(FileError, match="column 'u_px' is missing"):
+        load_correspondences(path)
+
+
+def test_tables_of_another_format_or_kind_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    arrow = to_arrow(table())
+    for metadata, message in (
+        (
+            {"format": "calibgraph-correspondences/9"},
+            "has the format 'calibgraph-correspondences/9'",
+        ),
+        ({"matcher": "not JSON"}, "metadata"),
+        ({"matcher": "[1]"}, "metadata must be a mapping"),
+        ({"matcher": "[" * 100_000}, "metadata"),
+    ):
+        parquet.write_table(arrow.replace_schema_metadata(metadata), path)
+        with pytest.raises(FileError, match=message) as caught:
+            load_correspondences(path)
+        assert "\n" not in str(caught.value)
+    for name, column in (
+        ("camera", pa.array([["a"]] * 4)),
+        ("frame", pa.array([True] * 4)),
+        ("frame", pa.array([2**63] * 4, pa.uint64())),
+        ("u_px", pa.array(["1"] * 4)),
+    ):
+        index = arrow.column_names.index(name)
+        parquet.write_table(arrow.set_column(index, name, column), path)
+        with pytest.raises(FileError, match=str(path)) as caught:
+            load_correspondences(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_whole_number_is_a_systematic_error_as_well(tmp_path: Path) -> None:
+    said = {"systematic_rotation_rad": 1, "systematic_translation_m": 0.02}
+    table(metadata=said).save(tmp_path / "table.parquet")
+    assert load_correspondences(tmp_path / "table.parquet").findings.systematic_sigmas == (
+        1.0,
+        0.02,
+    )
+
+
+def changed(name: str, column: pa.Array | pa.ChunkedArray, **metadata: str | bytes) -> pa.Table:
+    """A good Arrow table with one column, or its metadata, replaced."""
+    arrow = to_arrow(table())
+    arrow = arrow.set_column(arrow.column_names.index(name), name, column)
+    return arrow.replace_schema_metadata(metadata)
+
+
+FOUR = [1.0] * 4
+
+
+CAMERAS = pa.array([0, 1, 0, 2])
+
+
+@pytest.mark.parametrize(
+    ("arrow", "message"),
+    [
+        (to_arrow(table()).drop_columns(["v_px"]), "column 'v_px' is missing"),
+        (changed("confidence", pa.array([1, 1e300, 1, 1])), r"row 1 .*lie in \(0, 1\]"),
+        (changed("u_px", pa.array([1, None, 1, 1])), "row 1: column 'u_px' is empty"),
+        (changed("u_px", pa.nulls(4)), "column 'u_px' is empty; fill in or drop it"),
+        (changed("camera", pa.array(["a", "b", None, "c"])), "row 2: column 'camera' is empty"),
+        (
+            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, ["a", None, "b"])),
+            "row 1: column 'camera' is empty",
+        ),
+        (
+            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, FOUR)),
+            "'camera' must hold text, found dictionary<values=double",
+        ),
+        (changed("camera", pa.array([b"\xff"] * 4)), "has the wrong type: Invalid UTF8"),
+        (changed("frame", pa.array([2**63] * 4, pa.uint64())), "'frame' .* beyond 64 bits"),
+        (changed("frame", pa.array(FOUR)), "'frame' must hold whole numbers, found double"),
+        (changed("u_px", pa.array(["1"] * 4)), "'u_px' must hold numbers, found string"),
+        (
+            changed("u_px", pa.RunEndEncodedArray.from_arrays([4], [1.0])),
+            "'u_px' must hold numbers, found run_end_encoded",
+        ),
+        (changed("u_px", pa.array([FOUR] * 4)), "'u_px' must hold numbers, found list"),
+        (
+            changed("u_px", pa.array(FOUR).dictionary_encode()),
+            "'u_px' must hold numbers, found dictionary",
+        ),
+        (changed("u_px", pa.array([1] * 4, pa.decimal128(3, 1))), "found decimal"),
+        (changed("u_px", pa.array([1] * 4, pa.timestamp("s"))), "found timestamp"),
+        (
+            changed("u_px", pa.array(FOUR), matcher='{"systematic_rotation_rad": -1}'),
+            "metadata 'systematic_rotation_rad' must be a number from 0 to 3.14, found -1.0",
+        ),
+        (
+            changed("u_px", pa.array(FOUR), matcher=b'{"a": "\xff"}'),
+            "the metadata has the wrong type",
+        ),
+    ],
+)
+def test_wrong_arrow_data_is_named_in_one_line(arrow: pa.Table, message: str) -> None:
+    with pytest.raises(CorrespondenceError, match=message) as caught:
+        from_arrow(arrow)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        pa.array(["left", "left", "right", "left"]).dictionary_encode(),
+        pa.array(["left", "left", "right", "left"], pa.large_string()),
+        pa.array([b"left", b"left", b"right", b"left"]),
+        pa.chunked_array([pa.array(["left", "left"]), pa.array(["right", "left"])]),
+        pa.DictionaryArray.from_arrays([0, 1, 3, 0], ["left", "left", None, "right"]),
+    ],
+)
+def test_names_of_cameras_may_be_any_text(cameras: pa.Array | pa.ChunkedArray) -> None:
+    read = from_arrow(changed("camera", cameras))
+    assert read.counts() == {"left": 3, "right": 1}
+
+
+def test_a_column_whose_name_is_no_utf8_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"camera,fr\xffame,u_px,v_px,x_m,y_m,z_m\nleft,1,1,2,3,4,5\n")
+    with pytest.raises(FileError, match="table.csv: a column's name is not UTF-8") as caught:
+        load_correspondences(path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,68 @@
+"""KITTI odometry sequences: the extrinsics of ``calib.txt``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibgraph import FileError, load_dataset, load_rig
+from tests.conftest import make_camera
+from tests.io.test_clouds import CLOUD
+
+
+def written_kitti(folder: Path, frames: int = 2) -> Path:
+    """A KITTI odometry sequence with two cameras and known numbers."""
+    (folder / "velodyne").mkdir(parents=True)
+    K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
+    lines = []
+    for k in range(4):
+        b = np.array([[-0.5 * k], [0.01 * k], [0.002 * k]])
+        lines.append(f"P{k}: " + " ".join(map(str, (K @ np.hstack([np.eye(3), b])).ravel())))
+    Tr = np.hstack([make_camera((0.27, 0.0, -0.08)).T_camera_lidar[:3]])
+    lines.append("Tr: " + " ".join(map(str, Tr.ravel())))
+    (folder / "calib.txt").write_text("\n".join(lines))
+    for k in (2, 3):
+        (folder / f"image_{k}").mkdir()
+        for i in range(frames):
+            image = np.full((370, 1226, 3), 40 * k, np.uint8)
+            cv2.imwrite(str(folder / f"image_{k}" / f"{i:06}.png"), image)
+    for i in range(frames):
+        CLOUD.tofile(folder / "velodyne" / f"{i:06}.bin")
+    return folder
+
+
+def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:
+    rig = load_rig(written_kitti(tmp_path / "00"))
+    assert list(rig.cameras) == ["image_2", "image_3"]
+    Tr = make_camera((0.27, 0.0, -0.08)).T_camera_lidar
+    for k in (2, 3):
+        expected = Tr.copy()
+        expected[:3, 3] += [-0.5 * k, 0.01 * k, 0.002 * k]
+        np.testing.assert_allclose(rig.T_camera_lidar[f"image_{k}"], expected, atol=1e-12)
+    assert (rig.cameras["image_2"].width_px, rig.cameras["image_2"].height_px) == (1226, 370)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2 is no projection matrix"),
+        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2 is no projection matrix"),
+        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2 is no projection matrix"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and Tr: T_camera_lidar"),
+        ("Tr: 1 0 0", "expected 12 numbers"),
+        ("\xff\xfe", "is not a text file"),
+    ],
+)
+def test_a_wrong_kitti_calibration_is_one_line(tmp_path: Path, line: str, said: str) -> None:
+    folder = written_kitti(tmp_path / "00")
+    path = folder / "calib.txt"
+    key = line.partition(":")[0]
+    kept = [other for other in path.read_text().splitlines() if not other.startswith(key)]
+    path.write_bytes("\n".join([*kept, line]).encode("latin-1"))
+    with pytest.raises(FileError, match=re.escape(said)) as caught:
+        load_dataset(folder)
+    assert "\n" not in str(caught.value)

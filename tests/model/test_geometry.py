@@ -1,0 +1,146 @@
+"""Directions and derivatives of SE(3), by worked points and finite differences."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph.model.geometry import (
+    angle_deg,
+    camera_center,
+    invert,
+    point_in_lidar,
+    pose_difference,
+    pose_rows,
+    relative_covariance,
+    relative_transform,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
+    twist_between,
+)
+
+# A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
+QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+NO_TRANSFORM = "the inverse of an information matrix or a normal equation, not of a transform"
+INVERTING = {
+    "calibgraph/matching/cmrnext/training/samples.py": "a camera matrix K",
+    "calibgraph/solver/augmented_fit.py": NO_TRANSFORM,
+    "calibgraph/tracking/assessment.py": NO_TRANSFORM,
+    "calibgraph/tracking/cause.py": NO_TRANSFORM,
+    "calibgraph/tracking/epoch_summary.py": NO_TRANSFORM,
+    "calibgraph/tracking/noise.py": NO_TRANSFORM,
+    "calibgraph/tracking/posterior.py": NO_TRANSFORM,
+    "calibgraph/tracking/step_detection.py": NO_TRANSFORM,
+}
+
+
+def random_transform(seed: int, size: float = 1.0) -> np.ndarray:
+    return gtsam.Pose3.Expmap(size * np.random.default_rng(seed).standard_normal(6)).matrix()
+
+
+def exp(xi: np.ndarray) -> np.ndarray:
+    return gtsam.Pose3.Expmap(xi).matrix()
+
+
+def test_a_transform_maps_from_its_second_frame_to_its_first() -> None:
+    """One point, by hand, through every direction."""
+    T_camera_lidar = QUARTER
+    in_lidar = np.array([1.0, 0.0, 0.0])
+    in_camera = np.array([1.0, 3.0, 3.0])
+    np.testing.assert_allclose((T_camera_lidar @ [*in_lidar, 1])[:3], in_camera)
+    np.testing.assert_allclose((invert(T_camera_lidar) @ [*in_camera, 1])[:3], in_lidar)
+    np.testing.assert_allclose(point_in_lidar(T_camera_lidar, in_camera), in_lidar)
+    T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
+    np.testing.assert_allclose(T_lidar_camera.transformFrom(in_camera), in_lidar)
+    np.testing.assert_allclose(T_lidar_camera.transformTo(in_lidar), in_camera)
+
+
+def test_the_camera_center_is_the_origin_of_its_frame() -> None:
+    """p_camera = 0 means (-y, x, z) = (-1, -2, -3)."""
+    np.testing.assert_allclose(camera_center(QUARTER), [-2, 1, -3])
+    np.testing.assert_allclose((QUARTER @ [*camera_center(QUARTER), 1])[:3], 0, atol=1e-15)
+
+
+def test_the_variable_and_the_extrinsic_convert_into_each_other() -> None:
+    T = random_transform(1)
+    np.testing.assert_allclose(to_T_camera_lidar(to_T_lidar_camera(T)), T, atol=1e-15)
+    np.testing.assert_allclose(T @ to_T_lidar_camera(T).matrix(), np.eye(4), atol=1e-15)
+    np.testing.assert_allclose(T @ invert(T), np.eye(4), atol=1e-15)
+
+
+def test_a_relative_transform_maps_from_the_second_camera_to_the_first() -> None:
+    T_a_lidar, T_b_lidar = random_transform(1), random_transform(2)
+    point = np.array([0.3, -0.2, 5.0, 1.0])
+    T_a_b = relative_transform(T_a_lidar, T_b_lidar)
+    np.testing.assert_allclose(T_a_b @ T_b_lidar @ point, T_a_lidar @ point, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1e-7, 0.01, 1.0])
+def test_the_twist_is_on_the_left_and_has_the_rotation_first(size: float) -> None:
+    reference = random_transform(1)
+    xi = size * np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
+    # Transforms of size 1 are rounded to 1e-16; their logarithm amplifies that by a few.
+    np.testing.assert_allclose(twist_between(exp(xi) @ reference, reference), xi, atol=1e-14)
+
+
+def test_angles_and_distances_of_extrinsics_are_those_of_the_cameras() -> None:
+    other = QUARTER.copy()
+    other[:3, 3] += QUARTER[:3, :3] @ [0.03, 0.0, 0.04]  # the camera's centre moves by 5 cm
+    degrees, centimetres = pose_difference(QUARTER, other)
+    assert degrees == pytest.approx(0.0, abs=1e-12)
+    assert centimetres == pytest.approx(5.0)
+    assert angle_deg(QUARTER[:3, :3]) == pytest.approx(90.0)
+
+
+def test_rows_of_a_camera_are_six() -> None:
+    joint = np.arange(18)
+    assert [joint[pose_rows(camera)].tolist() for camera in range(3)] == [
+        [*range(0, 6)],
+        [*range(6, 12)],
+        [*range(12, 18)],
+    ]
+
+
+def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
+    """Of xi in T_b_a = exp(xi) estimate, by perturbing both extrinsics on the left."""
+    T_a, T_b = random_transform(1), random_transform(2)
+    T_b_a = relative_transform(T_b, T_a)
+    step = 1e-6
+    jacobian = np.zeros((6, 12))
+    for axis in range(12):
+        ends = []
+        for sign in (1, -1):
+            xi = np.zeros(12)
+            xi[axis] = sign * step
+            moved = relative_transform(exp(xi[6:]) @ T_b, exp(xi[:6]) @ T_a)
+            ends.append(twist_between(moved, T_b_a))
+        jacobian[:, axis] = (ends[0] - ends[1]) / (2 * step)
+    root = np.random.default_rng(3).standard_normal((12, 12))
+    joint = root @ root.T
+    expected = jacobian @ joint @ jacobian.T
+    # Central differences: rounding eps / step = 1e-10, truncation step^2 = 1e-12, times |joint|.
+    tolerance = 1e-8 * np.abs(expected).max()
+    np.testing.assert_allclose(
+        relative_covariance(joint, 0, 1, T_b_a), expected, rtol=0, atol=tolerance
+    )
+
+
+def test_only_the_geometry_inverts_transforms() -> None:
+    """Elsewhere ``inv`` and ``inverse`` occur in the listed files alone, each with its reason."""
+    package = Path(calibgraph.__file__).parent
+    found = set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            called = node.func if isinstance(node, ast.Call) else None
+            if isinstance(called, ast.Attribute) and (
+                ast.unparse(called) == "np.linalg.inv" or called.attr == "inverse"
+            ):
+                found.add(path.relative_to(package.parent).as_posix())
+    assert "calibgraph/model/geometry.py" in found
+    assert found == {"calibgraph/model/geometry.py", *INVERTING}

@@ -1,0 +1,118 @@
+"""The page: everything of a result, nothing fetched, whatever is missing."""
+
+from __future__ import annotations
+
+import html
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import calibgraph
+from calibgraph import Calibration, Rig, simulate_correspondences
+from tests.conftest import ROOT, make_camera, stereo_relative_pose
+from tests.report.conftest import solve_simulated, write_page
+
+NASTY = "<b>x&\"y'</b>"
+
+
+def title_of(text: str) -> str:
+    match = re.search("<title>(.*?)</title>", text)
+    assert match is not None
+    return match[1]
+
+
+def test_a_solved_table_is_reported_without_overlays(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    status = solved_pair.verdict.status
+    text = write_page(solved_pair, tmp_path)
+    assert title_of(text).startswith(status)
+    assert f'<strong class="big">{status}</strong>' in text
+    assert text.count("Overlays are left out:") == 1
+    assert "Pictures of the residuals are left out" not in text
+    assert "One standard deviation, about and along" in text
+    for name in solved_pair.rig.cameras:
+        assert f"Residuals over the image of {name}" in text
+    for check in solved_pair.camera_verdicts["left"].checks:
+        assert html.escape(check.name).replace("&#x27;", "&#39;") in text
+    assert "one round only" in text
+
+
+def test_names_of_cameras_are_escaped(tmp_path: Path) -> None:
+    rig = Rig(cameras={NASTY.replace("/", ""): make_camera(), "$x_1$": make_camera((0, 0.5, 0))})
+    text = write_page(solve_simulated(rig), tmp_path)
+    assert "<b>x" not in text
+    assert "&lt;b&gt;x&amp;&#34;y&#39;&lt;b&gt;" in text
+    assert "$x_1$" in text
+
+
+def test_a_failure_is_marked_prominently(pair: Rig, tmp_path: Path) -> None:
+    result = solve_simulated(pair, outlier_share=1.0)
+    assert result.verdict.status == "FAIL"
+    text = write_page(result, tmp_path)
+    assert title_of(text).startswith("FAIL - do not use")
+    assert "No. Do not use this result" in text
+    assert 'class="verdict FAIL"' in text
+    for reason in result.camera_verdicts["left"].reasons:
+        assert reason.split(":")[0] in text
+
+
+def test_too_few_frames_for_an_error_bar_are_reported(pair: Rig, tmp_path: Path) -> None:
+    result = solve_simulated(pair, frames=3)
+    assert result.covariance["left"] is None
+    text = write_page(result, tmp_path)
+    assert "Unknown: too few frames for an error bar." in text
+    assert "Error bar per axis: unknown, too few frames" in text
+    assert "One standard deviation, about and along" not in text
+
+
+def test_weaknesses_priors_and_the_bootstrap_are_shown(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    bootstrap = np.diag(np.square([np.radians(0.123), *5 * [0.01]]))
+    result = replace(
+        solved_pair,
+        weaknesses={"left": ("the height is loose <&>",)},
+        prior_share={"left": 0.25},
+        bootstrap={"left": bootstrap},
+    )
+    text = write_page(result, tmp_path)
+    assert "<b>left</b>: the height is loose &lt;&amp;&gt;" in text
+    assert "25 % of this camera" in text
+    assert "0.123 deg" in text
+
+
+def test_a_camera_without_correspondences_is_reported(pair: Rig, tmp_path: Path) -> None:
+    rig = pair.model_copy(update={"relative_poses": (stereo_relative_pose(pair),)})
+    table = simulate_correspondences(pair, frames=8, matches=200)
+    left = table.select(table.camera_index == table.cameras.index("left"))
+    text = write_page(replace(calibgraph.solve(rig, left), correspondences=left), tmp_path)
+    assert "Residuals over the image of left" in text
+    assert "Residuals over the image of right" not in text
+
+
+def test_a_result_without_correspondences_is_reported(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    text = write_page(replace(solved_pair, correspondences=None), tmp_path)
+    assert "Pictures of the residuals are left out" in text
+    assert "a point 10 m ahead on the optical axis" in text
+
+
+def test_a_result_from_driving_is_reported(pair: Rig, tmp_path: Path) -> None:
+    tracker = calibgraph.IncrementalCalibrator(pair)
+    table = simulate_correspondences(pair, frames=12, matches=100)
+    for frame in range(12):
+        tracker.update(table.select(table.frame == frame))
+    text = write_page(tracker.calibration(), tmp_path)
+    assert "Pictures of the residuals are left out" in text
+    assert "frames that wait" in text
+
+
+def test_the_template_is_part_of_the_package() -> None:
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert "calibgraph*" in setuptools["packages"]["find"]["include"]
+    assert setuptools["package-data"]["calibgraph.report"] == ["page.html.j2"]

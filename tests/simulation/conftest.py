@@ -1,0 +1,54 @@
+"""A short drive, a small camera and a coarse LiDAR, shared by the tests of the sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import Camera, Intrinsics, Rig
+from calibgraph.simulation.lidar import lidar_of
+from calibgraph.simulation.recording import Drive, build_drive, simulate_street
+from tests.conftest import FORWARD, KANNALA, RADTAN5
+
+LENSES = {"pinhole": (), "radtan": RADTAN5, "fisheye": KANNALA}
+DRIVE_SEED = 3
+
+
+SCAN = replace(lidar_of(16), azimuth_step_deg=1.0)
+"""A coarse LiDAR."""
+
+
+def small_camera(lens: str, position_m: tuple[float, float, float] = (0.3, 0.2, -0.3)) -> Camera:
+    T = np.eye(4)
+    T[:3, :3] = FORWARD
+    T[:3, 3] = -FORWARD @ position_m
+    is_fisheye = lens == "fisheye"
+    focal = 62.0 if is_fisheye else 150.0  # 120 px from the centre: 107 or 39 degrees
+    return Camera(
+        model="fisheye" if is_fisheye else "pinhole",
+        width_px=240,
+        height_px=150,
+        intrinsics_px=Intrinsics(fx=focal, fy=focal + 1, cx=121.3, cy=73.8),
+        distortion=LENSES[lens],
+        T_camera_lidar=T,
+    )
+
+
+@pytest.fixture(scope="session")
+def drive() -> Drive:
+    return build_drive(frames=3, seed=DRIVE_SEED)
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    return Rig(cameras={name: small_camera(name) for name in ("radtan", "fisheye")})
+
+
+@pytest.fixture(scope="session")
+def recording(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated") / "street"
+    simulate_street(folder, rig, beams=16, frames=2, seed=5, rotation_deg=3, translation_m=0.2)
+    return folder

@@ -1,0 +1,111 @@
+"""Simulated cameras: the inverse of every lens, and the images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.simulation.cameras import (
+    Imaging,
+    camera_rays,
+    pixel_directions,
+    render,
+    trace_light,
+)
+from calibgraph.simulation.lidar import scan
+from calibgraph.simulation.mesh import join_meshes, mesh_of_solid
+from calibgraph.simulation.recording import Drive
+from calibgraph.simulation.solids import ellipsoid
+from calibgraph.simulation.world import build_world, cast
+from tests.simulation.conftest import LENSES, SCAN, small_camera
+
+pytest.importorskip(
+    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
+)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_camera_and_lidar_see_the_same_surfaces(drive: Drive, lens: str) -> None:
+    camera = small_camera(lens)
+    T_world_camera = relative_transform(drive.T_world_lidar[1], camera.T_camera_lidar)
+    exact = replace(SCAN, range_noise_m=0.0)
+    cloud = scan(drive.world, exact, np.ones(16), drive.T_world_lidar[1], np.random.default_rng(0))
+    points = cloud[:, :3] @ camera.T_camera_lidar[:3, :3].T + camera.T_camera_lidar[:3, 3]
+    pixels, valid = camera.lens.project(points)
+    seen = valid & camera.in_image(pixels)
+    rays = pixel_directions(camera, pixels[seen])
+    looking = rays.any(axis=1)  # within the fisheye's field
+    outwards = (rays @ T_world_camera[:3, :3].T).astype(np.float32)
+    depth = cast(drive.world, T_world_camera[:3, 3], outwards).distance_m[looking]
+    behind = depth - np.linalg.norm(points[seen], axis=1)[looking]
+    # Rays are float32, 6e-8 of 100 m, and inverted to 1e-6 px of 1/62 rad: at an incidence of 89
+    # degrees that is 60 times 2e-6 m. Points may be hidden from the camera, which is not at the
+    # LiDAR's place; none may lie in front of what the camera sees, but for some at edges.
+    assert np.count_nonzero(looking) > 300
+    assert np.mean(np.abs(behind) < 1e-3) > 0.85
+    assert np.mean(behind > 1e-3) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("lens", "place_m"),
+    [
+        ("pinhole", (6.0, 2.0, 1.0)),
+        ("radtan", (6.0, -4.2, -1.8)),
+        ("radtan", (5.0, 3.2, 0.3)),
+        ("fisheye", (4.0, 3.0, -1.0)),
+        ("fisheye", (0.15, -4.0, -0.2)),  # 92 degrees off the axis
+    ],
+)
+def test_a_ball_is_where_the_lens_projects_it(lens: str, place_m: tuple[float, ...]) -> None:
+    camera = small_camera(lens)
+    size = 0.04 * float(np.linalg.norm(place_m))
+    rays, rng, sun = camera_rays(camera), np.random.default_rng(0), np.array([0.0, 0.0, 1.0])
+    x, y, z = place_m
+    black = (0.0, 0.0, 0.0, 0.0)
+    ball = ellipsoid((x, y, z - size / 2), (size, size, size), black)
+    far = ellipsoid((-900.0, 0.0, 900.0), (1.0, 1.0, 1.0), black)
+    T_world_camera = invert(camera.T_camera_lidar)
+    empty, full = (
+        trace_light(
+            build_world(join_meshes(map(mesh_of_solid, solids)), sun, rng), rays, T_world_camera
+        )
+        for solids in ((far,), (far, ball))
+    )
+    covered = np.maximum(empty - full, 0).sum(axis=2)
+    v, u = (np.average(index, weights=covered) for index in np.indices(covered.shape))
+    centre = camera.T_camera_lidar[:3, :3] @ place_m + camera.T_camera_lidar[:3, 3]
+    expected = camera.lens.project(centre[None])[0][0]
+    # A ball of angular radius r, at t off the axis, is an ellipse about f tan(t) (1 + tan(t)^2) r^2
+    # from its centre's image: at most 150 * 0.8 * 1.6 * 0.02^2 = 0.08 px. Its 20 rim pixels are
+    # covered by quarters: 0.02 px. Half a pixel's shift of the grid shows.
+    assert np.count_nonzero(covered) > 5
+    assert np.allclose([u, v], expected, atol=0.12)
+
+
+def test_fisheye_is_black_just_beyond_95_degrees() -> None:
+    camera = small_camera("fisheye")
+    angles = np.radians([94.9, 95.1])
+    turn = np.radians([0.0, 180.0])  # to both sides, where the image is wide enough
+    rays = np.array([[np.sin(a) * np.cos(t), 0.0, np.cos(a)] for a in angles for t in turn])
+    pixels, valid = camera.lens.project(rays)
+    assert valid.all()
+    found = pixel_directions(camera, pixels)
+    assert np.allclose(found[:2], rays[:2], atol=1e-6)
+    assert not found[2:].any()
+
+
+def test_image_noise_is_as_configured(drive: Drive) -> None:
+    camera = small_camera("pinhole")
+    rays, T = camera_rays(camera), relative_transform(drive.T_world_lidar[0], camera.T_camera_lidar)
+    clean, first, second = (
+        render(drive.world, rays, T, rng, Imaging(noise=noise, exposure_spread=0.0)).astype(float)
+        for noise, rng in zip((0.0, 0.02, 0.02), np.random.default_rng(1).spawn(3), strict=True)
+    )
+    inside = (clean > 25) & (clean < 230)  # 5 sigma from black and white
+    difference = (first - second)[inside]
+    expected = np.sqrt(2 * ((255 * 0.02) ** 2 + 1 / 12))  # with the rounding to whole levels
+    assert len(difference) > 10_000
+    assert abs(difference.std() / expected - 1) < 4 / np.sqrt(2 * len(difference))

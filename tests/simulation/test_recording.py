@@ -1,0 +1,106 @@
+"""Simulated recordings: datasets with their truth."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import CalibrationError, Camera, Rig, load_dataset, load_rig
+from calibgraph.model.geometry import angle_deg, relative_transform
+from calibgraph.simulation.lidar import scan
+from calibgraph.simulation.recording import build_drive, simulate_street
+from tests.simulation.conftest import SCAN
+
+pytest.importorskip(
+    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
+)
+
+
+def test_stops_are_apart_and_the_lane_is_free() -> None:
+    drive = build_drive(frames=6, step_m=5.0, seed=1)
+    places = np.array([T[:3, 3] for T in drive.T_world_lidar])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    # Along the line 5 m +- 15 %; across, each stop sways by 0.25 m, which adds under 5 %.
+    assert steps.min() > 0.8 * 5.0
+    assert steps.max() < 1.25 * 5.0
+    for T in drive.T_world_lidar:
+        cloud = scan(drive.world, SCAN, np.ones(16), T, np.random.default_rng(0))
+        x, y, z = cloud[:, :3].T
+        assert not np.any((np.abs(x) < 2.5) & (np.abs(y) < 1.0) & (z > -1.4))
+
+
+def test_a_recording_is_a_dataset_with_its_truth(recording: Path, rig: Rig) -> None:
+    data, truth = load_dataset(recording), load_rig(recording / "reference.yaml")
+    assert [frame.name for frame in data.frames] == ["000000", "000001"]
+    for name, camera in truth.cameras.items():
+        assert np.allclose(camera.T_camera_lidar, rig.cameras[name].T_camera_lidar, atol=1e-12)
+        off = relative_transform(data.rig.cameras[name].T_camera_lidar, camera.T_camera_lidar)
+        assert angle_deg(off[:3, :3]) == pytest.approx(3.0)
+        image = data.frames[1].load_image(name, camera)
+        assert image.std() > 20  # levels: there is something to see
+    cloud = data.frames[1].load_cloud()
+    assert cloud.shape[1] == 4
+    assert 0.5 * 16 * 1800 < len(cloud) < 16 * 1800
+    assert cloud[:, 3].min() >= 0
+    assert cloud[:, 3].max() <= 1
+
+
+def test_the_same_seed_gives_the_same_files(recording: Path, rig: Rig, tmp_path: Path) -> None:
+    again, other = tmp_path / "again", tmp_path / "other"
+    simulate_street(again, rig, beams=16, frames=2, seed=5, rotation_deg=3, translation_m=0.2)
+    simulate_street(other, rig, beams=16, frames=2, seed=6, rotation_deg=3, translation_m=0.2)
+    files = sorted(p.relative_to(recording) for p in recording.rglob("*") if p.is_file())
+    assert len(files) == 2 + 2 + 2 * 2
+    for file in files:
+        assert (again / file).read_bytes() == (recording / file).read_bytes()
+        same = (other / file).read_bytes() == (recording / file).read_bytes()
+        assert same == (file.name == "reference.yaml")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"beams": 33}, "33 beams"),
+        ({"frames": 0}, "0 frames"),
+        ({"step_m": -1.0}, "-1.0 m apart"),
+        ({"step_m": float("nan")}, "nan m apart"),
+        ({"frames": 1000}, "1000 frames, 4.0 m apart"),
+        ({"rotation_deg": -1.0}, "-1.0 deg"),
+    ],
+)
+def test_bad_arguments_are_refused(
+    rig: Rig, tmp_path: Path, changed: dict[str, float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        simulate_street(tmp_path / "out", rig, **changed)
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_open3d_says_how_to_install_it(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[pointcloud\]'"):
+        simulate_street(tmp_path / "out", rig, frames=1)
+
+
+def test_nothing_is_left_of_a_recording_that_fails(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*arguments: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("calibgraph.simulation.recording.render", fails)
+    with pytest.raises(MemoryError):
+        simulate_street(tmp_path / "out", rig, frames=1, beams=16)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_images_too_large_to_write_are_refused(rig: Rig, tmp_path: Path) -> None:
+    name, camera = next(iter(rig.cameras.items()))
+    values = {**camera.model_dump(), "width_px": 70_000}
+    with pytest.raises(ValueError, match="70000x"):
+        simulate_street(tmp_path / "out", Rig(cameras={name: Camera(**values)}), frames=1)

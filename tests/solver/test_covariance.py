@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from calibgraph import Rig
+from calibgraph.model.geometry import relative_covariance
+from calibgraph.solver.covariance import with_pseudo_frames
+
+
+def test_pseudo_frames_add_the_scatter_without_its_correlations() -> None:
+    rng = np.random.default_rng(0)
+    hessian = np.diag([4.0, 3.0, 2.0, 1.0])
+    gradients = rng.standard_normal((10, 4)) @ rng.standard_normal((4, 4))
+    scatter = gradients.T @ gradients
+    found = with_pseudo_frames(scatter, hessian, np.full(4, 10.0))
+    np.testing.assert_allclose(found, scatter + 0.8 * np.diag(np.diag(scatter)))
+
+
+def test_the_covariance_of_a_pair_is_the_scatter_of_small_steps_of_both_cameras(pair: Rig) -> None:
+    rng = np.random.default_rng(1)
+    root = 1e-4 * rng.standard_normal((12, 12))
+    left, right = (gtsam.Pose3(T) for T in pair.T_camera_lidar.values())
+    T_right_left = right.compose(left.inverse())
+    steps = rng.standard_normal((4000, 12)) @ root.T
+    twists = [
+        gtsam.Pose3.Logmap(
+            gtsam.Pose3.Expmap(s[6:]).compose(right)
+            .compose(gtsam.Pose3.Expmap(s[:6]).compose(left).inverse())
+            .compose(T_right_left.inverse())
+        )
+        for s in steps
+    ]  # fmt: skip
+    expected = np.cov(np.array(twists), rowvar=False)
+    found = relative_covariance(root @ root.T, 0, 1, T_right_left.matrix())
+    ratio = np.linalg.eigvals(np.linalg.solve(expected, found)).real
+    # A covariance from n draws is off by sqrt(2 / n), 2.2 %, per direction: 4 of these.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.09)

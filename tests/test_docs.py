@@ -1,0 +1,172 @@
+"""README and pages: links lead somewhere, command lines parse, Python compiles."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+import yaml
+from typer.main import get_command
+
+import calibgraph
+from calibgraph.cli.app import app
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
+from calibgraph.model.config import Config
+from docs.tables import GENERATED
+from tests.conftest import ROOT
+
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
+READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
+PLACEHOLDER = re.compile(r"<!-- generated: (.*) -->")
+VALUES = ("--help", "--version", "--debug")
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_to_files_and_headings(page: Path) -> None:
+    text = without_code(page.read_text())
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), f"{target}: no such file"
+        if anchor and file.suffix == ".md":
+            assert anchor in anchors_of(file), f"{target}: no such heading"
+
+
+def without_code(text: str) -> str:
+    """The text without blocks of code, in which brackets are no links."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"^ {4}.*$", "", text, flags=re.MULTILINE)
+
+
+def anchors_of(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and mkdocs make them."""
+    headings = re.findall(r"^#+ (.*)$", without_code(page.read_text()), flags=re.MULTILINE)
+    words = (re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in headings)
+    return {re.sub(r"\s", "-", heading) for heading in words}
+
+
+def command_lines(page: Path) -> Iterator[list[str]]:
+    """The words of every ``calibgraph ...`` in an indented or fenced block."""
+    blocks = re.findall(r"^```(?!python|yaml).*?^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    lines = re.findall(r"^ {4}(.*)$", page.read_text(), re.MULTILINE)
+    for line in [*lines, *(line for block in blocks for line in block.splitlines())]:
+        found = re.search(r"(?:^|\| )calibgraph (.*)", line)
+        if found:
+            shell = re.split(r" [|<>] ", found[1].split("  #")[0])[0]
+            yield shlex.split(shell)
+
+
+@pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
+def test_commands_and_options_exist(page: Path) -> None:
+    for words in command_lines(page):
+        command, rest = resolve(words)
+        known = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
+        for option in (word for word in rest if word.startswith("--")):
+            assert option.partition("=")[0] in {*known, *VALUES}, f"{words}: {option}"
+        assert takes(command, rest), f"{words}: arguments do not fit"
+
+
+def resolve(words: list[str]) -> tuple[click.Command, list[str]]:
+    """The command that some words call, and the words after it."""
+    command: click.Command = get_command(app)
+    while children := getattr(command, "commands", None):
+        assert words and words[0] in children, f"{words}: no such command"
+        command, words = children[words[0]], words[1:]
+    return command, words
+
+
+def takes(command: click.Command, words: list[str]) -> bool:
+    """Whether the words are as many arguments as the command needs, options and values apart."""
+    wanted = [p for p in command.params if p.param_type_name == "argument" and p.required]
+    with_value = {
+        name
+        for p in command.params
+        for name in p.opts
+        if p.param_type_name == "option" and not getattr(p, "is_flag", False)
+    }
+    given, skip = 0, False
+    for word in words:
+        if skip or word.startswith("--"):
+            skip = word in with_value
+        else:
+            given += 1
+    return given >= len(wanted)
+
+
+def test_every_command_is_shown() -> None:
+    shown = {words[0] for page in READERS_PAGES for words in command_lines(page)}
+    assert shown == set(get_command(app).commands)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
+def test_python_blocks_compile(page: Path) -> None:
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
+        compile(block, name_of(page), "exec")
+
+
+@pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
+def test_modules_that_pages_run_exist(page: Path) -> None:
+    for module in re.findall(r"python -m (benchmarks[\w.]*)", page.read_text()):
+        file = ROOT / (module.replace(".", "/") + ".py")
+        assert file.is_file(), module
+
+
+def yaml_blocks(page: str) -> list[object]:
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+    return [yaml.safe_load(block) for block in blocks]
+
+
+def test_examples_of_settings_are_settings() -> None:
+    for example in yaml_blocks("docs/settings.md"):
+        Config.model_validate(example)
+    for example in yaml_blocks("docs/learned_matcher.md"):
+        TrainSettings.model_validate(example)
+
+
+def test_the_api_page_has_every_public_name() -> None:
+    listed = re.findall(
+        r"^::: calibgraph\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE
+    )
+    assert sorted(listed) == sorted(calibgraph.__all__)
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    for page in ROOT.glob("docs/*.md"):
+        assert f": {page.name}\n" in navigation, page.name
+
+
+@pytest.mark.parametrize("name", ["thresholds", "settings", "tracking settings", "presets"])
+def test_generated_tables_have_rows(name: str) -> None:
+    for table in GENERATED[name]().split("\n\n"):
+        rows = table.splitlines()
+        assert len(rows) > 3
+        assert len({row.replace(r"\|", "").count("|") for row in rows}) == 1, "cells are missing"
+
+
+def test_pages_name_tables_that_exist() -> None:
+    named = {name for page in PAGES for name in PLACEHOLDER.findall(page.read_text())}
+    assert named == set(GENERATED)
+
+
+@pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
+def test_files_that_pages_name_exist(page: Path) -> None:
+    """Names like ``calibgraph/solver/joint.py`` and, after a colon, names in them."""
+    text = page.read_text()
+    pattern = (
+        r"`((?:calibgraph|factors|tests|benchmarks|docs)/[\w./]+\.\w+)`(?:: ((?:`\w+`(?:, )?)+))?"
+    )
+    for name, inside in re.findall(pattern, text):
+        assert (ROOT / name).is_file(), name
+        for symbol in re.findall(r"`(\w+)`", inside):
+            assert re.search(rf"\b{symbol}\b", (ROOT / name).read_text()), f"{name}: {symbol}"

@@ -1,0 +1,68 @@
+"""YAML files: what is no plain mapping is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calibgraph import (
+    FileError,
+    Rig,
+    load_rig,
+)
+from tests.model.test_rig import written
+
+
+def test_a_key_given_twice_is_refused(pair: Rig, tmp_path: Path) -> None:
+    path = written(pair, tmp_path)
+    path.write_text(path.read_text() + "\nlidar: another\n")
+    with pytest.raises(FileError, match="'lidar' is given twice"):
+        load_rig(path)
+
+
+@pytest.mark.parametrize("text", ["", "- a\n- b\n", "{unclosed", "\x00\x01", "just words"])
+def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    with pytest.raises(FileError, match=str(path)):
+        load_rig(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 2020-13-45", "not valid YAML"),
+        ("a: !!int abc", "not valid YAML"),
+        ("a: " + "9" * 5000, "not valid YAML"),
+        ("[" * 20_000, "not valid YAML|too deeply"),
+        ("{a: " * 1000, "not valid YAML|too deeply"),
+        ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process
+        ("&a [*a]", "."),
+    ],
+)
+def test_what_the_yaml_parser_chokes_on_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    with pytest.raises(FileError, match=message) as caught:
+        load_rig(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+    path = tmp_path / "rig.yaml"
+    path.write_text("\n".join([*lines, "cameras: {a: {T_camera_lidar: *a11}}"]))
+    with pytest.raises(FileError, match="aliases stand for over"):
+        load_rig(path)
+
+
+def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "rig.bin").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(FileError, match="not a text file"):
+        load_rig(tmp_path / "rig.bin")
+    with pytest.raises(FileError, match="holds none of"):
+        load_rig(tmp_path)
+    with pytest.raises(FileError, match="no such file"):
+        load_rig(tmp_path / "nothing.yaml")

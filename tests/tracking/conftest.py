@@ -1,0 +1,65 @@
+"""Fixtures of the tests of tracking: one simulated drive is shared by all."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from calibgraph import (
+    concatenate,
+    perturb,
+)
+from calibgraph.io.rigs import load_rig
+from calibgraph.tracking.history import History
+from tests.conftest import Call
+from tests.tracking.drives import (
+    World,
+    drive,
+    expected_lines,
+    pair_of,
+)
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    folder = tmp_path_factory.mktemp("world")
+    guess = perturb(pair_of(), rotation_deg=1, translation_m=0.1, seed=1)
+    tables = drive(pair_of())
+    guess.save(folder / "rig.yaml")
+    guess = load_rig(folder / "rig.yaml")
+    concatenate(tables).save(folder / "matches.parquet")
+    lines = expected_lines(guess, tables)
+    return World(guess, folder / "rig.yaml", folder / "matches.parquet", tables, lines)
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes a second, and has tests of its own."""
+    monkeypatch.setattr(History, "draw", lambda self, path: path.write_bytes(b""))
+
+
+@pytest.fixture
+def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Callable[..., tuple[int, str, str]]:
+    """Run ``track RIG -`` with bytes, or a file, on standard input."""
+
+    def run(rig: Path, given: Any, *options: object) -> tuple[int, str, str]:
+        buffer = io.BytesIO(given) if isinstance(given, bytes) else given
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=buffer))
+        return call("track", rig, "-", *options)
+
+    return run
+
+
+@pytest.fixture
+def memory() -> Iterator[Path]:
+    """A folder in memory, where thousands of databases are opened: syncing costs nothing there."""
+    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    with tempfile.TemporaryDirectory(dir=place) as folder:
+        yield Path(folder)

@@ -1,0 +1,98 @@
+"""A simulated drive, as tables in memory and as what programs send."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibgraph import (
+    Correspondences,
+    IncrementalCalibrator,
+    MatcherErrors,
+    Rig,
+)
+from calibgraph.simulation.correspondences import simulate_drive
+from calibgraph.tracking.report import json_line
+from tests.conftest import make_camera
+
+FRAMES = 14
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
+
+
+def pair_of(**options: Any) -> Rig:
+    return Rig(
+        cameras={
+            "left": make_camera((0.3, 0.1, -0.1), **options),
+            "right": make_camera((0.3, -0.4, -0.1), **options),
+        }
+    )
+
+
+def moved_later(rig: Rig, at: int) -> Callable[[int], Rig]:
+    """The first camera moves by 3 cm and 0.6 deg."""
+    name, T = next(iter(rig.T_camera_lidar.items()))
+    step = np.eye(4)
+    step[:2, :2] = [[np.cos(0.01), -np.sin(0.01)], [np.sin(0.01), np.cos(0.01)]]
+    step[0, 3] = 0.03
+    after = rig.moved_to({name: step @ T})
+    return lambda frame: after if frame >= at else rig
+
+
+def drive(
+    rig: Rig, frames: int = FRAMES, *, moves_at: int | None = None, **options: Any
+) -> list[Correspondences]:
+    rig_at = moved_later(rig, frames if moves_at is None else moves_at)
+    settings: dict[str, Any] = {"matches": 60, "errors": ERRORS, "seed": 1, **options}
+    return list(simulate_drive(rig_at, frames=frames, **settings))
+
+
+def content_of(table: Correspondences) -> dict[str, Any]:
+    """A frame as its line of JSON has it."""
+    cameras = {}
+    for name in table.cameras:
+        own = table.of_camera(name)
+        columns = (*own.pixels_px.T, *own.points_lidar_m.T, own.confidence.astype(float))
+        keys = ("u_px", "v_px", "x_m", "y_m", "z_m", "confidence")
+        cameras[name] = {k: c.tolist() for k, c in zip(keys, columns, strict=True)}
+    return {"frame": int(table.frame[0]), "cameras": cameras}
+
+
+def as_lines(tables: Sequence[Correspondences]) -> bytes:
+    return b"".join(json.dumps(content_of(table)).encode() + b"\n" for table in tables)
+
+
+def expected_lines(rig: Rig, tables: Sequence[Correspondences]) -> list[str]:
+    tracker = IncrementalCalibrator(rig)
+    return [json_line(tracker.update(table)) for table in tables]
+
+
+def frames_in(out: str) -> list[int]:
+    return [json.loads(line)["frame"] for line in out.splitlines()]
+
+
+def left_out(err: str) -> list[str]:
+    return [line for line in err.splitlines() if line.startswith("left out: ")]
+
+
+@dataclass
+class World:
+    """A rig's guess and a drive, as files and in memory."""
+
+    guess: Rig
+    rig: Path
+    source: Path
+    tables: list[Correspondences]
+    lines: list[str]
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+class Crashed(BaseException):
+    """As good as a kill: nothing is saved on the way out."""

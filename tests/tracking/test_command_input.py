@@ -1,0 +1,85 @@
+"""The command `track` with wrong input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibgraph import (
+    Correspondences,
+)
+from tests.tracking.drives import (
+    World,
+    as_lines,
+    content_of,
+    expected_lines,
+    left_out,
+)
+
+pytestmark = pytest.mark.usefixtures("no_picture")
+
+
+# Wrong input
+
+
+def wrong_lines(good: Correspondences) -> dict[str, bytes]:
+    """What is no frame, or a frame that cannot be taken, each with its number before the good."""
+
+    def line(**changes: Any) -> bytes:
+        content = content_of(good)
+        content["frame"] += 1
+        camera = content["cameras"]["left"]
+        for key, value in changes.items():
+            if key in camera:
+                camera[key][3] = value
+            else:
+                content[key] = value
+        return json.dumps(content).encode()
+
+    content = content_of(good)
+    return {
+        "is not JSON": line()[:200],
+        "not in the rig": line(cameras={"stranger": content["cameras"]["left"]}),
+        "comes again": line(frame=content["frame"]),
+        "comes after": line(frame=-1),
+        "NaN is no number": line(u_px=float("nan")),
+        "Infinity is no number": line(z_m=float("inf")),
+        "below 1e+06, found [1000000.0": line(u_px=1e6),
+        "point must be finite": line(x_m=1e6),
+        "u_px.3: Input should be a valid number, found '1.5'": line(u_px="1.5"),
+        "v_px.3: Input should be a valid number, found True": line(v_px=True),
+        "confidence must lie in (0, 1]": line(confidence=1e30),
+        "confidence must lie": line(confidence=0),
+        "frame: Input should be a valid integer": line(frame=1.5),
+        "is missing": b'{"frame": 7}',
+        "Input should be a JSON object": b"[1, 2]",
+        "is not UTF-8": b"\xff\xfe\xfa",
+        "unknown key": line(time=3),
+        "metadata 'systematic_rotation_rad'": line(metadata={"systematic_rotation_rad": "much"}),
+        "given twice": b'{"frame": 7, "frame": 7, "cameras": {}}',
+        "differ in length": b'{"frame": 7, "cameras": {"left": {"u_px": [1], "v_px": [],'
+        b' "x_m": [], "y_m": [], "z_m": []}}}',
+    }
+
+
+def test_wrong_input_is_left_out_with_a_line_each_and_leaves_no_trace(
+    world: World, piped: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Frames 0, 10, 20, ...; after the seventh everything that can be wrong."""
+    tables = [replace(table, frame=10 * table.frame) for table in world.tables]
+    wrong = wrong_lines(tables[6])
+    given = as_lines(tables[:7]) + b"\n".join(wrong.values()) + b"\n" + as_lines(tables[7:])
+    half_a_line = as_lines(tables[:1])[:500]
+    code, out, err = piped(world.rig, given + half_a_line, "--out", tmp_path / "out")
+    assert code == 0
+    assert out.splitlines() == expected_lines(world.guess, tables)
+    messages = left_out(err)
+    assert len(messages) == len(wrong) + 1
+    for line, what in zip(messages, (*wrong, "is not JSON"), strict=True):
+        assert what in line
+    assert "Traceback" not in err

@@ -1,0 +1,253 @@
+"""The command `track` under `kill -9`, and with a slow reader."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import (
+    concatenate,
+    perturb,
+)
+from calibgraph.cli import app
+from calibgraph.tracking import durable
+from calibgraph.tracking.history import History
+from tests.conftest import SAMPLE
+from tests.tracking.drives import (
+    FRAMES,
+    World,
+    as_lines,
+    drive,
+    frames_in,
+    pair_of,
+)
+
+pytestmark = pytest.mark.usefixtures("no_picture")
+
+
+# Kills
+
+
+def _command(arguments: list[str], lines: Path, snapshot_every: int) -> None:
+    """In a process of its own: ``track`` with standard output appended to a file."""
+    for descriptor, path in ((1, lines), (2, lines.with_suffix(".err"))):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        os.dup2(file, descriptor)
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
+    durable._SNAPSHOT_EVERY = snapshot_every
+    History.draw = lambda self, path: path.write_bytes(b"")  # type: ignore[method-assign]
+    sys.argv = ["calibgraph", "track", *arguments]
+    app.main()
+
+
+@dataclass
+class Killed:
+    """A command that is killed and started again, and the lines that it printed in between."""
+
+    arguments: list[str]
+    path: Path
+    snapshot_every: int = 7
+
+    def run(self, when: Callable[[], bool] | None) -> bool:
+        """Start it, and kill it when that is so; whether it ended by itself, and well."""
+        self._cut_half_a_line()
+        before = self.lines
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(
+            ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.cli.tables"]
+        )
+        process = context.Process(
+            target=_command, args=(self.arguments, self.path, self.snapshot_every)
+        )
+        process.start()
+        while process.is_alive() and not (when is not None and when()):
+            process.join(0.002)
+        process.kill()
+        process.join()
+        if before and (after := self.lines[len(before) :]):
+            last, first = frames_in(before[-1])[0], frames_in(after[0])[0]
+            assert first >= last, "an update that was acknowledged is lost"
+        assert process.exitcode in (0, -signal.SIGKILL), self.path.with_suffix(".err").read_text()
+        return process.exitcode == 0
+
+    @property
+    def lines(self) -> list[str]:
+        """The complete ones."""
+        text = self.path.read_text() if self.path.exists() else ""
+        return text[: text.rfind("\n") + 1].splitlines()
+
+    def after(self, delay_s: float, printed: int) -> Callable[[], bool]:
+        """Whether a time has passed since so many lines were there."""
+        begun: list[float] = []
+
+        def passed() -> bool:
+            if not begun and (not printed or len(self.lines) >= printed):
+                begun.append(time.monotonic())
+            return bool(begun) and time.monotonic() - begun[0] >= delay_s
+
+        return passed
+
+    def acknowledged(self) -> list[str]:
+        """The lines, the ones that came again once: they must be the same to the last digit."""
+        lines = self.lines
+        return [line for line, before in zip(lines, [None, *lines], strict=False) if line != before]
+
+    def _cut_half_a_line(self) -> None:
+        if self.path.exists():
+            text = self.path.read_text()
+            self.path.write_text(text[: text.rfind("\n") + 1])
+
+
+def kill_often(folder: Path, kills: int, longest_s: float, seed: int) -> int:
+    """Kill at random moments, from the start to well into the drive; how many drives that took.
+
+    The drive has failed matches, a move, and epochs that close.
+    """
+    truth = pair_of()
+    guess = perturb(truth, rotation_deg=1, translation_m=0.1, seed=1)
+    tables = drive(truth, 60, moves_at=33, failed_share=0.1)
+    guess.save(folder / "rig.yaml")
+    concatenate(tables).save(folder / "matches.parquet")
+    arguments = [str(folder / "rig.yaml"), str(folder / "matches.parquet"), "--out"]
+    whole = Killed([*arguments, str(folder / "whole")], folder / "whole.jsonl")
+    assert whole.run(None)
+    assert len(whole.lines) == len(tables)
+    rng, done, drives = np.random.default_rng(seed), 0, 0
+    while done < kills:
+        killed = Killed([*arguments, str(folder / str(drives))], folder / f"{drives}.jsonl")
+        ended = False
+        while not ended and done < kills:
+            printed = len(killed.lines) + rng.integers(1, 12) if rng.random() < 0.5 else 0
+            delay_s = rng.uniform(0, 0.01 if printed else longest_s)
+            ended = killed.run(killed.after(delay_s, printed))
+            done += not ended
+        assert ended or killed.run(None)
+        assert killed.acknowledged() == whole.lines
+        drives += 1
+    return drives
+
+
+@pytest.mark.slow
+def test_random_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
+    assert kill_often(tmp_path, kills=5, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1
+
+
+@pytest.mark.statistics
+def test_forty_random_kills_under_load_lose_nothing_and_change_nothing(
+    tmp_path: Path,
+) -> None:
+    spin = "while True: pass"
+    load = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(os.cpu_count() or 1)]
+    try:
+        kill_often(tmp_path, kills=40, longest_s=1.0, seed=int.from_bytes(os.urandom(4)))
+    finally:
+        for process in load:
+            process.kill()
+            process.wait()
+
+
+# Back-pressure
+
+
+@pytest.fixture
+def running(world: World, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    arguments = [world.rig, "-", "--out", tmp_path / "out"]
+    program = "from calibgraph.cli import app; app.main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, "track", *map(str, arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        yield process
+        process.kill()
+
+
+@pytest.mark.slow
+def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
+    world: World, running: subprocess.Popen[bytes]
+) -> None:
+    """Between the two are pipes of 64 kB each, a chunk of 64 kB, and the frame at hand."""
+    assert running.stdin is not None and running.stdout is not None
+    sent = [0]
+
+    def write_endlessly() -> None:
+        assert running.stdin is not None
+        try:
+            for number in range(10**9):
+                table = world.tables[number % FRAMES]
+                table = replace(table, frame=np.full(len(table), number))
+                sent[0] += running.stdin.write(as_lines([table]))
+                running.stdin.flush()
+        except OSError:  # it has ended
+            return
+
+    def memory_kb() -> int:
+        status = Path(f"/proc/{running.pid}/status").read_text()
+        return int(next(s.split()[1] for s in status.splitlines() if s.startswith("VmRSS")))
+
+    def settled() -> int:
+        """Bytes sent, once no more are taken."""
+        before, quiet = -1, 0
+        while quiet < 6:
+            quiet = quiet + 1 if sent[0] == before else 0
+            before = sent[0]
+            time.sleep(0.1)
+        return before
+
+    writer = threading.Thread(target=write_endlessly)
+    writer.start()
+    running.stdout.readline()
+    held = settled()
+    memory = memory_kb()
+    taken = sum(len(running.stdout.readline()) for _ in range(100))
+    assert taken > 100_000
+    # What was printed and not read: 64 kB are some 30 frames of 10 kB each.
+    assert settled() - held < 2_500_000
+    assert memory_kb() - memory < 50_000
+    running.send_signal(signal.SIGTERM)
+    rest = running.stdout.read()
+    assert running.wait() in (0, 1)
+    assert all(json.loads(line) for line in rest.splitlines())
+    writer.join()
+
+
+@pytest.mark.statistics
+def test_the_structure_matcher_continues_after_kills_and_around_corrupt_files(
+    tmp_path: Path,
+) -> None:
+    """The sample and three frames more: an image cut short, an empty image, a cloud cut short."""
+    data = tmp_path / "data"
+    shutil.copytree(SAMPLE, data)
+    places = [*(data / "cameras").iterdir(), data / "lidar"]
+    for place in places:
+        for path in sorted(place.iterdir())[:4]:
+            shutil.copy(path, path.with_stem(f"{int(path.stem) + 6:06d}"))
+    for path, size in (
+        (data / "cameras" / "left" / "000006.jpg", 500),
+        (data / "cameras" / "left" / "000007.jpg", 0),
+        (data / "lidar" / "000008.npy", 60),
+    ):
+        path.write_bytes(path.read_bytes()[:size])
+    arguments = [str(data), str(data), "--matcher", "structure", "--out"]
+    whole = Killed(arguments + [str(tmp_path / "whole")], tmp_path / "whole.jsonl")
+    assert whole.run(None)
+    assert [json.loads(line)["frame"] for line in whole.lines] == [0, 1, 2, 3, 4, 5, 9]
+    killed = Killed(arguments + [str(tmp_path / "killed")], tmp_path / "killed.jsonl")
+    for count in (1, 3, 5, 6):
+        killed.run(lambda done=count: len(set(killed.lines)) >= done)
+    assert killed.run(None)
+    assert killed.acknowledged() == whole.lines

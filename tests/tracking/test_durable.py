@@ -1,0 +1,251 @@
+"""A tracker on disk: crashes, damage, other rigs, a full disk."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibgraph import (
+    CorrespondenceError,
+    DurableCalibrator,
+    IncrementalCalibrator,
+    concatenate,
+    perturb,
+)
+from calibgraph.tracking import command, durable, tracker
+from calibgraph.tracking.history import History
+from calibgraph.tracking.report import json_line
+from calibgraph.tracking.run import follow
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from calibgraph.tracking.streams import StreamFrame
+from tests.conftest import KANNALA, Call
+from tests.tracking.drives import (
+    FRAMES,
+    Crashed,
+    World,
+    as_lines,
+    files_in,
+    pair_of,
+)
+
+pytestmark = pytest.mark.usefixtures("no_picture")
+
+
+def test_a_line_is_given_once_its_update_is_on_disk(world: World, tmp_path: Path) -> None:
+    rig = world.guess
+
+    def write(line: str) -> None:
+        shutil.copytree(tmp_path / "state", tmp_path / "copy", dirs_exist_ok=False)
+        with DurableCalibrator(tmp_path / "copy", rig) as found:
+            assert found.tracker.frame == json.loads(line)["frame"]
+        shutil.rmtree(tmp_path / "copy")
+        written.append(line)
+
+    written: list[str] = []
+    frames = [StreamFrame(int(table.frame[0]), None, table) for table in world.tables[:7]]
+    with DurableCalibrator(tmp_path / "state", rig) as calibrator:
+        counts = follow(
+            frames, calibrator, History(), every=1, stop=lambda: False, write=write, notify=print
+        )
+    assert counts.updates == 7 and written == world.lines[:7]
+
+
+def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
+    world: World, tmp_path: Path
+) -> None:
+    good = world.tables[7]
+    stamps = np.full(len(good), 5, np.int64)
+    wrong = (
+        world.tables[3],
+        world.tables[6],
+        replace(good, cameras=("left", "stranger")),
+        concatenate([good, world.tables[8]]),
+        good.select(slice(0, 0)),
+        replace(good, stamp_ns=stamps),
+        replace(good, metadata={"of": object()}),
+        replace(good, metadata={"of": np.float32(1)}),
+    )
+    with DurableCalibrator(tmp_path, world.guess) as calibrator:
+        for table in world.tables[:6]:
+            calibrator.update(table)
+        calibrator.update(replace(world.tables[6], stamp_ns=stamps[: len(world.tables[6])]))
+        before = calibrator.tracker.to_bytes(), files_in(tmp_path)
+        for table in wrong:
+            with pytest.raises(CorrespondenceError):
+                calibrator.update(table)
+            assert (calibrator.tracker.to_bytes(), files_in(tmp_path)) == before
+        with pytest.raises(CorrespondenceError, match="is of frame 7, not 9"):
+            calibrator.update(good, frame=9)
+        assert calibrator.update(good, frame=np.int64(7)).frame == 7
+
+
+# State
+
+
+def test_a_folder_in_use_is_refused_in_one_line(world: World, call: Call, tmp_path: Path) -> None:
+    with DurableCalibrator(tmp_path / "state", world.guess):
+        code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert (code, out) == (2, "")
+    assert "is in use by another process" in err and err.count("\n") == 1
+
+
+def test_a_state_of_another_rig_or_config_is_refused_in_one_line(
+    world: World, call: Call, tmp_path: Path
+) -> None:
+    out = ("--out", tmp_path / "out")
+    call("track", world.rig, world.source, *out)
+    before = files_in(tmp_path / "out" / "state")
+    pair_of(model="fisheye", distortion=KANNALA).save(tmp_path / "other.yaml")
+    (tmp_path / "config.yaml").write_text("tracking: {epoch_frames: 7}\n")
+    for arguments, reason in (
+        ((tmp_path / "other.yaml", world.source), "another rig"),
+        ((world.rig, world.source, "--config", tmp_path / "config.yaml"), "other settings"),
+    ):
+        code, text, err = call("track", *arguments, *out)
+        assert (code, text) == (2, "")
+        assert reason in err and str(tmp_path) in err and err.count("\n") == 1
+        assert files_in(tmp_path / "out" / "state") == before
+    moved = perturb(world.guess, rotation_deg=1, translation_m=0.1, seed=9)
+    moved.save(tmp_path / "moved.yaml")  # another guess of the same rig is no other rig
+    code, text, _ = call("track", tmp_path / "moved.yaml", world.source, *out)
+    assert (code, text) == (0, "")
+
+
+def test_a_damaged_snapshot_is_named_and_costs_nothing(
+    world: World, call: Call, tmp_path: Path
+) -> None:
+    concatenate(world.tables[:8]).save(tmp_path / "begin.parquet")
+    call("track", world.rig, tmp_path / "begin.parquet", "--out", tmp_path / "out")
+    path = tmp_path / "out" / "state" / DATABASE
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
+        database.execute(
+            "UPDATE snapshot SET digest = zeroblob(32)"
+            " WHERE number = (SELECT max(number) FROM snapshot)"
+        )
+    code, out, err = call("track", world.rig, world.source, "--out", tmp_path / "out")
+    assert code == 0
+    # What was before the damage is taken from the snapshot before and the journal.
+    assert out.splitlines() == world.lines[7:]
+    assert [line for line in err.splitlines() if line.startswith("warning: ")] == [
+        f"warning: {path}: the snapshot after update 8 is damaged: not used"
+    ]
+
+
+def test_a_damaged_database_is_refused_in_one_line(
+    world: World, call: Call, tmp_path: Path
+) -> None:
+    call("track", world.rig, world.source, "--out", tmp_path)
+    path = tmp_path / "state" / DATABASE
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    before = files_in(tmp_path / "state")
+    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert (code, out) == (2, "")
+    assert f"{path}: is damaged" in err and "choose another folder" in err
+    assert err.count("\n") == 1
+    assert files_in(tmp_path / "state") == before
+
+
+def test_a_state_of_the_earlier_layout_is_refused_in_one_line(
+    world: World, call: Call, tmp_path: Path
+) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "snapshot-000001.state").write_bytes(b"calibgraph-tracker/1\nS")
+    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert (code, out) == (2, "")
+    assert "is state of the earlier layout" in err and "choose another folder" in err
+    assert err.count("\n") == 1
+
+
+def test_a_state_of_another_version_is_refused_in_one_line(
+    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(IncrementalCalibrator, "to_bytes", lambda self: b"other")
+        call("track", world.rig, world.source, "--out", tmp_path)
+    code, _, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert code == 2
+    assert "holds a state of another version" in err and err.count("\n") == 1
+
+
+def test_a_counter_that_starts_anew_is_reported(
+    world: World, piped: Callable[..., Any], tmp_path: Path
+) -> None:
+    later = [replace(table, frame=table.frame + 100) for table in world.tables]
+    piped(world.rig, as_lines(later), "--out", tmp_path)
+    _, out, err = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
+    assert out == ""
+    assert "frame 0 and others up to 113 are known: skipped" in err
+    assert f"{FRAMES} known from before" in err
+
+
+def test_a_full_disk_under_the_state_is_reported_in_one_line_and_costs_nothing(
+    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    append = StateDatabase.append
+
+    def full(database: StateDatabase, record: bytes) -> None:
+        if len(left) == 0:
+            raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path))
+        left.pop()
+        append(database, record)
+
+    left = [0] * 6
+    with monkeypatch.context() as patch:
+        patch.setattr(StateDatabase, "append", full)
+        code, first, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert code == 2
+    assert err.splitlines()[-1] == f"calibgraph: {tmp_path}: No space left on device"
+    _, second, _ = call("track", world.rig, world.source, "--out", tmp_path)
+    again = first.splitlines()[-1]
+    assert first.splitlines() + second.splitlines() == [*world.lines[:5], again, *world.lines[5:]]
+
+
+def test_a_tracker_that_throws_leaves_the_state_as_it_was(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever an update may raise: half of it must not get into a snapshot."""
+    rig = world.guess
+    with pytest.raises(ZeroDivisionError), DurableCalibrator(tmp_path, rig) as calibrator:  # noqa: PT012
+        for table in world.tables[:7]:
+            calibrator.update(table)
+        before = calibrator.tracker.to_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(tracker, "make_update", lambda *_: 1 / 0)
+            calibrator.update(world.tables[7])
+    with DurableCalibrator(tmp_path, rig) as calibrator:
+        assert calibrator.tracker.to_bytes() == before
+        assert json_line(calibrator.update(world.tables[7])) == world.lines[7]
+
+
+@pytest.mark.parametrize("at", [0, 4, 9, 10, 13])
+def test_after_a_crash_the_last_line_comes_again(
+    at: int, world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Between the disk and the line: the line was not printed. The snapshots are every 5 frames."""
+    monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 5)
+    given: list[str] = []
+
+    def write(line: str) -> None:
+        if len(given) == at:
+            raise Crashed
+        given.append(line)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "_write_line", write)
+        with pytest.raises(Crashed):
+            call("track", world.rig, world.source, "--out", tmp_path)
+    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
+    assert code == 0
+    assert given + out.splitlines() == world.lines
+    assert f"{FRAMES - at - 1} updates" in err

@@ -1,0 +1,220 @@
+"""The tracker's state on disk: damage, files of others, and the lock."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph.errors import FileError
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from tests.tracking.state_data import (
+    INPUT_BYTES,
+    LOG,
+    content,
+    crashed,
+    filled,
+    held,
+    opened,
+    recovered,
+    require_refused,
+    require_usable,
+    restored,
+)
+
+# Damage.
+
+
+def flipped(data: bytes, at: int, bits: int = 0xFF) -> bytes:
+    changed = bytearray(data)
+    changed[at] ^= bits
+    return bytes(changed)
+
+
+def check_damaged(folder: Path, truth: bytes) -> str:
+    """Nothing false is returned, and a refusal changes nothing."""
+    before = content(folder)
+    try:
+        result = recovered(folder)
+    except FileError as error:
+        assert "\n" not in str(error)
+        assert str(folder) in str(error)
+        assert content(folder) | {"lock": b""} == before | {"lock": b""}
+        return "refused"
+    assert held(result) == truth
+    return "snapshot" if result.damages else "unused"
+
+
+@pytest.mark.parametrize("bits", [0x01, 0xFF])
+def test_a_changed_byte_of_the_database_is_refused_or_changes_nothing(
+    memory: Path, bits: int
+) -> None:
+    truth = filled(memory / "state", 8)
+    files = content(memory / "state")
+    data = files[DATABASE]
+    used = np.flatnonzero(np.frombuffer(data, np.uint8))
+    rng = np.random.default_rng(bits)
+    places = {*range(110), *rng.choice(used, 400).tolist(), *rng.choice(len(data), 100).tolist()}
+    found = set()
+    for at in sorted(places):
+        folder = restored(memory / "copy", files | {DATABASE: flipped(data, at, bits)})
+        found.add(check_damaged(folder, truth))
+    assert found == {"refused", "snapshot", "unused"}
+
+
+def test_a_database_cut_short_anywhere_is_refused(memory: Path) -> None:
+    truth = filled(memory / "state", 8)
+    files = content(memory / "state")
+    data = files[DATABASE]
+    for length in [*range(0, 120, 7), *range(120, len(data), 257)]:
+        folder = restored(memory / "copy", files | {DATABASE: data[:length]})
+        assert check_damaged(folder, truth) == "refused", length
+
+
+def test_a_log_that_is_damaged_or_cut_short_costs_the_inputs_from_there_on_at_most(
+    memory: Path,
+) -> None:
+    """To SQLite it is a log that a crash has cut short: nothing false comes back."""
+    files, truth = crashed(memory / "state", 8)
+    log = files[LOG]
+    lengths = set()
+    for at in range(0, len(log), 97):
+        for damaged in (log[:at], flipped(log, at)):
+            result = recovered(restored(memory / "copy", files | {LOG: damaged}))
+            assert truth.startswith(held(result))
+            lengths.add(len(held(result)))
+    assert lengths == {*range(0, len(truth), INPUT_BYTES)}
+
+
+def test_a_log_that_is_missing_is_reported(tmp_path: Path) -> None:
+    files, _ = crashed(tmp_path / "state", 8)
+    del files[LOG]
+    folder = restored(tmp_path / "copy", files)
+    (line,) = recovered(folder).damages
+    assert line.startswith(f"{folder / LOG}: is missing, updates may be lost")
+    with opened(folder) as database:
+        database.append(b"abc")
+    assert recovered(folder).damages == ()
+
+
+def test_a_database_that_is_missing_beside_its_log_is_refused(tmp_path: Path) -> None:
+    files, _ = crashed(tmp_path / "state", 8)
+    del files[DATABASE]
+    require_refused(restored(tmp_path / "copy", files), "is missing, and its log is there")
+
+
+def edited(folder: Path, statement: str) -> None:
+    with closing(sqlite3.connect(folder / DATABASE, isolation_level=None)) as database:
+        database.execute(statement)
+
+
+def test_a_damaged_snapshot_is_replaced_by_the_one_before_and_the_inputs_since(
+    tmp_path: Path,
+) -> None:
+    truth = filled(tmp_path, 8)
+    edited(tmp_path, "UPDATE snapshot SET content = x'00' WHERE number = 6")
+    result = recovered(tmp_path)
+    assert (result.snapshot, len(result.inputs)) == (truth[: 3 * INPUT_BYTES], 5)
+    assert held(result) == truth
+    assert result.damages == (
+        f"{tmp_path / DATABASE}: the snapshot after update 6 is damaged: not used",
+    )
+
+
+@pytest.mark.parametrize(
+    ("statement", "match"),
+    [
+        ("UPDATE snapshot SET content = x'00'", "no snapshot has the right checksum"),
+        ("UPDATE snapshot SET content = 'text'", "no snapshot has the right checksum"),
+        ("UPDATE journal SET content = x'00' WHERE number = 8", "update 8 is missing or has a"),
+        ("UPDATE journal SET digest = zeroblob(32) WHERE number = 7", "update 7 is missing or"),
+        ("UPDATE journal SET number = 9 WHERE number = 7", "update 7 is missing or has a wrong"),
+        ("DELETE FROM journal WHERE number = 7", "update 7 is missing or has a wrong checksum"),
+        ("DROP TABLE journal", "is damaged"),
+        ("DELETE FROM status", "is damaged"),
+        ("UPDATE status SET number = 9", "update 9 is missing"),
+        ("UPDATE status SET number = 7", "is damaged"),
+    ],
+)
+def test_damaged_rows_are_refused(tmp_path: Path, statement: str, match: str) -> None:
+    filled(tmp_path, 8)
+    edited(tmp_path, statement)
+    require_refused(tmp_path, match)
+
+
+# Files of others.
+
+
+@pytest.mark.parametrize("name", ["snapshot-000001.state", "journal-000002.log"])
+def test_a_folder_of_the_earlier_layout_is_refused(tmp_path: Path, name: str) -> None:
+    restored(tmp_path, {name: b"calibgraph-tracker/1\nwhatever"})
+    require_refused(
+        tmp_path, f"{name}: is state of the earlier layout .*; choose another folder, or continue"
+    )
+
+
+@pytest.mark.parametrize(
+    ("statement", "match"),
+    [
+        ("PRAGMA user_version=3", "is state of layout 3, expected 2; choose another folder, or"),
+        ("PRAGMA application_id=5", "is a database of another program; choose another folder"),
+    ],
+)
+def test_a_database_of_another_layout_or_program_is_refused(
+    tmp_path: Path, statement: str, match: str
+) -> None:
+    filled(tmp_path, 5)
+    edited(tmp_path, statement)
+    require_refused(tmp_path, match)
+
+
+@pytest.mark.parametrize("data", [b"", b"half", b"no database at all" * 1000])
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path, data: bytes) -> None:
+    restored(tmp_path, {DATABASE: data})
+    require_refused(tmp_path, "is damaged or no tracker's state; choose another folder")
+
+
+# The lock.
+
+
+HOLDING = """
+import sys
+from pathlib import Path
+from calibgraph.tracking.state_database import StateDatabase
+database = StateDatabase(Path(sys.argv[1]))
+print("locked", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_two_processes_cannot_have_one_folder(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDING, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"locked\n"
+        with pytest.raises(FileError, match="is in use by another process; stop that one"):
+            StateDatabase(tmp_path)
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+    filled(tmp_path, 1)
+
+
+def test_a_second_writer_is_refused_until_the_first_is_closed(tmp_path: Path) -> None:
+    with opened(tmp_path), pytest.raises(FileError, match="is in use"):
+        StateDatabase(tmp_path)
+    filled(tmp_path, 1)
+
+
+def test_a_database_that_another_program_has_locked_is_left_alone(tmp_path: Path) -> None:
+    truth = filled(tmp_path, 5)
+    with closing(sqlite3.connect(tmp_path / DATABASE, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with opened(tmp_path) as database, pytest.raises(OSError, match="database is locked"):
+            database.append(b"abc")
+    require_usable(tmp_path, truth)

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import MatcherErrors, Rig, concatenate, solve
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.cross_validation import check_competing_solution
+from tests.trust.conftest import named, simulated
+
+
+def test_a_competing_solution_of_the_matches_is_found(pair: Rig) -> None:
+    """60 % agree on a wrong extrinsic, 40 % on the right one, which the check names."""
+    wrong = calibgraph.perturb(pair, rotation_deg=3, translation_m=0.3, seed=2)
+    one, two = simulated(pair, matches=80), simulated(wrong, matches=120, seed=1)
+    result = solve(pair, concatenate([one, two]))
+    (check,) = named(result, "left", "competing solution")
+    assert check.status == "FAIL" and "the other is 3 deg" in check.text
+
+
+def test_random_outliers_are_no_competing_solution(pair: Rig) -> None:
+    errors = MatcherErrors(outlier_share=0.5)
+    solved = solve_joint(pair, simulated(pair, errors=errors))
+    assert check_competing_solution(solved, "left").value < 0.1
+
+
+def test_held_out_frames_show_that_matches_are_too_few(pair: Rig) -> None:
+    """Two frames of 8 matches: 16 residuals take 6 numbers; the other frame pays for it."""
+    errors = MatcherErrors(noise_px=2.0)
+    result = solve(pair, simulated(pair, frames=2, matches=8, errors=errors))
+    assert named(result, "left", "held-out")[0].value > 1.5
+
+
+def test_a_camera_with_all_matches_behind_it_is_one_line(pair: Rig) -> None:
+    solved = solve_joint(pair, simulated(pair))
+    backwards = {name: np.diag([-1.0, 1, -1, 1]) @ T for name, T in solved.T_camera_lidar.items()}
+    with pytest.raises(calibgraph.CorrespondenceError, match="'left': all its .* are behind"):
+        solved.objective.scales_at(backwards)

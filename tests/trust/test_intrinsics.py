@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from calibgraph import Camera, Correspondences, Rig, solve
+from tests.trust.conftest import named, simulated
+
+
+def with_lens(rig: Rig, distortion: tuple[float, ...] = (), **changes: float) -> Rig:
+    """The rig with intrinsics multiplied (fx, fy) or shifted (cx, cy)."""
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        k = camera.intrinsics_px
+        lens = {
+            "fx": k.fx * changes.get("focal", 1.0),
+            "fy": k.fy * changes.get("focal", 1.0),
+            "cx": k.cx + changes.get("cx", 0.0),
+            "cy": k.cy,
+        }
+        given = {**camera.model_dump(), "intrinsics_px": lens}
+        cameras[name] = Camera.model_validate({**given, "distortion": distortion})
+    return rig.model_copy(update={"cameras": cameras})
+
+
+def test_right_intrinsics_pass(mixed_rig: Rig) -> None:
+    result = solve(mixed_rig, simulated(mixed_rig))
+    for name in mixed_rig.cameras:
+        checks = named(result, name, "residuals over the image")
+        assert [check.status for check in checks] == ["PASS"] * 3
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.03])
+def test_a_wrong_focal_length_fails_and_is_measured(pair: Rig, factor: float) -> None:
+    result = solve(with_lens(pair, focal=factor), simulated(pair))
+    (check,) = named(result, "left", "a focal length")[:1]
+    assert check.status == "FAIL"
+    words = "shorter" if factor > 1 else "longer"
+    assert f"% {words}" in check.text
+    percent = float(check.text.split("a focal length ")[1].split("%")[0])
+    # A tenth of it goes into the pose where the gate cuts: the loss is robust.
+    assert percent == pytest.approx(100 * abs(1 / factor - 1), rel=0.1)
+
+
+def test_images_undistorted_twice_fail(pair: Rig) -> None:
+    result = solve(with_lens(pair, distortion=(-0.2, 0.0, 0.0, 0.0)), simulated(pair))
+    assert named(result, "left", "radial distortion")[0].status == "FAIL"
+
+
+def test_a_shifted_principal_point_is_a_warning(pair: Rig) -> None:
+    result = solve(with_lens(pair, cx=20.0), simulated(pair))
+    (check,) = named(result, "left", "principal point")
+    assert check.status == "WARN"
+    (found,) = re.findall(r"off by \((-[0-9.]+), ", check.text)
+    assert abs(float(found) + 20) < 1
+
+
+def test_matches_at_far_points_alone_depend_on_the_focal_length(pair: Rig) -> None:
+    far = solve(pair, simulated(pair, depth_m=(40.0, 80.0)))
+    near = solve(pair, simulated(pair))
+    words = "focal length wrong by 1 %"
+    assert named(near, "left", words)[0].status == "PASS"
+    assert named(far, "left", words)[0].status == "WARN"
+
+
+def test_a_wall_hides_a_wrong_focal_length_which_is_a_warning(pair: Rig) -> None:
+    """On a wall straight ahead, one percent of focal length is one percent of its distance."""
+    T = pair.T_camera_lidar["left"]
+    table = simulated(pair).of_camera("left")
+    ahead = table.points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    ahead *= 20.0 / ahead[:, 2:]
+    wall = (ahead - T[:3, 3]) @ T[:3, :3]
+    rig = Rig(cameras={"left": pair.cameras["left"]})
+    flat = Correspondences.from_arrays(
+        camera="left", frame=table.frame, pixels_px=table.pixels_px, points_lidar_m=wall
+    )
+    result = solve(rig, flat)
+    (check,) = named(result, "left", "focal length wrong by 1 %")
+    assert check.status == "WARN" and check.value == pytest.approx(20.0, rel=0.02)

@@ -1,0 +1,62 @@
+"""The verdict on a table's findings: the same for a matcher's own run and a later solve."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import calibgraph
+from calibgraph import Correspondences, Rig
+
+
+@pytest.fixture
+def table(pair: Rig) -> Correspondences:
+    return calibgraph.simulate_correspondences(pair, frames=8, matches=200)
+
+
+@pytest.mark.parametrize(
+    ("findings", "status"),
+    [
+        ({}, "PASS"),
+        ({"start_dependence": 0.1, "recall": 0.1, "failed_share": 0.1}, "PASS"),
+        ({"start_dependence": 0.3}, "WARN"),
+        ({"start_dependence": 0.9}, "FAIL"),
+        ({"start_dependence": float("nan")}, "FAIL"),
+        ({"recall": 0.4}, "WARN"),
+        ({"recall": 1.0}, "FAIL"),
+        ({"recall": -0.5}, "PASS"),
+        ({"failed_share": 0.5}, "WARN"),
+        ({"failed_share": 1.0}, "FAIL"),
+    ],
+)
+def test_findings_decide_the_verdict_of_their_camera(
+    pair: Rig, table: Correspondences, findings: dict[str, float], status: str
+) -> None:
+    metadata = {key: {"left": value} for key, value in findings.items()}
+    verdicts = calibgraph.solve(pair, replace(table, metadata=metadata)).camera_verdicts
+    assert verdicts["left"].status == status
+    assert len(verdicts["left"].reasons) == (status != "PASS")
+    assert verdicts["right"].status == "PASS"
+
+
+@pytest.mark.parametrize("nonsense", [{"left": "high"}, {"left": True}, 3, [1]])
+def test_malformed_findings_are_refused(
+    pair: Rig, table: Correspondences, nonsense: object
+) -> None:
+    with pytest.raises(calibgraph.CorrespondenceError, match="recall"):
+        calibgraph.solve(pair, replace(table, metadata={"recall": nonsense}))
+
+
+def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:
+    """It is part of the error bar; with too few frames for one it stands alone."""
+    for frames, reason in (
+        (8, "sigma: rotation"),
+        (3, "error that the matcher's frames share: rotation"),
+    ):
+        table = calibgraph.simulate_correspondences(pair, frames=frames, matches=200)
+        with_error = replace(table, metadata={"systematic_rotation_rad": 0.02})
+        verdict = calibgraph.solve(pair, with_error).camera_verdicts["left"]
+        assert verdict.status == "FAIL"
+        rotations = [text for text in verdict.reasons if "rotation" in text]
+        assert len(rotations) == 1 and rotations[0].startswith(reason)
