@@ -56,9 +56,7 @@ def match_in_rounds(
     """
     config = config or Config()
     full = find_matcher(matcher, seed=config.seed)
-    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    guess = rig if rig is not None else data.rig
-    data = data if full.most_frames is None else data.spread_out(full.most_frames)
+    data, guess = _open(dataset, rig, full.most_frames)
     if full.stage1 == "rig":  # frame weights need a pose per frame, which only PnP gives
         config = config.changed(stage1="rig", learnt_weights=False)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
@@ -81,6 +79,13 @@ def match_in_rounds(
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
     return replace(run, out_of_time=out_of_time())
+
+
+def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[Dataset, Rig]:
+    """The frames that the matcher is given, and the initial guess."""
+    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
+    guess = rig if rig is not None else data.rig
+    return (data if most_frames is None else data.spread_out(most_frames)), guess
 
 
 def _deadline(seconds: float | None) -> Callable[[], bool]:

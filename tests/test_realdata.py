@@ -30,7 +30,7 @@ def start_and_reference(folders: list[Path], seed: int) -> tuple[Rig, Rig]:
     return start, reference
 
 
-@pytest.mark.parametrize("names", ["00", "06+07+08"])
+@pytest.mark.parametrize("names", [pytest.param("00", marks=pytest.mark.ci), "06+07+08"])
 def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) -> None:
     """One start each; benchmarks.accuracy.search has more, and from farther."""
     folders = sequences(realdata, names)

@@ -152,13 +152,10 @@ def run_experiment(
         for n in sizes
         for index in range(draws)
     ]
-    results = _run(tasks, jobs, progress)
-    blocks = [
-        block
-        for k, n in enumerate(sizes)
-        for block in _summarize(n, results[k * draws : (k + 1) * draws])
-    ]
-    return Report(source.name, source.published_as, config.preset, seed, tuple(blocks))
+    found = _run(tasks, jobs, progress)
+    parts = [_summarize(n, found[k * draws : (k + 1) * draws]) for k, n in enumerate(sizes)]
+    blocks = tuple(block for part in parts for block in part)
+    return Report(source.name, source.published_as, config.preset, seed, blocks)
 
 
 def draw_seed(seed: int, frames: int, index: int) -> int:

@@ -146,14 +146,16 @@ def tune(
         tried.append(ScoredConfig("candidate", config, score(halves[0], config)))
     tried.sort(key=lambda scored: scored.tuning)
     best = tried[0]
+    tested = ScoredConfig("best", best.config, best.tuning, score(halves[1], best.config))
+    return TuningResult(tested, _score_references(base, halves), tuple(tried))
+
+
+def _score_references(base: Config, halves: Sequence[Sequence[Draw]]) -> tuple[ScoredConfig, ...]:
+    """The paper's settings and ``auto``, on the draws for tuning and on those for the test."""
     others = {f"the paper's ({base.preset})": base, "auto": preset("auto").changed(seed=base.seed)}
-    return TuningResult(
-        ScoredConfig("best", best.config, best.tuning, score(halves[1], best.config)),
-        tuple(
-            ScoredConfig(name, config, *(score(half, config) for half in halves))
-            for name, config in others.items()
-        ),
-        tuple(tried),
+    return tuple(
+        ScoredConfig(name, config, *(score(half, config) for half in halves))
+        for name, config in others.items()
     )
 
 

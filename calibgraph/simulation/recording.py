@@ -36,6 +36,7 @@ MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
+_WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
 _WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE = range(5)  # each has its own random stream
 
 
@@ -104,16 +105,10 @@ def simulate_street(
         _write_images(made / "cameras", rig, drive, seed, progress)
         rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
-        names = (
-            "lidar",
-            "cameras",
-            REFERENCE_FILE,
-            RIG_FILE,
-        )  # rig.yaml last: it makes the folder a dataset
-        for name in names:
+        for name in _WRITTEN:
             (made / name).rename(out / name)
     sync_folder(out)
-    return [out / name for name in reversed(names)]
+    return [out / name for name in reversed(_WRITTEN)]
 
 
 def build_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:

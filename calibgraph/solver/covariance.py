@@ -58,10 +58,7 @@ def cluster_robust_covariance(
     if len(gradients) < MIN_FRAMES:
         return None
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
-    for name, block in blocks.items():
-        rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
-        hessian[rows, rows] += (gate_hessian or {}).get(name, 0.0)
+    _add_robust_hessians(hessian, blocks, T_camera_lidar, gate_hessian or {})
     values, vectors = np.linalg.eigh(hessian)
     if values[0] <= _FREE * values[-1]:
         return None
@@ -70,6 +67,20 @@ def cluster_robust_covariance(
     scatter = with_pseudo_frames(gradients.T @ gradients, hessian, counts)
     covariance: Array = inverse @ scatter @ inverse
     return covariance
+
+
+def _add_robust_hessians(
+    hessian: Array,
+    blocks: Mapping[str, ProjectionBlock],
+    T_camera_lidar: Mapping[str, Array],
+    gate_hessian: Mapping[str, Array],
+) -> None:
+    """Add the correspondences' part to the joint Hessian of the priors, (6 N, 6 N)."""
+    cameras = list(T_camera_lidar)
+    for name, block in blocks.items():
+        rows = pose_rows(cameras.index(name))
+        hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
+        hessian[rows, rows] += gate_hessian.get(name, 0.0)
 
 
 def _frame_gradients(

@@ -17,6 +17,7 @@ pytest.importorskip(
 )
 
 
+@pytest.mark.ci
 @pytest.mark.slow
 def test_the_command_in_the_readme_makes_the_sample(call: Call, tmp_path: Path) -> None:
     line = re.search(r"^    calibgraph (.*) --out data/sample$", README, flags=re.MULTILINE)

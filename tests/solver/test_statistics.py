@@ -22,7 +22,7 @@ def error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return gtsam.Pose3.Logmap(gtsam.Pose3(estimate @ np.linalg.inv(truth)))
 
 
-@pytest.mark.parametrize("frames", [6, 30])
+@pytest.mark.parametrize("frames", [pytest.param(6, marks=pytest.mark.ci), 30])
 def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> None:
     """Errors shared by a frame: (J^T J)^-1 would be too small by far, clusters are not.
 

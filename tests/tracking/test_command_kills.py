@@ -140,6 +140,7 @@ def kill_often(folder: Path, kills: int, longest_s: float, seed: int) -> int:
     return drives
 
 
+@pytest.mark.ci
 @pytest.mark.slow
 def test_random_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
     assert kill_often(tmp_path, kills=5, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1

@@ -107,8 +107,7 @@ def make_sample(
     view = View(scene.camera, crop_even=True)
     image, cloud = _load(scene, view)
     if settings.augment:
-        image, cloud = _mirror(_recolour(image, rng), cloud, view, rng)
-        image, cloud = _turn(image, cloud, view, rng)
+        image, cloud = _augment(image, cloud, view, rng)
     E = draw_perturbation(rng, settings.rotation_deg, settings.translation_m)
     lidar = LidarImage.render(cloud.astype(np.float32), invert(E), view)
     truth = cloud[lidar.point_index, :3]
@@ -137,6 +136,14 @@ def make_sample(
         points_camera_m=truth[inside],
         E=E,
     )
+
+
+def _augment(
+    image: NDArray[np.uint8], cloud: Array, view: View, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], Array]:
+    """Other colours, mirrored or not, turned about the optical axis."""
+    image, cloud = _mirror(_recolour(image, rng), cloud, view, rng)
+    return _turn(image, cloud, view, rng)
 
 
 def _load(scene: Scene, view: View) -> tuple[NDArray[np.uint8], Array]:
