@@ -1,4 +1,4 @@
-"""Thousands of robust projection factors of one camera as one 7-row factor, without loss.
+"""Thousands of robust projection factors of one camera as one 7-row factor, without approximation.
 
 For correspondences k with whitened residual r_k, Jacobian J_k, s_k = |r_k|^2 and robust loss rho,
 

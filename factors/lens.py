@@ -1,8 +1,8 @@
 """Lens models: from a point in the camera frame to a pixel, with the derivative.
 
-The formulas are OpenCV's (``projectPoints`` and ``fisheye.projectPoints``) wherever those are
-injective. Outside that domain (behind the camera, or past the field angle at which the
-distortion polynomial folds back) OpenCV returns pixels that mean nothing; here such a point is
+The formulas are OpenCV's (``projectPoints`` and ``fisheye.projectPoints``) inside the field of
+view in which they are one-to-one. Outside (behind the camera, or past the field angle at which
+the distortion polynomial folds back) OpenCV returns pixels that mean nothing; here such a point is
 reported as invalid, and its projection is continued continuously (see ``project_one``), so that an
 optimizer that steps there gets a large, finite error instead of a NaN or a wrong small one.
 """

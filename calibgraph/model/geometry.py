@@ -1,4 +1,4 @@
-"""All of SE(3): the only module that inverts a transform.
+"""All of SE(3): the only module of ``calibgraph`` that inverts a transform.
 
 ``T_a_b`` maps coordinates in b to coordinates in a. Files, results and public functions hold
 ``T_camera_lidar``, a (4, 4) array; GTSAM's variables are ``T_lidar_camera``, a ``Pose3``.

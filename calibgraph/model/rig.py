@@ -25,7 +25,7 @@ from pydantic import (
 
 from calibgraph.errors import RigError
 from calibgraph.files import write_yaml
-from factors import Lens
+from factors import Lens, LensModel
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class Intrinsics(_Model):
 class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference."""
 
-    model: Literal["pinhole", "fisheye"] = "pinhole"
+    model: LensModel = "pinhole"
     width_px: Size
     height_px: Size
     intrinsics_px: Intrinsics
@@ -121,8 +121,8 @@ class Camera(_Model):
     @cached_property
     def lens(self) -> Lens:
         """The lens model for projection."""
-        make = Lens.pinhole if self.model == "pinhole" else Lens.fisheye
-        return make(**self.intrinsics_px.model_dump(), distortion=self.distortion)
+        make = {"pinhole": Lens.pinhole, "fisheye": Lens.fisheye}
+        return make[self.model](**self.intrinsics_px.model_dump(), distortion=self.distortion)
 
     @property
     def matrix_px(self) -> Array:

@@ -21,8 +21,8 @@ class Check:
         status: PASS, WARN or FAIL.
         text: one sentence: what was found and, if that is not PASS, what to do.
         value: the number that was found, if it is one.
-        warn: the last value that is PASS, if there is such a limit.
-        fail: the last value that is not FAIL, if there is such a limit.
+        warn: the limit of PASS, which itself passes, if there is one.
+        fail: the limit of WARN, which itself does not fail, if there is one.
         unit: of value, warn and fail.
     """
 

@@ -78,8 +78,8 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
         (n, 3) unit vectors in the camera's frame; 0 where the lens projects no direction to the
         pixel, or one more than 95 degrees off its axis.
     """
-    undistorted = _fisheye_directions if camera.model == "fisheye" else _pinhole_directions
-    directions = undistorted(camera, pixels_px)
+    undistort = {"fisheye": _fisheye_directions, "pinhole": _pinhole_directions}
+    directions = undistort[camera.model](camera, pixels_px)
     back, valid = camera.lens.project(directions)
     with np.errstate(invalid="ignore"):
         valid &= np.abs(back - pixels_px).max(axis=1) < _MISS_PX

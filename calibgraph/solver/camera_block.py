@@ -95,7 +95,7 @@ class CameraBlock:
         return BlockResiduals(self, T_lidar_camera, residuals, projectable)
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(n,) unweighted errors [px] where constrained; (n,) whether projectable."""
+        """(n,) unweighted errors [px] along constrained directions; (n,) whether projectable."""
         at = self.at(T_camera_lidar)
         return at.errors_px, at.projectable
 

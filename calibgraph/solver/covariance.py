@@ -14,7 +14,7 @@ from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]
 
-MIN_FRAMES = 5
+MIN_FRAMES_FOR_ERROR_BAR = 5
 """The scatter of fewer frames is too uncertain (by a third and more) to print a number."""
 
 PSEUDO_FRAMES = 8.0
@@ -51,11 +51,11 @@ def cluster_robust_covariance(
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
         xi = (rotation [rad], translation [m]) in each camera's axes. None with fewer than
-        MIN_FRAMES frames, or where H is singular.
+        MIN_FRAMES_FOR_ERROR_BAR frames, or where H is singular.
     """
     cameras = list(T_camera_lidar)
     gradients = _frame_gradients(blocks, frames, T_camera_lidar)
-    if len(gradients) < MIN_FRAMES:
+    if len(gradients) < MIN_FRAMES_FOR_ERROR_BAR:
         return None
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     _add_robust_hessians(hessian, blocks, T_camera_lidar, gate_hessian or {})

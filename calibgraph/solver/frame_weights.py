@@ -30,7 +30,7 @@ from calibgraph.solver.stage1 import Stage1
 
 Array = NDArray[np.float64]
 
-MIN_FRAMES = 8
+MIN_FRAMES_TO_WEIGH = 8
 """Fewer frames do not determine their own scatter; weights from them would shrink the error bar."""
 
 
@@ -83,7 +83,8 @@ def weigh_all_frames(
 ) -> WeighedFrames:
     """The correspondences of every camera, weighted by their residuals.
 
-    As they are, with ``learnt_weights`` off, without PnP, or without the reprojection term.
+    Unchanged if ``learnt_weights`` is off, Stage 1 is not PnP, or ``terms`` has no reprojection
+    term.
 
     Args:
         table: with the confidences.
@@ -130,7 +131,7 @@ def weigh_frames(
         by_frame: (4, 4) T_camera_lidar of single frames, by PnP.
     """
     edges = block.frame_edges
-    if len(edges) - 1 < MIN_FRAMES:
+    if len(edges) - 1 < MIN_FRAMES_TO_WEIGH:
         return WeighedCamera(block, T_camera_lidar, 0)
     numbers = block.frame[edges[:-1]]
     parts = [block.select(np.arange(*edge)) for edge in pairwise(edges)]

@@ -30,7 +30,7 @@ _NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px, half an image, to 1
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Everything that Eq. 5 sums over. Its cached property is a pure function of the fields.
+    """Everything that Eq. 5 sums over. ``pose_graph`` is computed once, from the fields alone.
 
     Attributes:
         rig: its cameras are the unknowns; its ``relative_poses`` are measurements.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +48,11 @@ def normalized(camera: Camera, pixels_px: Array) -> Array:
     pixels = np.ascontiguousarray(pixels_px[:, None, :])
     distortion = np.array(camera.distortion, dtype=np.float64)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-    if camera.model == "fisheye":
-        plane = cv2.fisheye.undistortPoints(pixels, camera.matrix_px, distortion, criteria=criteria)
-    else:
-        plane = cv2.undistortPoints(pixels, camera.matrix_px, distortion, criteria=criteria)
+    undistort: dict[str, Callable[..., Any]] = {
+        "fisheye": cv2.fisheye.undistortPoints,
+        "pinhole": cv2.undistortPoints,
+    }
+    plane = undistort[camera.model](pixels, camera.matrix_px, distortion, criteria=criteria)
     return np.asarray(plane, dtype=np.float64).reshape(-1, 2)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
-from calibgraph.solver.covariance import MIN_FRAMES, pose_hessian, with_pseudo_frames
+from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR, pose_hessian, with_pseudo_frames
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 from calibgraph.tracking.window import pose_priors
@@ -55,7 +55,7 @@ def joint_covariance(state: State, sums: Posterior, prior: Array) -> Array:
     rotation, translation = state.systematic_sigmas
     shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
     covariance += np.diag(np.tile(shared**2, len(state.cameras)))
-    few = np.repeat(sums.frames < MIN_FRAMES, 6)
+    few = np.repeat(sums.frames < MIN_FRAMES_FOR_ERROR_BAR, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return covariance
 

@@ -54,7 +54,7 @@ class Estimate:
         halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
         conflicts: of the relative poses that name this camera.
         pull: how far priors and relative poses pull it from its own solution [deg, cm]; None if
-            not, or within what that solution leaves open.
+            nothing pulls, or by less than ``pull_sigmas`` of that solution.
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
     """

@@ -71,7 +71,7 @@ class Evidence:
 
     @cached_property
     def fitted_blocks(self) -> Mapping[str, CameraBlock]:
-        """Per camera, the correspondences that the solution was fitted to, with outliers."""
+        """Per camera, the correspondences of pass 1, before the gate; none of outlier frames."""
         objective = self.solution.objective
         return objective.blocks if objective.uses_correspondences else {}
 
@@ -184,7 +184,7 @@ class Evidence:
     def pull_of(self, camera: str) -> tuple[float, float] | None:
         """How far priors and relative poses pull a camera from its own solution: deg, cm.
 
-        None where they do not, or within what that solution leaves open.
+        None if nothing pulls, or by less than ``pull_sigmas`` of the camera's own solution.
         """
         if self.data_only is None or camera not in self.solution.inliers.blocks:
             return None

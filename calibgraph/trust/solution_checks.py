@@ -141,7 +141,7 @@ ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
 
 
 def outlier_frame_checks(evidence: Evidence) -> Checks:
-    """How many frames were left out of the solve, apart from where frames are densest."""
+    """How many frames were left out because they lie far from where most frames agree."""
     counts = evidence.solution.counts
     return {
         name: [

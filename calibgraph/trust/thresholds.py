@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 from calibgraph.model.verdict import Threshold, in_unit
-from calibgraph.solver.covariance import MIN_FRAMES
+from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR
 
 _COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
@@ -70,7 +70,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "cm", "The same.", _COUNTED),
     Threshold("correspondences_used", "correspondences used", "at least", 50, 0, "",
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
-    Threshold("frames", "frames", "at least", MIN_FRAMES, 0, "", "Are there enough frames?",
+    Threshold("frames", "frames", "at least", MIN_FRAMES_FOR_ERROR_BAR, 0, "",
+              "Are there enough frames?",
               "The scatter of fewer frames gives no error bar.", "too few to give an error bar"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
@@ -117,7 +118,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "How far would focal length, principal point or distortion, if estimated, turn the "
               "camera?", "Right intrinsics, recorded and rendered: up to 0.6 deg (principal "
               "point, 7 sigma). Counted beyond `focal_sigmas` etc."),
-    Threshold("lens_translation", "would move the camera by", "at most", 5.0, 10.0, "cm",
+    Threshold("lens_translation", "translation by a lens parameter set free", "at most",
+              5.0, 10.0, "cm",
               "The same, how far would they move it?",
               "Right intrinsics, recorded and rendered: up to 1.4 cm (4.2 sigma)."),
     Threshold("focal_sensitivity", "a focal length wrong by 1 % would move the camera by",

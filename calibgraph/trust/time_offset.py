@@ -26,7 +26,7 @@ Gray = NDArray[np.uint8]
 
 MAX_ROWS = 10_000  # per camera: more of dense matches add no information
 MAX_FRAMES = 24  # evenly spread over those with a neighbour: bounds the time
-MIN_FRAMES = 4  # that move: with fewer, a single frame decides
+MIN_MOVING_FRAMES = 4  # that move: with fewer, a single frame decides
 MIN_MOTION_PX = 0.5  # median image motion per frame: below, the vehicle stands
 RETURN_PX = 1.0  # a pixel tracked forth and back must end this near
 SYSTEMATIC_PX = 0.15
@@ -86,7 +86,7 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
     known = np.flatnonzero(np.isfinite(motion_px).all(axis=1))
     table, motion_px = table.select(known), motion_px[known]
     frames = len(np.unique(table.frame))
-    if len(table) < MIN_ROWS or frames < MIN_FRAMES:
+    if len(table) < MIN_ROWS or frames < MIN_MOVING_FRAMES:
         return None
     typical = float(np.median(np.linalg.norm(motion_px, axis=1)))
     if typical < MIN_MOTION_PX:

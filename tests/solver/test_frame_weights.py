@@ -19,7 +19,7 @@ from calibgraph import (
 )
 from calibgraph.model.correspondences import concatenate
 from calibgraph.simulation.matcher_errors import PoseSpread
-from calibgraph.solver.frame_weights import MIN_FRAMES, confidence_sigmas
+from calibgraph.solver.frame_weights import MIN_FRAMES_TO_WEIGH, confidence_sigmas
 from calibgraph.solver.joint import solve_joint
 
 STUCK = MatcherErrors(
@@ -40,6 +40,7 @@ def errors_of(rig: Rig, errors: MatcherErrors, *, learnt: bool, seed: int) -> li
     return [error.rotation_error_deg for error in evaluate(found, rig).cameras.values()]
 
 
+@pytest.mark.slow
 def test_a_majority_of_frames_that_are_stuck_elsewhere_seldom_decides(pair: Rig) -> None:
     """70 % of frames lie about one wrong pose, 0.5 deg and 0.6 m away; 16 draws of a camera."""
     most = replace(STUCK, stuck_share=0.7)
@@ -84,7 +85,9 @@ def test_frames_with_few_matches_neither_rule_nor_are_called_apart(pair: Rig) ->
 
 
 def test_few_frames_are_not_weighed(pair: Rig) -> None:
-    table = simulate_correspondences(pair, frames=MIN_FRAMES - 1, matches=200, errors=STUCK)
+    table = simulate_correspondences(
+        pair, frames=MIN_FRAMES_TO_WEIGH - 1, matches=200, errors=STUCK
+    )
     for counts in solve_joint(pair, table).counts.values():
         assert counts["outlier_frames"] == 0
 

@@ -65,6 +65,7 @@ def events_of(updates: list[Update]) -> list[Event]:
     return [event for update in updates for event in update.events if event.kind != "started"]
 
 
+@pytest.mark.slow
 def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
     """The rest is the hard gate: a match at its edge is in for one and out for the other.
 

@@ -57,7 +57,13 @@ def inputs(architecture: Architecture, batch: int = 2) -> tuple[torch.Tensor, to
     return rgb, torch.randn(batch, architecture.lidar_channels, 128, 192, generator=generator)
 
 
-@pytest.mark.parametrize("name", ARCHITECTURES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name[0] in "AB" else pytest.param(name, marks=pytest.mark.slow)
+        for name in ARCHITECTURES
+    ],
+)
 def test_network_computes_its_description(name: str) -> None:
     architecture = ARCHITECTURES[name]
     model = generated(architecture)

@@ -88,6 +88,7 @@ class TestSearch:
         error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
         assert error.rotation_error_deg < 0.7
 
+    @pytest.mark.slow
     def test_a_camera_whose_images_show_noise_is_missed(
         self, truth: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -119,6 +120,7 @@ class TestSearch:
 
 
 class TestRounds:
+    @pytest.mark.slow
     def test_matches_are_independent_of_the_order_of_points(self, tmp_path: Path) -> None:
         data = calibgraph.load_dataset(SAMPLE).select("0:2")
         given, other = (
@@ -130,6 +132,7 @@ class TestRounds:
             assert error.rotation_error_deg < 0.02
             assert error.translation_error_cm < 0.5
 
+    @pytest.mark.slow
     def test_more_frames_do_not_give_fewer_matches(self, truth: Rig) -> None:
         """Frames share the windows that bound the time, and a group needs some in one frame."""
         rig = Rig(cameras={"left": truth.cameras["left"]})
@@ -141,6 +144,7 @@ class TestRounds:
         )
         assert many > few
 
+    @pytest.mark.slow
     def test_images_of_320_pixels_are_matched(self, tmp_path: Path, truth: Rig) -> None:
         """The last rounds reach few of their pixels only, by their angles."""
         data = calibgraph.load_dataset(SAMPLE)

@@ -40,6 +40,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
         torch.testing.assert_close(tensor, states[1][name], msg=name)
 
 
+@pytest.mark.slow
 def test_the_checkpoint_holds_the_range_of_training(
     parts: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:
@@ -57,6 +58,7 @@ def test_the_checkpoint_holds_the_range_of_training(
     assert not list(tmp_path.glob(".writing-*"))
 
 
+@pytest.mark.slow
 def test_fine_tuning_starts_from_given_weights(
     parts: tuple[Dataset, Dataset], tmp_path: Path
 ) -> None:
