@@ -116,7 +116,7 @@ class TestSearch:
         assert missed and missed <= set(truth.cameras)
         code, _, err = call("solve", rig, table, "--out", tmp_path / "out")
         assert code == 1
-        assert "no pose within the matcher's range explains the images" in err
+        assert "no extrinsic within the matcher's range explains the images" in err
 
 
 class TestRounds:
