@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
 from calibgraph.matching.structure.directions import find_visible, scan_angles, thin, view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
-from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import downscale_log_gray
+from calibgraph.matching.structure.shift_scores import downscale_log_gray, score_windows
 from calibgraph.matching.structure.windows import Windows, cut_windows
 from calibgraph.model.rig import Camera
 

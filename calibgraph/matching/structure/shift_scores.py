@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows, build_windows
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
@@ -21,9 +21,11 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 
+GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
 OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly constant
 MIN_GROUP_WINDOWS = 4
 MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
+MIN_RESIDUAL_SHARE = 0.1  # of an image's variance, which no cloud explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,3 +156,53 @@ def _add_scores(
     first = np.array([-reach, -reach])
     score_windows(image, places, windows.counts, windows.basis, group, first, likelihood, grids)
     grids -= grids.mean(axis=(1, 2), keepdims=True)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
+    """Add every window's score at all shifts to its group's grid.
+
+    image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
+    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s).
+    The score is d_D^2 + d_I |d_I|, with d the image's components along the columns of the basis,
+    over the image's own variation: squared for depth, whose sign in an image is unknown, and signed
+    for intensity. It is a share r of explained variance, or (likelihood) the -log(1 - r) of a
+    Gaussian window. Shifts at which a window leaves the image count 0.
+    """
+    height, width = image.shape
+    rows, columns = grids.shape[1], grids.shape[2]
+    sums = np.empty((6, columns), np.float32)  # depth, intensity, two of trend, total, power
+    for w in range(places.shape[0]):
+        n = counts[w]
+        left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
+        top, bottom = places[w, :n, 1].min(), places[w, :n, 1].max()
+        first = max(origin[0], -left)
+        size = min(origin[0] + columns, width - right) - first
+        if size <= 0:
+            continue
+        for shift in range(max(origin[1], -top), min(origin[1] + rows, height - bottom)):
+            sums[:, :size] = 0
+            for p in range(n):
+                row = image[places[w, p, 1] + shift]
+                start = places[w, p, 0] + first
+                a, b, c, d = basis[w, p, 0], basis[w, p, 1], basis[w, p, 2], basis[w, p, 3]
+                for k in range(size):
+                    value = row[start + k]
+                    sums[0, k] += a * value
+                    sums[1, k] += b * value
+                    sums[2, k] += c * value
+                    sums[3, k] += d * value
+                    sums[4, k] += value
+                    sums[5, k] += value * value
+            grid = grids[group[w], shift - origin[1]]
+            for k in range(size):
+                power = sums[5, k] - sums[4, k] * sums[4, k] / n + n * np.float32(GRAY_NOISE**2)
+                power -= sums[2, k] * sums[2, k] + sums[3, k] * sums[3, k]
+                score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
+                share = score / power
+                if likelihood:
+                    left_over = np.float32(1 + MIN_RESIDUAL_SHARE) - abs(share)
+                    share = np.copysign(
+                        np.log(np.float32(1 + MIN_RESIDUAL_SHARE) / left_over), share
+                    )
+                grid[first - origin[0] + k] += share
