@@ -48,10 +48,10 @@ __all__ = [  # with the factors that calibgraph re-exports
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 200
-"""Of Levenberg-Marquardt, which mostly takes 4 to 20."""
+"""Of Levenberg-Marquardt."""
 
 RELATIVE_TOLERANCE = 1e-10
-"""Change of the error at which it stops: far below one standard deviation of the result."""
+"""Relative change of the error at which it stops."""
 
 
 @dataclass(frozen=True)
