@@ -11,8 +11,6 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +21,7 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import sum_scores, z_score
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
 from calibgraph.trust.lens_evidence import UNKNOWN, measure_lens
@@ -83,7 +82,7 @@ def measure_image_evidence(
     report = progress or no_progress
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with core_pool() as pool:
         scorer = FrameScorer(dataset, frames, pool)
         for index, (name, camera) in enumerate(rig.cameras.items()):
             report(f"checking: {name}", index, len(rig.cameras))

@@ -7,6 +7,7 @@ sharper ones. Each stage keeps the best, without near duplicates.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,12 +69,15 @@ class Box:
         return np.asarray(np.maximum(np.abs(displacements) / self.half_widths - 1, 0).sum(axis=1))
 
 
-def search_box(maps: CorrelationMaps, box: Box, *, effort: int = 1, seed: int) -> list[Array]:
+def search_box(
+    maps: CorrelationMaps, box: Box, cores: Executor, *, effort: int = 1, seed: int
+) -> list[Array]:
     """Find the best extrinsics in a box.
 
     Args:
         maps: of one camera.
         box: where to search.
+        cores: works on several starts in parallel.
         effort: factor on the number of poses that go on from each stage.
         seed: of the search.
 
@@ -84,9 +88,9 @@ def search_box(maps: CorrelationMaps, box: Box, *, effort: int = 1, seed: int) -
     rng = np.random.default_rng(seed)
     samples = _sample(coarse, box, rng)
     starts = _suppress_duplicates(samples, effort * COARSE_STARTS)
-    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng)[: effort * FINE_STARTS]
+    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng, cores)[: effort * FINE_STARTS]
     fine = maps.blur(FINE_BLUR_CELLS)
-    refined = _refine(fine, box, rough, FINE_SIGMAS, rng)
+    refined = _refine(fine, box, rough, FINE_SIGMAS, rng, cores)
     return list(box.transforms(np.array(_suppress_duplicates(refined, effort * CANDIDATES))))
 
 
@@ -126,6 +130,7 @@ def _refine(
     starts: Sequence[Array],
     sigmas: Array,
     rng: np.random.Generator,
+    cores: Executor,
 ) -> list[Array]:
     """The displacements of the best z-score near each start; best first."""
 
@@ -133,17 +138,16 @@ def _refine(
         z_scores = maps.z_scores(box.transforms(displacements))
         return z_scores - PENALTY * box.excess(displacements)
 
-    maxima = [
-        maximize(
+    def maximize_from(start: Array, own_rng: np.random.Generator) -> tuple[Array, float]:
+        return maximize(
             penalised,
             start=start,
             sigmas=sigmas,
             half_widths=REACH_SIGMAS * sigmas,
             samples=REFINE_SAMPLES,
             steps=REFINE_STEPS,
-            rng=rng,
+            rng=own_rng,
         )
-        for start in starts
-    ]
-    maxima.sort(key=lambda pair: -pair[1])
-    return [displacement for displacement, _ in maxima]
+
+    maxima = cores.map(maximize_from, starts, rng.spawn(len(starts)))
+    return [displacement for displacement, _ in sorted(maxima, key=lambda pair: -pair[1])]

@@ -66,7 +66,8 @@ def maximize_score(
 def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
     """(n,) sum over groups of the score at the shift that each row of unknowns (n, k) implies."""
     out = np.zeros(len(unknowns))
-    _sum_interpolated(scores.grids, scores.jacobian, np.ascontiguousarray(unknowns), out)
+    columns = np.ascontiguousarray(unknowns.T, dtype=np.float32)
+    _sum_interpolated(scores.grids, scores.jacobian, columns, out)
     return out
 
 
@@ -91,21 +92,34 @@ def _maximize_once(
     )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
-    """Sum bilinearly interpolated scores; shifts outside the grid count 0."""
-    reach = (grids.shape[1] - 1) // 2
-    for i in range(unknowns.shape[0]):
-        total = 0.0
-        for g in range(grids.shape[0]):
-            u = v = float(reach)
-            for k in range(jacobian.shape[2]):
-                u += jacobian[g, 0, k] * unknowns[i, k]
-                v += jacobian[g, 1, k] * unknowns[i, k]
-            if u < 0 or v < 0 or u >= 2 * reach or v >= 2 * reach:
-                continue
-            a, b = int(u), int(v)
-            x, y = u - a, v - b
-            total += (1 - y) * ((1 - x) * grids[g, b, a] + x * grids[g, b, a + 1])
-            total += y * ((1 - x) * grids[g, b + 1, a] + x * grids[g, b + 1, a + 1])
-        out[i] = total
+    """Add bilinearly interpolated scores; shifts outside the grid count 0. unknowns: (k, n).
+
+    A grid is in the first-level cache for all of the unknowns.
+    """
+    size, n = grids.shape[1], unknowns.shape[1]
+    reach = (size - 1) // 2
+    limit = np.float32(2 * reach)
+    us, vs, corner = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
+    for g in range(len(grids)):
+        us[:] = reach
+        vs[:] = reach
+        for k in range(len(unknowns)):
+            by_u, by_v = np.float32(jacobian[g, 0, k]), np.float32(jacobian[g, 1, k])
+            for i in range(n):
+                us[i] += by_u * unknowns[k, i]
+                vs[i] += by_v * unknowns[k, i]
+        for i in range(n):
+            inside = (us[i] >= 0) & (vs[i] >= 0) & (us[i] < limit) & (vs[i] < limit)
+            u, v = us[i] if inside else np.float32(0), vs[i] if inside else np.float32(0)
+            column, row = np.int32(u), np.int32(v)
+            corner[i] = row * size + column
+            us[i] = u - np.float32(column)
+            vs[i] = v - np.float32(row) if inside else np.float32(-1)
+        grid = grids[g].reshape(-1)
+        for i in range(n):
+            at, x, y = corner[i], us[i], vs[i]
+            above = grid[at] + x * (grid[at + 1] - grid[at])
+            below = grid[at + size] + x * (grid[at + size + 1] - grid[at + size])
+            out[i] += above + y * (below - above) if y >= 0 else np.float32(0)

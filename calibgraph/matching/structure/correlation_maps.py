@@ -8,18 +8,21 @@ guess, and not on its position. The global search reads its z-scores from these 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
-from calibgraph.matching.structure.directions import find_visible, scan_angles, thin, view_angles
+from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
-from calibgraph.matching.structure.shift_scores import downscale_log_gray, score_windows
-from calibgraph.matching.structure.windows import Windows, cut_windows
+from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.shift_scores import downscale_log_gray
+from calibgraph.matching.structure.visibility import find_visible
+from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
@@ -72,7 +75,7 @@ class CorrelationMaps:
         win, such as those far back, or those that see few and only the best.
         """
         out = np.zeros(len(T_camera_lidar))
-        maps, points, T = self.maps, self.points_lidar_m, np.ascontiguousarray(T_camera_lidar)
+        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
         grid = np.array([*self.origin_rad, self.step_rad])
         sum_z_scores(maps, self.variances, points, T, grid, self._variance_floor, out)
         return out
@@ -91,7 +94,7 @@ class CorrelationMaps:
         """
         reach = np.rint(np.array(reach_rad) / self.step_rad).astype(np.int64)
         out = np.zeros((len(T_camera_lidar), 3))
-        maps, points, T = self.maps, self.points_lidar_m, np.ascontiguousarray(T_camera_lidar)
+        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
         grid = np.array([*self.origin_rad, self.step_rad])
         find_best_shifts(maps, self.variances, points, T, grid, self._variance_floor, reach, out)
         return out[:, 0], out[:, 1:] * self.step_rad
@@ -99,6 +102,11 @@ class CorrelationMaps:
     @property
     def _variance_floor(self) -> float:
         return MIN_VARIANCE_SHARE * float(self.variances.sum()) + 1e-12
+
+
+def _to_columns(T: Array) -> NDArray[np.float32]:
+    """(12, n) the first three rows of transforms (n, 4, 4), a column each."""
+    return np.ascontiguousarray(T[:, :3].reshape(len(T), 12).T, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +128,7 @@ def correlate(
     grays: Sequence[NDArray[np.uint8]],
     clouds: Sequence[PreparedCloud],
     camera: Camera,
+    cores: Executor,
     *,
     range_rad: float,
     max_windows: int,
@@ -131,16 +140,15 @@ def correlate(
         grays: (height, width) images.
         clouds: one per image.
         camera: lens, and the guess, of which only the orientation is used.
+        cores: works on several frames in parallel.
         range_rad: largest error of the orientation, per axis.
         max_windows: per frame; fewer where the maps would be too large.
         seed: of the choice of windows.
     """
     cells = _to_angular_image(grays[0], camera).log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
-    frames = [
-        _correlate_frame(gray, cloud, camera, range_rad, (max_windows, seed))
-        for gray, cloud in zip(grays, clouds, strict=True)
-    ]
+    one = partial(_correlate_frame, camera=camera, range_rad=range_rad, draw=(max_windows, seed))
+    frames = list(cores.map(one, grays, clouds))
     return CorrelationMaps(
         np.concatenate([frame.maps for frame in frames]),
         np.concatenate([frame.points_lidar_m for frame in frames]),
@@ -163,8 +171,9 @@ def _correlate_frame(
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
     R = camera.T_camera_lidar[:3, :3]
+    order, group, centres = _group_windows(windows.rays_m[:, 0] @ R.T)
+    windows = windows.select(order)
     turned = windows.rays_m @ R.T
-    group, centres = _group_windows(turned[:, 0])
     angles = view_angles(turned.reshape(-1, 3)).reshape(*turned.shape[:2], 2)
     off_centre = angles - view_angles(centres)[group][:, None]
     places = np.rint(off_centre / STEP_RAD).astype(np.int32)
@@ -181,23 +190,17 @@ def _cut_windows_in_reach(
     draw: tuple[int, int],
 ) -> Windows:
     """Windows of the part of the cloud that the camera may see from anywhere in the range."""
-    R, viewpoint_m = camera.T_camera_lidar[:3, :3], cloud.viewpoint_lidar_m(camera)
-    rays_m = cloud.points_lidar_m - viewpoint_m
-    angles, origin = view_angles(rays_m @ R.T), image.origin_rad
+    R, origin = camera.T_camera_lidar[:3, :3], image.origin_rad
+    rays_m = (cloud.points_lidar_m - cloud.viewpoint_lidar_m(camera)) @ R.T
+    angles = view_angles(rays_m)
     end = origin + np.array(image.inside.shape[::-1]) * STEP_RAD
     margin = range_rad + MARGIN_RAD
-    near = np.flatnonzero(((angles > origin - margin) & (angles < end + margin)).all(axis=1))
-    near = near[find_visible(angles[near], np.linalg.norm(rays_m[near], axis=1), STEP_RAD / 2)]
-    near = near[thin(scan_angles(rays_m[near]), STEP_RAD)]
-    return cut_windows(
-        rays_m[near],
-        cloud.intensity_rank[near],
-        spacing_rad=STEP_RAD,
-        stride_spacings=STRIDE_SPACINGS,
-        max_windows=draw[0],
-        keep_linear=False,
-        seed=draw[1],
-    )
+    near = ((angles > origin - margin) & (angles < end + margin)).all(axis=1)
+    if not cloud.seen_from_origin:
+        distance_m = np.linalg.norm(rays_m[near], axis=1)
+        near[near] = find_visible(angles[near], distance_m, STEP_RAD / 2)
+    table = cloud.windows(camera, near, STEP_RAD, STRIDE_SPACINGS, fine=False)
+    return table.cut(near, near, max_covered=1.0, max_windows=draw[0], seed=draw[1])
 
 
 def _score_maps(
@@ -239,12 +242,17 @@ def _to_angular_image(gray: NDArray[np.uint8], camera: Camera) -> _AngularImage:
     return _AngularImage(np.asarray(image, dtype=np.float32), seen[part], origin_rad)
 
 
-def _group_windows(centres_m: Array) -> tuple[NDArray[np.int32], Array]:
-    """Group windows by direction and distance: the group of each, and the groups' mean points."""
+def _group_windows(centres_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32], Array]:
+    """Group windows by direction and distance.
+
+    Returns:
+        The windows (w,), by group; the group of each (w,); the groups' mean points (g, 3).
+    """
     distance = np.linalg.norm(centres_m, axis=1)
     bins = np.floor(np.log2(distance) / OCTAVES_PER_BIN)
     cells = np.column_stack([np.floor(view_angles(centres_m) / GROUP_RAD), bins])
     _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     group = group.reshape(-1)
     sums = [np.bincount(group, column, minlength=len(counts)) for column in centres_m.T]
-    return group.astype(np.int32), np.stack(sums, axis=1) / counts[:, None]
+    order = np.argsort(group, kind="stable")
+    return order, group[order].astype(np.int32), np.stack(sums, axis=1) / counts[:, None]

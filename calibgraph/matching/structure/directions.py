@@ -1,15 +1,15 @@
-"""Directions as angles: of the camera, of the LiDAR; thinning and visibility by their cells."""
+"""Directions: view angles of a camera, and one direction per cell of the sphere."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-
-HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the nearest is hidden
 
 
 def view_angles(points_camera_m: Array) -> Array:
@@ -19,52 +19,50 @@ def view_angles(points_camera_m: Array) -> Array:
 
 
 def scan_angles(rays_m: Array) -> Array:
-    """(n, 2) angles [rad] along and across scan lines about the LiDAR's z axis, from their middle.
+    """(n, 2) angles [rad] along scan lines about the LiDAR's z axis, and across them.
+
+    Along is the arc from the x axis, so that both are angles in space.
 
     Args:
         rays_m: (n, 3) from the viewpoint, along the axes of the LiDAR frame.
     """
-    if not len(rays_m):
-        return np.empty((0, 2))
     x, y, z = rays_m.T
-    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    middle = np.arctan2(np.sin(azimuth).sum(), np.cos(azimuth).sum())
-    along = (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
-    return np.column_stack([along * np.cos(elevation), elevation])
+    elevation = np.arctan2(z, np.hypot(x, y))
+    return np.column_stack([np.arctan2(y, x) * np.cos(elevation), elevation])
 
 
-def thin(angles: Array, cell_rad: float) -> Rows:
-    """Keep one of the angles per cell, the one nearest to its centre, whatever their order.
+def thin(directions: Array, cell_rad: float) -> Rows:
+    """Keep one direction per cell of the sphere, the one nearest to its centre.
+
+    Rows of cells lie along circles of equal elevation about the z axis, as scan lines do.
 
     Args:
-        angles: (n, 2) [rad].
+        directions: (n, 3) unit vectors, in any order.
         cell_rad: side of a cell.
 
     Returns:
-        Rows of the angles that are kept.
+        Rows of the directions that are kept, by cell.
     """
-    if not len(angles):
+    if not len(directions):
         return np.empty(0, np.intp)
-    cells = np.floor(angles / cell_rad)
-    off_centre = ((angles / cell_rad - cells - 0.5) ** 2).sum(axis=1)
-    column, row = (cells - cells.min(axis=0)).astype(np.int64).T
-    name = row * (column.max() + 1) + column
-    order = np.lexsort((off_centre, name))
-    return np.asarray(order[np.append(True, np.diff(name[order]) != 0)])
+    elevation = np.arcsin(np.clip(directions[:, 2], -1, 1)) / cell_rad
+    first, last = math.floor(elevation.min()), math.floor(elevation.max())
+    columns = math.ceil(2 * math.pi / cell_rad) + 1
+    nearest = np.full((last - first + 1) * columns, -1, np.intp)
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + math.pi
+    _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest)
+    return nearest[nearest >= 0]
 
 
-def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
-    """Find the points that no much nearer point of the same cell hides.
-
-    Args:
-        angles: (n, 2) [rad].
-        distance_m: (n,).
-        cell_rad: side of a cell.
-    """
-    if not len(angles):
-        return np.empty(0, np.bool_)
-    cells = np.floor((angles - angles.min(axis=0)) / cell_rad).astype(np.int64)
-    name = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    nearest_m = np.full(int(name.max()) + 1, np.inf)
-    np.minimum.at(nearest_m, name, distance_m)
-    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[name] + HIDDEN_M)
+@njit(cache=True, nogil=True)
+def _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest):  # type: ignore[no-untyped-def]
+    """The direction nearest to the centre of each cell; its squared distance is in cells."""
+    least = np.empty(len(nearest))
+    for i in range(len(azimuth)):
+        row = math.floor(elevation[i])
+        along = azimuth[i] * math.cos((row + 0.5) * cell_rad) / cell_rad
+        column = math.floor(along)
+        off = (along - column - 0.5) ** 2 + (elevation[i] - row - 0.5) ** 2
+        cell = (row - first) * columns + column
+        if nearest[cell] < 0 or off < least[cell]:
+            nearest[cell], least[cell] = i, off

@@ -10,38 +10,40 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Frame
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.window_table import WindowTables
 from calibgraph.model.rig import Camera
+from calibgraph.parallel import Once
 
 FileVersion = tuple[Path, int, int]
 """Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
 
 
 class FrameCache:
-    """Clouds and images, decoded once from round to round."""
+    """Clouds and images, decoded once from round to round; and the clouds' windows."""
 
     def __init__(self) -> None:
-        self._clouds: dict[FileVersion, PreparedCloud] = {}
-        self._images: dict[tuple[FileVersion, int, int], NDArray[np.uint8]] = {}
+        self._clouds: Once[FileVersion, PreparedCloud] = Once()
+        self._images: Once[tuple[FileVersion, int, int], NDArray[np.uint8]] = Once()
+        self._tables = WindowTables()
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
-        self._clouds = {key: value for key, value in self._clouds.items() if key[0] in kept}
-        self._images = {key: value for key, value in self._images.items() if key[0][0] in kept}
+        self._clouds.keep_only(lambda key: key[0] in kept)
+        self._images.keep_only(lambda key: key[0][0] in kept)
+        self._tables.keep_only(self._clouds.values())
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
-        key = _file_version(frame.cloud_path)
-        if key not in self._clouds:
-            self._clouds[key] = PreparedCloud.from_points(frame.load_cloud())
-        return self._clouds[key]
+        return self._clouds.get(
+            _file_version(frame.cloud_path),
+            lambda: PreparedCloud.from_points(frame.load_cloud(), self._tables),
+        )
 
     def image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the camera's image, gray; its size is checked against the camera's."""
         key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
-        if key not in self._images:
-            self._images[key] = frame.load_gray(name, camera)
-        return self._images[key]
+        return self._images.get(key, lambda: frame.load_gray(name, camera))
 
 
 def _file_version(path: Path) -> FileVersion:

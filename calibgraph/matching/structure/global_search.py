@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 
@@ -60,7 +60,7 @@ def locate_cameras(
     *,
     seed: int,
     out_of_time: Callable[[], bool],
-    pool: ThreadPoolExecutor,
+    pool: Executor,
     progress: Progress,
 ) -> dict[str, Candidate]:
     """Locate all cameras of a rig.
@@ -71,7 +71,7 @@ def locate_cameras(
         search_range: about the guess.
         seed: of the search.
         out_of_time: checked before each search, and after each pose that is tried.
-        pool: works on several cameras in parallel.
+        pool: a thread per camera, which waits for the cores of its frames.
         progress: called as the work goes on.
 
     Returns:
@@ -174,13 +174,14 @@ class _CameraSearch:
             frames.grays,
             frames.clouds,
             camera,
+            frames.cores,
             range_rad=self.range.rotation_rad,
             max_windows=effort * SEARCH_WINDOWS // len(frames.grays),
             seed=seed,
         )
         if not len(maps.maps):
             return Candidate(camera, -math.inf, False)
-        transforms = search_box(maps, self._box(name), effort=effort, seed=seed)
+        transforms = search_box(maps, self._box(name), frames.cores, effort=effort, seed=seed)
         return self.first_accepted(name, ([T_camera_lidar] for T_camera_lidar in transforms))
 
     def try_proposals(self, located: Mapping[str, Candidate], name: str) -> Candidate:

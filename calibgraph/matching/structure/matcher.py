@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -27,6 +26,7 @@ from calibgraph.matching.structure.shift_scores import (
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress
 
 SYSTEMATIC_ROTATION_RAD = float(np.radians(0.09))
@@ -105,10 +105,10 @@ class StructureMatcher:
             return Start(rig)
         self._cache.keep_only(dataset.frames)
         frames = spread_out(dataset.frames, SEARCH_FRAMES)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
             candidates = locate_cameras(
                 rig,
-                self._load_frames(frames, rig, pool),
+                self._load_frames(frames, rig, cores),
                 self.search_range,
                 seed=self.seed,
                 out_of_time=out_of_time,
@@ -126,29 +126,28 @@ class StructureMatcher:
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
         """Match every camera in every frame, about the rig's extrinsics."""
-        level, frames = self.levels[round_index], dataset.frames
-        self._cache.keep_only(frames)
-        work = len(rig.cameras) * len(frames)
+        self._cache.keep_only(dataset.frames)
+        work = len(rig.cameras) * len(dataset.frames)
         tables, z_scores = [], {}
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            for index, (name, camera) in enumerate(rig.cameras.items()):
-                done = round_index * work + index * len(frames)
+        with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+            one = partial(self._match_camera, dataset.frames, self.levels[round_index], cores)
+            matches = pool.map(one, rig.cameras, rig.cameras.values())
+            for index, name in enumerate(rig.cameras):
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
+                done = round_index * work + index * len(dataset.frames)
                 progress(what, done, self.rounds * work)
-                scores = self._score_camera(frames, name, camera, level, pool)
-                twist, z_scores[name] = find_consensus(scores, level, seed=self.seed)
-                least = level.min_quality
-                tables.append(extract_correspondences(scores, twist, name, min_quality=least))
+                table, z_scores[name] = next(matches)
+                tables.append(table)
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
 
     def _load_frames(
-        self, frames: Sequence[Frame], rig: Rig, pool: ThreadPoolExecutor
+        self, frames: Sequence[Frame], rig: Rig, cores: ThreadPoolExecutor
     ) -> dict[str, CameraFrames]:
-        clouds = list(pool.map(self._cache.cloud, frames))
+        clouds = list(cores.map(self._cache.cloud, frames))
         image = self._cache.image
         return {
             name: CameraFrames(
-                list(pool.map(partial(image, name=name, camera=camera), frames)), clouds
+                list(cores.map(partial(image, name=name, camera=camera), frames)), clouds, cores
             )
             for name, camera in rig.cameras.items()
         }
@@ -157,15 +156,10 @@ class StructureMatcher:
         confident = all(c.accepted and c.z_score >= _CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
-    def _score_camera(
-        self,
-        frames: Sequence[Frame],
-        name: str,
-        camera: Camera,
-        level: Level,
-        pool: ThreadPoolExecutor,
-    ) -> ShiftScores:
-        """The groups of one camera in all frames."""
+    def _match_camera(
+        self, frames: Sequence[Frame], level: Level, cores: Executor, name: str, camera: Camera
+    ) -> tuple[Correspondences, float]:
+        """The correspondences of one camera in all frames, and their z-score."""
         per_frame = level.max_windows // min(len(frames), SHARING_FRAMES)
         max_windows = min(per_frame, FRAME_WINDOWS)
 
@@ -175,7 +169,10 @@ class StructureMatcher:
                 gray, cloud, camera, level, frame=frame.index, max_windows=max_windows
             )
 
-        return concatenate_scores(list(pool.map(score, frames)))
+        scores = concatenate_scores(list(cores.map(score, frames)))
+        twist, z_score = find_consensus(scores, level, seed=self.seed)
+        table = extract_correspondences(scores, twist, name, min_quality=level.min_quality)
+        return table, z_score
 
     def _metadata(self, round_index: int, z_scores: Mapping[str, float]) -> dict[str, Any]:
         """The settings and findings of a round."""

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
-from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.shift_scores import concatenate_scores, score_frame
+from calibgraph.matching.structure.schedule import LEVELS, Level
+from calibgraph.matching.structure.shift_scores import (
+    ShiftScores,
+    concatenate_scores,
+    score_frame,
+)
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
@@ -46,10 +52,12 @@ class CameraFrames:
     Attributes:
         grays: (height, width) images.
         clouds: one per image.
+        cores: a thread per core, which works on several frames in parallel.
     """
 
     grays: Sequence[NDArray[np.uint8]]
     clouds: Sequence[PreparedCloud]
+    cores: Executor
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +107,25 @@ def _refine_once(frames: CameraFrames, camera: Camera) -> Candidate:
     """Go through the levels once, or until the z-score is too low to go on."""
     z_score = 0.0
     for level, windows in REFINEMENT:
-        per_frame = [
-            score_frame(
-                gray, cloud, camera, level, frame=i, max_windows=windows // len(frames.grays)
-            )
-            for i, (gray, cloud) in enumerate(zip(frames.grays, frames.clouds, strict=True))
-        ]
-        twist, z_score = find_consensus(concatenate_scores(per_frame), level, seed=0)
+        score = partial(_score, camera, level, windows // len(frames.grays))
+        numbers = range(len(frames.grays))
+        per_frame = frames.cores.map(score, frames.grays, frames.clouds, numbers)
+        twist, z_score = find_consensus(concatenate_scores(list(per_frame)), level, seed=0)
         camera = apply_twist(camera, twist)
         if z_score < ABANDONED:
             break
     return Candidate(camera, z_score, z_score >= ACCEPTED)
+
+
+def _score(
+    camera: Camera,
+    level: Level,
+    max_windows: int,
+    gray: NDArray[np.uint8],
+    cloud: PreparedCloud,
+    number: int,
+) -> ShiftScores:
+    return score_frame(gray, cloud, camera, level, frame=number, max_windows=max_windows)
 
 
 def _is_same_pose(one: Candidate, two: Candidate) -> bool:

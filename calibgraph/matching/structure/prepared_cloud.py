@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from calibgraph.matching.structure.directions import find_visible, scan_angles
+from calibgraph.matching.structure.directions import scan_angles
+from calibgraph.matching.structure.visibility import find_visible
+from calibgraph.matching.structure.window_table import WindowTable, WindowTables
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 MIN_RANGE_M = 1.5  # nearer returns are the vehicle itself
 ORIGIN_CELL_RAD, MAX_HIDDEN_FROM_ORIGIN = np.radians(0.3), 0.04
@@ -30,14 +33,18 @@ class PreparedCloud:
             intensities.
         seen_from_origin: whether the points were measured from the LiDAR frame's origin. Clouds
             that join several sensors, or are in a vehicle's frame, were not.
+        tables: where the windows of this and other clouds are kept.
     """
 
     points_lidar_m: Array
     intensity_rank: Array
     seen_from_origin: bool
+    tables: WindowTables = field(default_factory=WindowTables)
 
     @staticmethod
-    def from_points(cloud: NDArray[np.float32]) -> PreparedCloud:
+    def from_points(
+        cloud: NDArray[np.float32], tables: WindowTables | None = None
+    ) -> PreparedCloud:
         """Prepare a cloud, (n, 4) x y z [m] and intensity (NaN where there is none)."""
         points = cloud[:, :3].astype(np.float64)
         distance_m = np.linalg.norm(points, axis=1)
@@ -49,9 +56,37 @@ class PreparedCloud:
             points,
             rankdata(intensity) / max(1, len(intensity)),
             seen_from_origin=bool(hidden.sum() <= MAX_HIDDEN_FROM_ORIGIN * len(hidden)),
+            tables=tables or WindowTables(),
         )
 
     def viewpoint_lidar_m(self, camera: Camera) -> Array:
         """(3,) from where windows are cut: the LiDAR if it is at the origin, else the camera."""
         T = camera.T_camera_lidar
         return np.zeros(3) if self.seen_from_origin else camera_center(T)
+
+    def windows(
+        self, camera: Camera, usable: Mask, spacing_rad: float, stride_spacings: float, fine: bool
+    ) -> WindowTable:
+        """The windows of the cloud, which do not depend on the camera if the LiDAR is at the origin.
+
+        Args:
+            camera: from where they are cut if not.
+            usable: (n,) the points that are used if not.
+            spacing_rad: of the points in a window.
+            stride_spacings: of the windows, in spacings of the points.
+            fine: keep the linear parts of the variation.
+        """
+
+        def make() -> WindowTable:
+            return WindowTable(
+                self.points_lidar_m - self.viewpoint_lidar_m(camera),
+                self.intensity_rank,
+                np.arange(len(usable)) if self.seen_from_origin else np.flatnonzero(usable),
+                spacing_rad=spacing_rad,
+                stride_spacings=stride_spacings,
+                keep_linear=fine,
+            )
+
+        if not self.seen_from_origin:
+            return make()
+        return self.tables.get((self, spacing_rad, stride_spacings, fine), make)

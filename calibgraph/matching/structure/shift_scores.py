@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows, build_windows
+from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.visibility import find_in_view, find_visible
+from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
@@ -21,11 +22,12 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 
-GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
 OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly constant
 MIN_GROUP_WINDOWS = 4
 MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
-MIN_RESIDUAL_SHARE = 0.1  # of an image's variance, which no cloud explains
+MAX_COVERED = 0.3  # share of a window that something nearer may cover at a coarse level
+OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample each
+LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +68,20 @@ def score_frame(
         max_windows: at most so many windows of the cloud.
     """
     image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
-    windows = build_windows(cloud, camera, level, max_windows=max_windows)
-    points_lidar_m = windows.rays_m.reshape(-1, 3) + cloud.viewpoint_lidar_m(camera)
-    T = camera.T_camera_lidar
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    kept, group, groups = _group_windows(points[::WINDOW_POINTS], level.group_rad)
+    windows = select_windows(cloud, camera, level, max_windows=max_windows)
+    T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
+    centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
+    kept, group, groups = _group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
+    windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
+    points = (windows.rays_m.reshape(-1, 3) + viewpoint_m) @ T[:3, :3].T + T[:3, 3]
     pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
-    places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)[kept]
+    places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    _add_scores(grids, image, places, windows.select(kept), group, likelihood=level.fine)
+    _add_scores(grids, image, places, windows, group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
-    centres = _mean_by_group(points_lidar_m[::WINDOW_POINTS][kept], group, counts)
+    centres = _mean_by_group(centres_lidar_m, group, counts)
     pixels_px, jacobian_px = project_with_jacobian(camera, centres)
     return ShiftScores(
         grids=grids,
@@ -89,6 +92,25 @@ def score_frame(
         counts=counts,
         steps_per_px=scale,
     )
+
+
+def select_windows(
+    cloud: PreparedCloud, camera: Camera, level: Level, *, max_windows: int
+) -> Windows:
+    """Select the windows of a cloud that a camera sees from its estimated pose."""
+    index, angles, distance_m = find_in_view(cloud.points_lidar_m, camera)
+    visible = find_visible(angles, distance_m, OCCLUSION_SPACINGS * level.spacing_rad)
+    in_view, clear = np.zeros((2, len(cloud.points_lidar_m)), np.bool_)
+    in_view[index], clear[index[visible]] = True, True
+    table = cloud.windows(
+        camera,
+        in_view if level.fine else clear,
+        level.spacing_rad,
+        level.stride_spacings,
+        level.fine,
+    )
+    max_covered = 0.0 if level.fine else MAX_COVERED
+    return table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
 
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
@@ -108,8 +130,7 @@ def downscale_log_gray(
     factor = min(1.0, 1.0 / (camera.intrinsics_px.fx * step_rad))
     height, width = gray.shape
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
-    logarithm = np.log1p(gray.astype(np.float32))
-    small = cv2.resize(logarithm, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(cv2.LUT(gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), blur_steps)
     scale = np.array([size[0] / width, size[1] / height])
     return np.ascontiguousarray(small, dtype=np.float32), scale
@@ -121,7 +142,7 @@ def _group_windows(
     """Group windows by direction and depth; groups of too few windows are dropped.
 
     Returns:
-        The kept windows (k,), the group of each (k,), and the number of groups.
+        The kept windows (k,), by group; the group of each (k,); and the number of groups.
     """
     distance = np.linalg.norm(centres_camera_m, axis=1)
     cells = np.column_stack(
@@ -134,7 +155,8 @@ def _group_windows(
     cell = cell.reshape(-1)
     kept = np.flatnonzero(sizes[cell] >= MIN_GROUP_WINDOWS)
     names, group = np.unique(cell[kept], return_inverse=True)
-    return kept, group.reshape(-1).astype(np.int32), len(names)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    return kept[order], group.reshape(-1)[order].astype(np.int32), len(names)
 
 
 def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
@@ -156,53 +178,3 @@ def _add_scores(
     first = np.array([-reach, -reach])
     score_windows(image, places, windows.counts, windows.basis, group, first, likelihood, grids)
     grids -= grids.mean(axis=(1, 2), keepdims=True)
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
-    """Add every window's score at all shifts to its group's grid.
-
-    image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
-    (n, l, 4); group: (n,); origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s).
-    The score is d_D^2 + d_I |d_I|, with d the image's components along the columns of the basis,
-    over the image's own variation: squared for depth, whose sign in an image is unknown, and signed
-    for intensity. It is a share r of explained variance, or (likelihood) the -log(1 - r) of a
-    Gaussian window. Shifts at which a window leaves the image count 0.
-    """
-    height, width = image.shape
-    rows, columns = grids.shape[1], grids.shape[2]
-    sums = np.empty((6, columns), np.float32)  # depth, intensity, two of trend, total, power
-    for w in range(places.shape[0]):
-        n = counts[w]
-        left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
-        top, bottom = places[w, :n, 1].min(), places[w, :n, 1].max()
-        first = max(origin[0], -left)
-        size = min(origin[0] + columns, width - right) - first
-        if size <= 0:
-            continue
-        for shift in range(max(origin[1], -top), min(origin[1] + rows, height - bottom)):
-            sums[:, :size] = 0
-            for p in range(n):
-                row = image[places[w, p, 1] + shift]
-                start = places[w, p, 0] + first
-                a, b, c, d = basis[w, p, 0], basis[w, p, 1], basis[w, p, 2], basis[w, p, 3]
-                for k in range(size):
-                    value = row[start + k]
-                    sums[0, k] += a * value
-                    sums[1, k] += b * value
-                    sums[2, k] += c * value
-                    sums[3, k] += d * value
-                    sums[4, k] += value
-                    sums[5, k] += value * value
-            grid = grids[group[w], shift - origin[1]]
-            for k in range(size):
-                power = sums[5, k] - sums[4, k] * sums[4, k] / n + n * np.float32(GRAY_NOISE**2)
-                power -= sums[2, k] * sums[2, k] + sums[3, k] * sums[3, k]
-                score = sums[0, k] * sums[0, k] + sums[1, k] * abs(sums[1, k])
-                share = score / power
-                if likelihood:
-                    left_over = np.float32(1 + MIN_RESIDUAL_SHARE) - abs(share)
-                    share = np.copysign(
-                        np.log(np.float32(1 + MIN_RESIDUAL_SHARE) / left_over), share
-                    )
-                grid[first - origin[0] + k] += share

@@ -6,6 +6,7 @@ import pytest
 from calibgraph.matching.structure.box_search import Box, search_box
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
 from calibgraph.matching.structure.directions import view_angles
+from calibgraph.parallel import core_pool
 from tests.conftest import make_camera
 
 
@@ -33,7 +34,9 @@ def test_the_search_finds_where_the_maps_agree() -> None:
     maps -= maps.mean(axis=(1, 2), keepdims=True)
     correlation = CorrelationMaps(maps, points, origin, step)
     guess = Box(true, np.radians(20), 1.5).transforms(rng.uniform(-1, 1, (1, 6)) * 0.3)[0]
-    found = search_box(correlation, Box(guess, np.radians(20), 1.5), seed=0)
+    box = Box(guess, np.radians(20), 1.5)
+    with core_pool() as cores:
+        found = search_box(correlation, box, cores, seed=0)
     off = Box(true, 1.0, 1.0).displacement(found[0])
     assert np.abs(off[:3]).max() < np.radians(0.6)  # a step of the maps
     assert np.abs(off[3:]).max() < 0.15  # a step at 15 m

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from calibgraph.matching.structure.directions import find_visible, thin, view_angles
+from calibgraph.matching.structure.directions import thin, view_angles
+from calibgraph.matching.structure.visibility import find_visible
 
 
 def test_background_behind_a_near_object_is_hidden() -> None:
@@ -20,8 +22,19 @@ def test_background_behind_a_near_object_is_hidden() -> None:
 
 def test_thinning_is_independent_of_the_order_of_points() -> None:
     rng = np.random.default_rng(0)
-    angles = rng.uniform(-0.5, 0.5, (10_000, 2))
-    order = rng.permutation(10_000)
-    one, two = thin(angles, 0.05), thin(angles[order], 0.05)
-    assert len(one) == 400
-    np.testing.assert_array_equal(angles[one], angles[order][two])
+    rays = rng.standard_normal((20_000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    order = rng.permutation(len(rays))
+    one, two = thin(rays, 0.05), thin(rays[order], 0.05)
+    np.testing.assert_array_equal(rays[one], rays[order][two])
+    assert len(one) == pytest.approx(4 * np.pi / 0.05**2, rel=0.05)  # cells of the sphere
+
+
+def test_thinned_directions_are_as_dense_everywhere() -> None:
+    rng = np.random.default_rng(0)
+    rays = rng.standard_normal((400_000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    kept = rays[thin(rays, 0.02)]
+    cells = 2 * np.pi * (1 - np.cos(0.5)) / 0.02**2  # of a cone of 0.5 rad
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        assert np.count_nonzero(kept @ axis > np.cos(0.5)) == pytest.approx(cells, rel=0.1)

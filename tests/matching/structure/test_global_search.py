@@ -57,8 +57,8 @@ def fake_search(
 
 
 def locate_without_images(rig: Rig) -> dict[str, Candidate]:
-    frames = {name: CameraFrames([], []) for name in rig.cameras}
     with ThreadPoolExecutor(1) as pool:
+        frames = {name: CameraFrames([], [], pool) for name in rig.cameras}
         return locate_cameras(
             rig,
             frames,

@@ -8,12 +8,12 @@ from calibgraph import Rig
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.shift_scores import (
+from calibgraph.matching.structure.score_kernel import (
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
-    score_frame,
     score_windows,
 )
+from calibgraph.matching.structure.shift_scores import score_frame
 from tests.conftest import SAMPLE
 
 
@@ -29,6 +29,7 @@ def test_the_score_of_a_window_is_its_share_of_the_images_variance(likelihood: b
     image = rng.standard_normal((20, 30)).astype(np.float32)
     places = rng.integers([10, 8], [18, 14], (12, 2)).astype(np.int32)
     basis = orthonormal(12, 4, rng).astype(np.float32)
+    basis[:, 2:] *= not likelihood
     grids = np.zeros((1, 5, 5), np.float32)
     score_windows(
         image, places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),

@@ -8,7 +8,8 @@ import calibgraph
 from calibgraph import Camera, Intrinsics, Rig
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.windows import build_windows, cut_windows
+from calibgraph.matching.structure.shift_scores import select_windows
+from calibgraph.matching.structure.window_table import WindowTable
 from tests.conftest import KANNALA, SAMPLE, make_camera
 
 
@@ -16,10 +17,10 @@ def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None
     raw = calibgraph.load_dataset(SAMPLE, truth).frames[0].load_cloud()
     camera = truth.cameras["front_left"]
     cloud = PreparedCloud.from_points(raw)
-    windows = build_windows(cloud, camera, LEVELS[3], max_windows=10_000)
+    windows = select_windows(cloud, camera, LEVELS[3], max_windows=10_000)
     raw[:, 3] = np.nan
     cloud = PreparedCloud.from_points(raw)
-    blind = build_windows(cloud, camera, LEVELS[3], max_windows=10_000)
+    blind = select_windows(cloud, camera, LEVELS[3], max_windows=10_000)
     assert len(windows.counts) > len(blind.counts) > 100
     # Without intensities all ranks are equal: their mean rounds by 1e-16, which the column divides
     # by 1e-6 and weighs by 1e-15.
@@ -43,7 +44,7 @@ def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
         T_camera_lidar=make_camera().T_camera_lidar,
     )
     cloud = PreparedCloud.from_points(raw)
-    windows = build_windows(cloud, camera, LEVELS[2], max_windows=10_000)
+    windows = select_windows(cloud, camera, LEVELS[2], max_windows=10_000)
     T = camera.T_camera_lidar
     z = (windows.rays_m.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
     assert z.min() < 0 < z.max()
@@ -56,18 +57,20 @@ def test_members_behind_a_silhouette_are_moved_to_it() -> None:
     rays = np.array([[1.0, np.tan(a), np.tan(e)] for a, e in itertools.product(angles, angles)])
     post = np.abs(rays[:, 1]) < np.tan(np.radians(1.0))
     rays *= np.where(post, 5.0, 20.0)[:, None]
-    windows = cut_windows(
+    table = WindowTable(
         rays,
         np.ones(len(rays)),
+        np.arange(len(rays)),
         spacing_rad=np.radians(0.2),
         stride_spacings=2.0,
-        max_windows=10_000,
         keep_linear=False,
     )
+    everywhere = np.ones(len(rays), np.bool_)
+    windows = table.cut(everywhere, everywhere, max_covered=0.0, max_windows=10_000)
     at_edge = ~windows.front.all(axis=1)
     assert np.count_nonzero(at_edge) > 20
     assert windows.rays_m[at_edge][..., 0].max() < 5.2
-    np.testing.assert_allclose(  # along their own rays
-        windows.rays_m / np.linalg.norm(windows.rays_m, axis=2, keepdims=True),
-        (rays / np.linalg.norm(rays, axis=1, keepdims=True))[windows.members],
-    )
+    along = windows.rays_m / np.linalg.norm(windows.rays_m, axis=2, keepdims=True)
+    given = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    gap = np.linalg.norm(along.reshape(-1, 1, 3)[:500] - given, axis=2).min(axis=1)
+    assert gap.max() < 1e-6  # along their own rays

@@ -1,0 +1,78 @@
+"""Which points of a cloud a camera sees."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from calibgraph.model.rig import Camera
+from factors.lens import is_projectable, project_one
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the nearest is hidden
+
+
+def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Array]:
+    """Find the points that project into a camera's image.
+
+    Args:
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        camera: lens, image size and extrinsic.
+
+    Returns:
+        (k,) their rows; (k, 2) view angles [rad], see :func:`directions.view_angles`; (k,)
+        distances from the camera [m].
+    """
+    lens, T = camera.lens, np.ascontiguousarray(camera.T_camera_lidar, dtype=np.float64)
+    points = np.ascontiguousarray(points_lidar_m, dtype=np.float64)
+    rows = np.empty(len(points), np.intp)
+    views = np.empty((len(points), 3))
+    count = _find_in_view(
+        lens.kind, lens.packed, T, points, camera.width_px, camera.height_px, rows, views
+    )
+    return rows[:count], views[:count, :2], views[:count, 2]
+
+
+def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
+    """Find the points that no much nearer point of the same cell hides.
+
+    Args:
+        angles: (n, 2) [rad].
+        distance_m: (n,).
+        cell_rad: side of a cell.
+    """
+    if not len(angles):
+        return np.empty(0, np.bool_)
+    cells = np.floor((angles - angles.min(axis=0)) / cell_rad).astype(np.int64)
+    name = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    nearest_m = np.full(int(name.max()) + 1, np.inf)
+    np.minimum.at(nearest_m, name, distance_m)
+    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[name] + HIDDEN_M)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if not is_projectable(kind, lens, x, y, z):
+            continue
+        projection = project_one(kind, lens, x, y, z)
+        u, v = projection[0] + 0.5, projection[1] + 0.5
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        rows[count] = i
+        views[count, 0] = math.atan2(x, z)
+        views[count, 1] = math.atan2(y, math.sqrt(x * x + z * z))
+        views[count, 2] = math.sqrt(x * x + y * y + z * z)
+        count += 1
+    return count

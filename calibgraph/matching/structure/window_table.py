@@ -1,0 +1,124 @@
+"""The windows of a cloud, cut where a camera looks and kept for the next pose and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.matching.structure.directions import thin
+from calibgraph.matching.structure.windows import Neighbours, Windows, cut_windows
+from calibgraph.parallel import Once
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
+MAX_BYTES = 500_000_000  # of all tables of a cache
+_UNCUT, _USELESS = -1, -2
+
+
+class WindowTable:
+    """The windows of a cloud from one viewpoint.
+
+    Centres are in random order, the same for every pose and camera, so that the windows of one
+    pose are those of the next as far as it sees them.
+
+    Args:
+        rays_m: (n, 3) from the viewpoint to the cloud's points, along the axes of the LiDAR frame.
+        intensity_rank: (n,) of the points.
+        rows: (m,) the points that may be used.
+        spacing_rad: of the points in a window.
+        stride_spacings: of the windows, in spacings of the points.
+        keep_linear: keep the linear parts of the variation.
+    """
+
+    def __init__(
+        self,
+        rays_m: Array,
+        intensity_rank: Array,
+        rows: Rows,
+        *,
+        spacing_rad: float,
+        stride_spacings: float,
+        keep_linear: bool,
+    ) -> None:
+        directions = rays_m[rows]
+        directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        kept = thin(directions, spacing_rad)
+        self._rows = rows[kept]
+        self._rays_m, self._intensity_rank = rays_m[self._rows], intensity_rank[self._rows]
+        self._neighbours = Neighbours(directions[kept], spacing_rad)
+        centres = thin(directions[kept], stride_spacings * spacing_rad)
+        self._centres = np.random.default_rng(0).permutation(centres)
+        self._slots = np.full(len(centres), _UNCUT, np.int32)
+        self._windows = Windows.empty()
+        self._keep_linear = keep_linear
+        self._lock = Lock()
+
+    def cut(
+        self, in_view: Mask, clear: Mask, *, max_covered: float, max_windows: int, seed: int = 0
+    ) -> Windows:
+        """Windows whose points are all in view, and mostly clear.
+
+        Args:
+            in_view: (n,) of all points of the cloud.
+            clear: (n,) those that nothing nearer covers.
+            max_covered: share of a window that may be covered.
+            max_windows: at most so many centres in view are taken.
+            seed: of the choice.
+        """
+        chosen = np.flatnonzero(in_view[self._rows[self._centres]])
+        if seed:
+            chosen = np.random.default_rng(seed).permutation(chosen)
+        windows, slots = self._take(chosen[:max_windows])
+        rows = self._rows[windows.members[slots]]
+        covered = (windows.front[slots] & ~clear[rows]).mean(axis=1)
+        return windows.select(slots[in_view[rows].all(axis=1) & (covered <= max_covered)])
+
+    def _take(self, chosen: Rows) -> tuple[Windows, NDArray[np.int32]]:
+        """All windows that have been cut, and the rows of those of some centres."""
+        with self._lock:
+            missing = chosen[self._slots[chosen] == _UNCUT]
+            if len(missing):
+                windows, reliability = cut_windows(
+                    self._rays_m,
+                    self._intensity_rank,
+                    self._centres[missing],
+                    self._neighbours,
+                    keep_linear=self._keep_linear,
+                )
+                useful = reliability > MIN_RELIABILITY
+                first = len(self._windows.counts)
+                self._slots[missing] = _USELESS
+                self._slots[missing[useful]] = first + np.arange(np.count_nonzero(useful))
+                self._windows = self._windows.join(windows.select(useful))
+            slots = self._slots[chosen]
+            return self._windows, slots[slots >= 0]
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        own = (self._rows, self._rays_m, self._rays_m, self._intensity_rank, self._centres)
+        return self._windows.nbytes + sum(values.nbytes for values in own)
+
+
+class WindowTables:
+    """The tables of several clouds: those used last, up to ``MAX_BYTES``."""
+
+    def __init__(self) -> None:
+        self._tables: Once[tuple[Hashable, ...], WindowTable] = Once()
+
+    def get(self, key: tuple[Hashable, ...], make: Callable[[], WindowTable]) -> WindowTable:
+        """The table of a key, of which the first is the cloud; made if it is not there."""
+        table = self._tables.get(key, make)
+        self._tables.keep_last(MAX_BYTES, lambda table: table.nbytes)
+        return table
+
+    def keep_only(self, clouds: Iterable[Hashable]) -> None:
+        """Drop the tables of all other clouds."""
+        kept = set(clouds)
+        self._tables.keep_only(lambda key: key[0] in kept)

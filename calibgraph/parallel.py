@@ -1,0 +1,67 @@
+"""Threads: as many as there are cores, and values that they make once."""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
+from typing import Generic, TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+def count_cores() -> int:
+    """The number of cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1
+
+
+def core_pool() -> ThreadPoolExecutor:
+    """A thread per core, for work that waits for nothing but a core."""
+    return ThreadPoolExecutor(count_cores())
+
+
+class Once(Generic[Key, Value]):
+    """Values by key, each made by the first thread that needs it; the one used last comes last."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._being_made: dict[Key, Lock] = {}
+        self._values: OrderedDict[Key, Value] = OrderedDict()
+
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        """The value of a key. Another thread that needs it meanwhile waits until it is made."""
+        with self._lock:
+            being_made = self._being_made.setdefault(key, Lock())
+        with being_made:
+            value = self._values[key] if key in self._values else make()
+            with self._lock:
+                self._values[key] = value
+                self._values.move_to_end(key)
+        return value
+
+    def values(self) -> list[Value]:
+        """All values."""
+        with self._lock:
+            return list(self._values.values())
+
+    def keep_only(self, wanted: Callable[[Key], bool]) -> None:
+        """Drop the values of all other keys."""
+        with self._lock:
+            for key in [key for key in self._values if not wanted(key)]:
+                del self._values[key], self._being_made[key]
+
+    def keep_last(self, most: float, size: Callable[[Value], float]) -> None:
+        """Drop the values that were used longest ago, until the others' sizes sum to the most."""
+        with self._lock:
+            total = sum(size(value) for value in self._values.values())
+            for key in list(self._values)[:-1]:
+                if total <= most:
+                    break
+                total -= size(self._values.pop(key))
+                del self._being_made[key]
