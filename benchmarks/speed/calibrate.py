@@ -176,7 +176,10 @@ def growth_table(runs: Runs) -> Table:
         "wall": [run.wall_s for run in runs.values()],
         "CPU": [run.cpu_s for run in runs.values()],
         "peak memory": [run.peak_mb for run in runs.values()],
-    } | {f"CPU, {stage}": [run.stages_cpu_s[stage] for run in runs.values()] for stage in STAGES}
+    } | {
+        f"CPU, {stage}": [run.stages_cpu_s[stage] for run in runs.values()]
+        for stage in STAGES[2:-1]
+    }
     variables = np.array([case.variables for case in runs], np.float64).reshape(-1, 3)
     rows = []
     for name, values in measured.items():
