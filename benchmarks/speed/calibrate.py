@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.ledger import code
-from benchmarks.speed.stages import STAGES, Run, run_in_process
+from benchmarks.speed.stages import STAGES, WORK, Run, run_in_process
 from benchmarks.speed.streets import DRAWN_FRAMES, link_dataset, render, street_rig
 from benchmarks.tables import Table, add_record_option, publish
 
@@ -176,10 +176,7 @@ def growth_table(runs: Runs) -> Table:
         "wall": [run.wall_s for run in runs.values()],
         "CPU": [run.cpu_s for run in runs.values()],
         "peak memory": [run.peak_mb for run in runs.values()],
-    } | {
-        f"CPU, {stage}": [run.stages_cpu_s[stage] for run in runs.values()]
-        for stage in STAGES[2:-1]
-    }
+    } | {f"CPU, {stage}": [run.stages_cpu_s[stage] for run in runs.values()] for stage in WORK}
     variables = np.array([case.variables for case in runs], np.float64).reshape(-1, 3)
     rows = []
     for name, values in measured.items():

@@ -49,8 +49,8 @@ _OUTER = (
     ("report", ("/calibgraph/report/", ":_write_result")),
 )
 _ALWAYS = ("import", "compile")
-STAGES = ("import", "compile", "decode", "windows", "score", "consensus", "search", "solve",
-          "checks", "report", OTHER)  # fmt: skip
+WORK = ("decode", "windows", "score", "consensus", "search", "solve", "checks", "report")
+STAGES = (*_ALWAYS, *WORK, OTHER)
 """In the order of a calibration. A stage is where the innermost function of a thread's stack that
 belongs to one is; but all that the checks or the report call is theirs."""
 
