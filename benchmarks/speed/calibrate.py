@@ -69,8 +69,10 @@ def main() -> None:
     """Run the cases that are not there yet, and print the tables."""
     options = parse_options()
     cases = [
-        Case(*map(int, size.split("x")), cameras, frames)
-        for size, cameras, frames in product(options.sizes, options.cameras, options.frames)
+        Case(width, height, cameras, frames)
+        for (width, height), cameras, frames in product(
+            options.sizes, options.cameras, options.frames
+        )
     ]
     options.folder.mkdir(parents=True, exist_ok=True)
     runs = run_cases(cases, options.folder, options.longest_s)
@@ -82,15 +84,21 @@ def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    sizes = ["640x480", "1242x375", "1920x1200"]
+    sizes = [(640, 480), (1242, 375), (1920, 1200)]
     kept = Path(tempfile.gettempdir()) / "calibgraph_speed"
     parser.add_argument("--cameras", type=int, nargs="+", default=[1, 2, 6, 12])
     parser.add_argument("--frames", type=int, nargs="+", default=[5, 10, 30, 100])
-    parser.add_argument("--sizes", nargs="+", default=sizes, metavar="WIDTHxHEIGHT")
+    parser.add_argument("--sizes", type=size, nargs="+", default=sizes, metavar="WIDTHxHEIGHT")
     parser.add_argument("--longest-s", type=float, default=600.0)
     parser.add_argument("--folder", type=Path, default=kept, help="streets and finished cases")
     add_record_option(parser)
     return parser.parse_args()
+
+
+def size(text: str) -> tuple[int, int]:
+    """Width and height of an image."""
+    width, height = text.split("x")
+    return int(width), int(height)
 
 
 def run_cases(cases: Sequence[Case], folder: Path, longest_s: float) -> Runs:

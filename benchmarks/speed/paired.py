@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, add_record_option, commit, publish
 from calibgraph import Calibration, evaluate, load_calibration, load_rig, perturb
 
 SEQUENCES = {"00": ("00",), "05-08": ("05", "06", "07", "08")}
@@ -192,6 +192,11 @@ def fastest(one: Measured, other: Measured) -> Measured:
     return Measured(min(one.wall_s, other.wall_s), min(one.cpu_s, other.cpu_s), other.result)
 
 
+def version(tree: Path) -> str:
+    """The commit of a source tree, or its name if it is not a checkout."""
+    return commit(tree) if (tree / ".git").exists() else tree.name
+
+
 def label(setting: Setting) -> str:
     """A setting in words."""
     return f"{setting.tree.name}, {setting.cores} cores"
@@ -205,7 +210,12 @@ def tables(cases: Sequence[Case], settings: Sequence[Setting], runs: Runs) -> It
         (case, (runs[case.name, Setting(before, n)], runs[case.name, Setting(after, n)]), n)
         for case, n in product(cases, cores)
     ]
-    yield Table("Times", TIME_COLUMNS, tuple(time_cells(case, n, pair) for case, pair, n in pairs))
+    names = " and ".join(version(tree) for tree in (before, after))
+    yield Table(
+        f"Times, before and after: {names}",
+        TIME_COLUMNS,
+        tuple(time_cells(case, n, pair) for case, pair, n in pairs),
+    )
     rows = [row for case, pair, n in pairs if n == cores[-1] for row in error_cells(case, pair)]
     yield Table(f"Errors, {cores[-1]} cores", ERROR_COLUMNS, tuple(rows))
     if len(cores) > 1:
@@ -253,7 +263,7 @@ def core_cells(
         centimetres = max(change.translation_error_cm for change in changes)
         numbers = f"{many.wall_s:.1f}", f"{one.wall_s / many.wall_s:.2f}"
         moved = f"{degrees:.2g}", f"{centimetres:.2g}"
-        yield case.name, tree.name, str(count), *numbers, *moved
+        yield case.name, version(tree), str(count), *numbers, *moved
 
 
 if __name__ == "__main__":
