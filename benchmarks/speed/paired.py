@@ -87,6 +87,7 @@ def main() -> None:
     cases = [case for case in all_cases(options.data, trees[1], options.folder)
              if not options.cases or case.name in options.cases]  # fmt: skip
     for tree in dict.fromkeys(trees):
+        print(f"{tree.name}: compiling", flush=True)
         warm_up(tree, cases[0], options.folder)
     runs = Runs()
     for case, repeat, setting in product(cases, range(options.repeats), settings):

@@ -36,7 +36,7 @@ OTHER = "other"
 _INNER = (
     ("import", ("importlib._bootstrap",)),
     ("compile", ("/numba/",)),
-    ("decode", ("/io/", "/prepared_cloud.py", "/frame_cache.py")),
+    ("decode", ("/calibgraph/io/", "/prepared_cloud.py", "/frame_cache.py")),
     ("windows", ("/structure/windows.py", "/structure/directions.py")),
     ("score", ("/structure/shift_scores.py", "/structure/score", ":_score_maps")),
     ("consensus", ("/structure/consensus.py",)),

@@ -14,7 +14,6 @@ DRAWN_FRAMES = 5
 """More frames repeat them: their images and clouds are read, matched and kept as any others."""
 FOCAL_SHARE = 0.58  # of the width: as KITTI's cameras, 82 degrees
 ROTATION_DEG, TRANSLATION_M = 2.0, 0.2  # of the guess
-RENDERED = "rendered"
 
 
 def street_rig(cameras: int, width_px: int, height_px: int) -> Rig:
@@ -35,29 +34,21 @@ def street_rig(cameras: int, width_px: int, height_px: int) -> Rig:
     return Rig(cameras={name: resized(camera) for name, camera in first})
 
 
-def render(folder: Path, rig: Rig, frames: int) -> Path:
+def render(folder: Path, rig: Rig) -> Path:
     """Render a drive with a rig, unless it is there already.
 
     Args:
         folder: of all drives.
         rig: its extrinsics are the truth.
-        frames: at most ``DRAWN_FRAMES`` are rendered.
 
     Returns:
         Its folder.
     """
     camera = next(iter(rig.cameras.values()))
-    drawn = min(frames, DRAWN_FRAMES)
-    name = f"{RENDERED}_{camera.width_px}x{camera.height_px}_{len(rig.cameras)}_{drawn}"
-    if not (folder / name / "rig.yaml").is_file():
-        simulate_street(
-            folder / name,
-            rig,
-            frames=drawn,
-            rotation_deg=ROTATION_DEG,
-            translation_m=TRANSLATION_M,
-        )
-    return folder / name
+    drive = folder / f"rendered_{camera.width_px}x{camera.height_px}_{len(rig.cameras)}"
+    if not (drive / "rig.yaml").is_file():
+        simulate_street(drive, rig, frames=DRAWN_FRAMES)
+    return drive
 
 
 def link_dataset(rendered: Path, folder: Path, cameras: int, frames: int) -> None:

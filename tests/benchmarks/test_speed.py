@@ -83,6 +83,22 @@ def test_the_expected_time_is_in_proportion_to_the_images() -> None:
     assert calibrate.expected(runs, calibrate.Case(640, 480, 1, 100)) == 0.0  # nothing to go by
 
 
+def test_finished_cases_are_kept_failed_ones_run_again_and_long_ones_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = []
+
+    def run_case(case: calibrate.Case, *_: object, warm_up: bool) -> calibrate.Run:
+        ran.append((case.frames, warm_up))
+        return calibrate.Run(2.0 * case.frames, 1, 1, verdict="PASS" if case.frames > 5 else "lost")
+
+    monkeypatch.setattr(calibrate, "run_case", run_case)
+    cases = [calibrate.Case(640, 480, 1, frames) for frames in (100, 5, 10)]
+    assert [case.frames for case in calibrate.run_cases(cases, tmp_path, 100.0)] == [5, 10]
+    calibrate.run_cases(cases, tmp_path, 1000.0)
+    assert ran == [(5, True), (10, False), (5, False), (100, False)]
+
+
 def test_a_dataset_repeats_the_frames_of_the_first_cameras(tmp_path: Path) -> None:
     rig, rendered = street_rig(3, 640, 480), tmp_path / "rendered"
     for part in ("lidar/0.npy", *(f"cameras/{name}/{i}.jpg" for name in rig.cameras for i in "01")):
