@@ -93,10 +93,10 @@ def matcher_calls(dataset: Dataset) -> list[Call]:
 def recorded(module: Any, name: str, calls: list[Call], *, stop: bool = False) -> Iterator[None]:
     """Record the calls of the kernel that a module makes; with ``stop``, none goes on."""
     kernel = module.score_windows
-    parameters = inspect.signature(kernel.py_func).parameters
+    signature = inspect.signature(getattr(kernel, "py_func", kernel))
 
     def record(*arguments: Any) -> None:
-        calls.append(Call(name, dict(zip(parameters, arguments, strict=True))))
+        calls.append(Call(name, dict(signature.bind(*arguments).arguments)))
         if stop:
             raise _EnoughError
         kernel(*arguments)
