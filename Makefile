@@ -51,7 +51,9 @@ $(VENV)/docs: $(VENV)/test
 docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-bench: $(VENV)/test ## Measure the solve, the updates and the network against other ways
+bench: $(VENV)/test ## Measure a calibration, and the solve, updates and network against other ways
+	$(BIN)/python -m benchmarks.speed.stages data/sample
+	$(BIN)/python -m benchmarks.speed.kernel
 	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
 	$(BIN)/python -m benchmarks.speed.incremental

@@ -106,22 +106,24 @@ def publish(benchmark: str, tables: Sequence[Table], *, record: bool) -> None:
         file.write(json.dumps(asdict(entry)) + "\n")
 
 
-def commit() -> str:
-    """Short hash of the checkout, with ``+`` if its sources have uncommitted changes."""
-    short = _git("rev-parse", "--short=7", "HEAD")
+def commit(checkout: Path = ROOT) -> str:
+    """Short hash of a checkout, with ``+`` if its sources have uncommitted changes."""
+    short = _git(checkout, "rev-parse", "--short=7", "HEAD")
     sources = ("calibgraph", "factors", "benchmarks/*.py")
-    return short + ("+" if _git("status", "--porcelain", "--", *sources) else "")
+    return short + ("+" if _git(checkout, "status", "--porcelain", "--", *sources) else "")
 
 
-def _git(*arguments: str) -> str:
+def _git(checkout: Path, *arguments: str) -> str:
     found = subprocess.run(
-        ["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True
+        ["git", *arguments], cwd=checkout, check=True, capture_output=True, text=True
     )
     return found.stdout.strip()
 
 
 def _command(benchmark: str) -> str:
-    options = [word for word in sys.argv[1:] if word != "--record"]
+    """The command that was called; absolute paths, which only this machine has, by their names."""
+    words = [word for word in sys.argv[1:] if word != "--record"]
+    options = [Path(word).name if word.startswith("/") else word for word in words]
     return " ".join(["python -m", f"benchmarks.{benchmark}", *options])
 
 

@@ -141,6 +141,11 @@ def solve_trf(problem: Problem, inliers: Problem) -> Passes:
     return Passes(first, _one_trf(inliers, first))
 
 
+def solve_trf_once(problem: Problem) -> Passes:
+    """The first pass of the paper's solver."""
+    return Passes(_one_trf(problem, problem.T_hat))
+
+
 def _one_trf(problem: Problem, start: Transforms) -> Transforms:
     """One pass of TRF, as the library's comparison with the paper runs it."""
 

@@ -1,0 +1,224 @@
+"""Where the time of a calibration goes: wall and processor seconds per stage, and peak memory.
+
+    python -m benchmarks.speed.stages DATASET [--json]       # calibrate with all frames, and report
+
+The command `calibgraph calibrate` runs in this process, from its imports to the written report.
+Nothing of the measured program is changed. A thread looks every few milliseconds at the stacks of
+the others, and at their processor clocks. The processor time of the whole process since the last
+look, which includes threads of libraries, is divided among the stages of the threads in proportion
+to their own clocks; so is the wall time, of which a stage that runs beside others has its share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from types import FrameType, TracebackType
+
+import numpy as np
+
+from benchmarks.tables import ROOT, Table
+
+INTERVAL_S = 0.005
+
+OTHER = "other"
+_INNER = (
+    ("import", ("importlib._bootstrap",)),
+    ("compile", ("/numba/",)),
+    ("decode", ("/calibgraph/io/", "/prepared_cloud.py", "/frame_cache.py")),
+    ("windows", ("/structure/windows.py", "/structure/directions.py")),
+    ("score", ("/structure/shift_scores.py", "/structure/score", ":_score_maps")),
+    ("consensus", ("/structure/consensus.py",)),
+    ("search", ("/structure/correlation", "/structure/box_search.py", "/structure/epipolar.py",
+                "/structure/proposals.py")),
+    ("solve", ("/calibgraph/solver/", "/factors/")),
+)  # fmt: skip
+_OUTER = (
+    ("checks", ("/calibgraph/trust/",)),
+    ("report", ("/calibgraph/report/", ":_write_result")),
+)
+_ALWAYS = ("import", "compile")
+WORK = ("decode", "windows", "score", "consensus", "search", "solve", "checks", "report")
+STAGES = (*_ALWAYS, *WORK, OTHER)
+"""In the order of a calibration. A stage is where the innermost function of a thread's stack that
+belongs to one is; but all that the checks or the report call is theirs."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a calibration took.
+
+    Attributes:
+        wall_s, cpu_s: from the imports to the report.
+        peak_mb: largest resident memory.
+        stages_wall_s, stages_cpu_s: the same seconds by stage.
+        verdict: of the rig, or the error.
+    """
+
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    stages_wall_s: dict[str, float] = field(default_factory=dict)
+    stages_cpu_s: dict[str, float] = field(default_factory=dict)
+    verdict: str = ""
+
+
+class StageSampler:
+    """Samples the stages of the process: ``with StageSampler() as sampler: ...``.
+
+    Attributes:
+        wall_s, cpu_s: seconds by stage; the sums are those of the body.
+    """
+
+    def __init__(self) -> None:
+        self.wall_s = dict.fromkeys(STAGES, 0.0)
+        self.cpu_s = dict.fromkeys(STAGES, 0.0)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._main = threading.get_ident()
+        self._clocks: dict[int, float] = {}
+        self._last = time.perf_counter(), time.process_time()
+
+    def __enter__(self) -> StageSampler:
+        """Start sampling."""
+        self._clocks = dict(_thread_clocks())
+        self._last = time.perf_counter(), time.process_time()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop sampling."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(INTERVAL_S):
+            self._sample()
+        self._sample()
+
+    def _sample(self) -> None:
+        """Add the time since the last sample to the stages that used it."""
+        stacks, clocks = sys._current_frames(), dict(_thread_clocks())
+        used = {key: max(0.0, clocks[key] - self._clocks.get(key, 0.0)) for key in clocks}
+        del used[threading.get_ident()]
+        now = time.perf_counter(), time.process_time()
+        wall_s, cpu_s = np.subtract(now, self._last)
+        self._clocks, self._last = clocks, now
+        total = sum(used.values())
+        shares = {ident: part / total for ident, part in used.items()} if total > 0 else {}
+        for ident, share in (shares or {self._main: 1.0}).items():
+            stage = stage_of(stacks.get(ident))
+            self.wall_s[stage] += share * float(wall_s)
+            self.cpu_s[stage] += share * float(cpu_s)
+
+
+def _thread_clocks() -> Iterator[tuple[int, float]]:
+    """Processor seconds of every Python thread, by its identifier."""
+    for thread in threading.enumerate():
+        if thread.native_id is None or thread.ident is None:
+            continue
+        try:  # Linux' number of a thread's clock; pthread_getcpuclockid is unsafe for ended threads
+            yield thread.ident, time.clock_gettime((~thread.native_id << 3) | 6)
+        except OSError:  # it has ended
+            continue
+
+
+def stage_of(frame: FrameType | None) -> str:
+    """The stage of a stack, given its innermost frame."""
+    found = OTHER
+    while frame is not None:
+        inner, outer = _stages_of(frame.f_code.co_filename, frame.f_code.co_name)
+        found = inner if found == OTHER else found
+        if found in _ALWAYS:
+            return found
+        if outer != OTHER:
+            return outer
+        frame = frame.f_back
+    return found
+
+
+@cache
+def _stages_of(file: str, function: str) -> tuple[str, str]:
+    """The stage of a function by ``_INNER`` and by ``_OUTER``."""
+    place = f"{file}:{function}"
+    inner, outer = (
+        [stage for stage, parts in stages if any(part in place for part in parts)]
+        for stages in (_INNER, _OUTER)
+    )
+    return [*inner, OTHER][0], [*outer, OTHER][0]
+
+
+def run_in_process(dataset: Path) -> Run:
+    """Calibrate a dataset in a process of its own; a failed one has no times."""
+    command = [sys.executable, "-m", "benchmarks.speed.stages", str(dataset), "--json"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        return Run(np.nan, np.nan, np.nan, verdict=(done.stderr.splitlines() or ["failed"])[-1])
+    return Run(**json.loads(done.stdout))
+
+
+def run_here(dataset: Path) -> Run:
+    """Calibrate a dataset in this process; errors of the command end it."""
+    with tempfile.TemporaryDirectory() as out:
+        with StageSampler() as sampler, contextlib.redirect_stdout(sys.stderr):
+            _calibrate(dataset, out)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        from calibgraph import load_calibration
+
+        verdict = load_calibration(out).verdict.status
+    wall_s, cpu_s = sampler.wall_s, sampler.cpu_s
+    return Run(sum(wall_s.values()), sum(cpu_s.values()), peak_mb, wall_s, cpu_s, verdict)
+
+
+def _calibrate(dataset: Path, out: str) -> None:
+    from calibgraph.cli.app import main as calibgraph
+
+    sys.argv = ["calibgraph", "calibrate", str(dataset), "--frames", ":", "--out", out]
+    try:
+        calibgraph()
+    except SystemExit as end:
+        if end.code not in (0, 1):  # 1: the verdict is FAIL
+            raise
+
+
+def stages_table(run: Run) -> Table:
+    """The stages of one calibration."""
+    rows = [(stage, run.stages_wall_s[stage], run.stages_cpu_s[stage]) for stage in STAGES]
+    cells = [
+        (stage, f"{wall_s:.2f}", f"{cpu_s:.2f}", f"{cpu_s / run.cpu_s:.0%}")
+        for stage, wall_s, cpu_s in (*rows, ("all", run.wall_s, run.cpu_s))
+    ]
+    title = f"{run.verdict}, {run.peak_mb:.0f} MB at most"
+    return Table(title, ("stage", "wall [s]", "CPU [s]", "share"), tuple(cells))
+
+
+def main() -> None:
+    """Print the stages of one calibration."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    run = run_here(options.dataset)
+    print(json.dumps(asdict(run)) if options.json else stages_table(run).text())
+
+
+if __name__ == "__main__":
+    main()

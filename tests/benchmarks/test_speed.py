@@ -1,0 +1,183 @@
+"""The benchmarks of speed measure what they state."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.speed import calibrate, ceres, kernel, paired
+from benchmarks.speed.solvers import Problem, solve_ours
+from benchmarks.speed.stages import STAGES, StageSampler
+from benchmarks.speed.streets import link_dataset, street_rig
+from calibgraph import load_rig, perturb, preset, simulate_correspondences, solve
+from calibgraph.simulation.rigs import rig_of
+
+BUSY_S = 0.4  # of 5 ms between samples: 80 of them
+
+
+def in_file(path: str, called: Callable[[], None]) -> Callable[[], None]:
+    """A function of a file of that name, which calls another."""
+    names = {"called": called}
+    exec(compile("def function():\n    called()\n", path, "exec"), names)
+    return names["function"]
+
+
+def compute() -> None:
+    end = time.thread_time() + BUSY_S
+    while time.thread_time() < end:
+        sum(range(1000))
+
+
+def clocks() -> NDArray[np.float64]:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def test_time_is_that_of_the_innermost_stage_but_checks_keep_all_they_call() -> None:
+    solver = in_file("/x/calibgraph/solver/joint.py", compute)
+    check = in_file("/x/calibgraph/trust/checks.py", solver)
+    windows = in_file("/x/structure/windows.py", compute)
+    score = in_file("/x/structure/shift_scores.py", windows)
+    for work, stage in ((solver, "solve"), (check, "checks"), (score, "windows")):
+        with StageSampler() as sampler:
+            work()
+        assert max(STAGES, key=lambda name: sampler.cpu_s[name]) == stage
+        assert sampler.cpu_s[stage] > 0.8 * BUSY_S
+
+
+def test_stages_of_parallel_threads_share_the_wall_time() -> None:
+    works = [in_file(f"/x/calibgraph/{part}/file.py", compute) for part in ("solver", "trust")]
+    threads = [threading.Thread(target=work) for work in works]
+    before = clocks()
+    with StageSampler() as sampler:
+        inner = clocks()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        inner = clocks() - inner
+    sums = sum(sampler.wall_s.values()), sum(sampler.cpu_s.values())
+    assert (inner <= sums).all()
+    assert (sums <= clocks() - before).all()
+    assert sampler.cpu_s["solve"] == pytest.approx(BUSY_S, rel=0.2)
+    assert sampler.cpu_s["checks"] == pytest.approx(BUSY_S, rel=0.2)
+
+
+def test_growth_is_the_exponent_of_each_variable() -> None:
+    variables = np.array([(c, f, 1000) for c in (1, 2, 6) for f in (5, 10)], float)
+    values = 3.0 * variables[:, 0] ** 0.9 * variables[:, 1] ** 0.4
+    found = calibrate.exponents(variables, values)
+    np.testing.assert_allclose(found[:2], [0.9, 0.4], rtol=1e-9)
+    assert np.isnan(found[2])  # all images have one size
+
+
+def test_the_expected_time_is_in_proportion_to_the_images() -> None:
+    runs = {calibrate.Case(640, 480, 2, 5): calibrate.Run(10.0, 0, 0)}
+    assert calibrate.expected(runs, calibrate.Case(640, 480, 6, 10)) == 60.0
+    assert calibrate.expected(runs, calibrate.Case(640, 480, 1, 100)) == 0.0  # nothing to go by
+
+
+def test_finished_cases_are_kept_failed_ones_run_again_and_long_ones_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = []
+
+    def run_case(case: calibrate.Case, *_: object, warm_up: bool) -> calibrate.Run:
+        ran.append((case.frames, warm_up))
+        return calibrate.Run(2.0 * case.frames, 1, 1, verdict="PASS" if case.frames > 5 else "lost")
+
+    monkeypatch.setattr(calibrate, "run_case", run_case)
+    cases = [calibrate.Case(640, 480, 1, frames) for frames in (100, 5, 10)]
+    assert [case.frames for case in calibrate.run_cases(cases, tmp_path, 100.0)] == [5, 10]
+    calibrate.run_cases(cases, tmp_path, 1000.0)
+    assert ran == [(5, True), (10, False), (5, False), (100, False)]
+
+
+def test_a_dataset_repeats_the_frames_of_the_first_cameras(tmp_path: Path) -> None:
+    rig, rendered = street_rig(3, 640, 480), tmp_path / "rendered"
+    for part in ("lidar/0.npy", *(f"cameras/{name}/{i}.jpg" for name in rig.cameras for i in "01")):
+        (rendered / part).parent.mkdir(parents=True, exist_ok=True)
+        (rendered / part).write_text(part)
+    rig.save(rendered / "reference.yaml")
+    link_dataset(rendered, tmp_path / "made", 2, 3)
+    names = list(load_rig(tmp_path / "made" / "rig.yaml").cameras)
+    assert names == list(rig.cameras)[:2]
+    texts = [f.read_text() for f in sorted((tmp_path / "made" / "cameras" / names[1]).iterdir())]
+    assert texts == [f"cameras/{names[1]}/{i}.jpg" for i in "010"]
+
+
+def test_multiply_adds_are_those_of_the_shifts_inside_the_image() -> None:
+    places = np.array([[(0, 0), (2, 1)], [(5, 4), (6, 5)]], np.int32)  # the second leaves earlier
+    basis = np.zeros((2, 2, 4), np.float32)
+    basis[1, 0, 2] = 1.0
+    arguments = {
+        "image": np.zeros((7, 9), np.float32), "places": places, "counts": np.array([2, 2]),
+        "basis": basis, "origin": np.array([-3, -2]), "grids": np.zeros((1, 5, 7), np.float32),
+    }  # fmt: skip
+    shifts = [
+        sum(
+            all(0 <= u + x < 9 and 0 <= v + y < 7 for u, v in window)
+            for x in range(-3, 4)
+            for y in range(-2, 3)
+        )
+        for window in places
+    ]
+    expected = 2 * (4 * shifts[0] + 6 * shifts[1])
+    assert kernel.Call("", arguments).multiply_adds() == expected
+
+
+def test_processes_are_bound_to_cores_and_this_one_is_not_afterwards() -> None:
+    every = os.sched_getaffinity(0)
+    with paired.bound_to(1):
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == every
+
+
+def test_a_comparison_has_ratios_errors_and_differences(tmp_path: Path) -> None:
+    rig = rig_of("kitti")
+    rig.save(tmp_path / "reference.yaml")
+    result = solve(
+        perturb(rig, rotation_deg=1, translation_m=0.1),
+        simulate_correspondences(rig, frames=5, matches=200),
+        preset("kitti"),
+    )
+    case = paired.Case("simulated", (), tmp_path, tmp_path / "reference.yaml")
+    settings = [
+        paired.Setting(tmp_path / tree, cores) for tree in ("old", "new") for cores in (1, 2)
+    ]
+    seconds = {"old": 6.0, "new": 2.0}
+    runs = {
+        (case.name, setting): paired.Measured(
+            seconds[setting.tree.name] / setting.cores, seconds[setting.tree.name] + 2, result
+        )
+        for setting in settings
+    }
+    times, errors, cores = paired.tables([case], settings, runs)
+    assert times.title.endswith("old and new")
+    assert times.rows[0] == ("simulated", "1", "6.0", "2.0", "3.00", "8.0", "4.0", "2.00")
+    assert [row[1] for row in errors.rows] == list(rig.cameras)
+    for row in errors.rows:
+        assert row[2] == row[3] != "0.000"
+        assert row[6:8] == ("0.0000", "0.000")
+        assert row[8] == row[9] == result.camera_verdicts[row[1]].status
+    assert cores.rows[1] == ("simulated", "old", "2", "3.0", "2.00", "0", "0")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(ceres.why_not()), reason=ceres.why_not() or "there")
+def test_ceres_finds_the_same_minimum_in_both_passes(tmp_path: Path) -> None:
+    problem = Problem.draw(1, 3)
+    ours = solve_ours(problem)
+    run = ceres.solve_ceres(ceres.compile_program(tmp_path), problem, ours.first)
+    inliers = problem.without_outliers(ours.first)
+    assert ours.second is not None and run.passes.second is not None
+    costs = inliers.cost(run.passes.second), inliers.cost(ours.second)
+    # it stops at relative changes of 1e-8 of the cost
+    assert problem.cost(run.passes.first) == pytest.approx(problem.cost(ours.first), rel=1e-7)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-7)
