@@ -123,22 +123,28 @@ def _error(error: Any) -> tuple[float, float]:
     return error.rotation_error_deg, error.translation_error_cm
 
 
+_DESCRIBE_WINDOWS = windows.describe_windows
+
+
 def _without_column(column: int) -> Part:
     """Windows without inverse range (0) or intensity (1)."""
-    basis = windows._window_basis
 
-    def flat(*arguments: Any) -> Any:
-        values, texture = basis(*arguments)
-        values[..., column] = 0.0
-        return values, texture
+    def flat(cloud: Any, members: Any, *others: Any) -> None:
+        _DESCRIBE_WINDOWS(cloud, members, *others)
+        others[4][..., column] = 0.0  # of the basis
 
-    return lambda: patch.object(windows, "_window_basis", flat)
+    return lambda: patch.object(windows, "describe_windows", flat)
 
 
-def _changed(module: Any, name: str, **fixed: Any) -> Part:
-    """A function with some of its arguments fixed."""
-    function = getattr(module, name)
-    return lambda: patch.object(module, name, lambda *a, **k: function(*a, **{**k, **fixed}))
+def _keep_hidden(cloud: Any, members: Any, *others: Any) -> None:
+    """Points behind a silhouette stay where they are."""
+    _DESCRIBE_WINDOWS(cloud, members, *others)
+    moved_m, front = others[2:4]
+    moved_m[:], front[:] = cloud[0][members], True
+
+
+def _without_trend(cloud: Any, members: Any, counts: Any, _: bool, *others: Any) -> None:
+    _DESCRIBE_WINDOWS(cloud, members, counts, False, *others)
 
 
 def _shares(*arguments: Any) -> None:
@@ -146,10 +152,6 @@ def _shares(*arguments: Any) -> None:
 
 
 _SCORE_WINDOWS = shift_scores.score_windows
-
-
-def _not_forward(ranges: Any) -> tuple[Any, Any]:
-    return np.ones(ranges.shape, np.bool_), ranges
 
 
 def _levels(levels: Sequence[Any]) -> Part:
@@ -160,13 +162,11 @@ ROUNDS: Mapping[str, Part] = {
     "all of it": nullcontext,
     "no intensity": _without_column(1),
     "no inverse range": _without_column(0),
-    "silhouettes not corrected": lambda: patch.object(
-        windows, "_move_to_silhouettes", _not_forward
-    ),
+    "silhouettes not corrected": lambda: patch.object(windows, "describe_windows", _keep_hidden),
     "windows with hidden points": lambda: patch.object(
-        windows, "find_visible", lambda angles, *_: np.ones(len(angles), np.bool_)
+        shift_scores, "find_visible", lambda angles, *_: np.ones(len(angles), np.bool_)
     ),
-    "linear parts removed": _changed(windows, "cut_windows", keep_linear=False),
+    "linear parts removed": lambda: patch.object(windows, "describe_windows", _without_trend),
     "shares, not likelihoods": lambda: patch.object(shift_scores, "score_windows", _shares),
     "without round 4": _levels(LEVELS[4:]),
     "without round 6": _levels(LEVELS[3:5]),

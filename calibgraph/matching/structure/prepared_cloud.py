@@ -67,11 +67,11 @@ class PreparedCloud:
     def windows(
         self, camera: Camera, usable: Mask, spacing_rad: float, stride_spacings: float, fine: bool
     ) -> WindowTable:
-        """The windows of the cloud, which do not depend on the camera if the LiDAR is at the origin.
+        """The windows of the cloud: if it was seen from the origin, the same for every camera.
 
         Args:
-            camera: from where they are cut if not.
-            usable: (n,) the points that are used if not.
+            camera: from where they are cut if it was not.
+            usable: (n,) the points that are used if it was not.
             spacing_rad: of the points in a window.
             stride_spacings: of the windows, in spacings of the points.
             fine: keep the linear parts of the variation.

@@ -14,13 +14,14 @@ SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one li
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def describe_windows(rays_m, intensity_rank, members, counts, keep_linear, moved_m, front, basis, reliability):  # type: ignore[no-untyped-def]  # fmt: skip
+def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis, reliability):  # type: ignore[no-untyped-def]
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
-    rays_m: (n, 3); intensity_rank: (n,); members: (w, l); counts: (w,). Filled are moved_m
-    (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,): the larger of those of inverse
-    range and intensity.
+    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,). Filled are
+    moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,): the larger of those of
+    inverse range and intensity.
     """
+    rays_m, intensity_rank = cloud
     size = members.shape[1]
     ranges, inverse, intensity = np.empty(size), np.empty(size), np.empty(size)
     trend = np.zeros((2, size))

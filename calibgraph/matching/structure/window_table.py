@@ -50,7 +50,7 @@ class WindowTable:
         directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         kept = thin(directions, spacing_rad)
         self._rows = rows[kept]
-        self._rays_m, self._intensity_rank = rays_m[self._rows], intensity_rank[self._rows]
+        self._cloud = rays_m[self._rows], intensity_rank[self._rows]
         self._neighbours = Neighbours(directions[kept], spacing_rad)
         centres = thin(directions[kept], stride_spacings * spacing_rad)
         self._centres = np.random.default_rng(0).permutation(centres)
@@ -85,8 +85,7 @@ class WindowTable:
             missing = chosen[self._slots[chosen] == _UNCUT]
             if len(missing):
                 windows, reliability = cut_windows(
-                    self._rays_m,
-                    self._intensity_rank,
+                    self._cloud,
                     self._centres[missing],
                     self._neighbours,
                     keep_linear=self._keep_linear,
@@ -102,7 +101,8 @@ class WindowTable:
     @property
     def nbytes(self) -> int:
         """Size in memory."""
-        own = (self._rows, self._rays_m, self._rays_m, self._intensity_rank, self._centres)
+        rays_m, _ = self._cloud
+        own = (self._rows, *self._cloud, rays_m, self._centres, self._slots)  # rays: in a tree too
         return self._windows.nbytes + sum(values.nbytes for values in own)
 
 

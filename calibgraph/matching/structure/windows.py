@@ -77,18 +77,13 @@ class Windows:
 
 
 def cut_windows(
-    rays_m: Array,
-    intensity_rank: Array,
-    centres: Rows,
-    neighbours: Neighbours,
-    *,
-    keep_linear: bool,
+    cloud: tuple[Array, Array], centres: Rows, neighbours: Neighbours, *, keep_linear: bool
 ) -> tuple[Windows, Array]:
     """Cut windows of the nearest rays.
 
     Args:
-        rays_m: (n, 3) from the viewpoint to thinned points, along the axes of the LiDAR frame.
-        intensity_rank: (n,) of the points.
+        cloud: (n, 3) rays from the viewpoint to thinned points, along the axes of the LiDAR
+            frame [m]; (n,) their intensity ranks.
         centres: (w,) rows of the windows' centres.
         neighbours: of the rays.
         keep_linear: keep the linear parts of the variation.
@@ -100,7 +95,7 @@ def cut_windows(
     windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
     windows.members[:], windows.counts[:] = neighbours.of(centres)
     describe_windows(
-        rays_m, intensity_rank, windows.members, windows.counts, keep_linear,
+        cloud, windows.members, windows.counts, keep_linear,
         windows.rays_m, windows.front, windows.basis, reliability,
     )  # fmt: skip
     reliability[windows.counts < MIN_WINDOW_POINTS] = 0.0
