@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.structure.consensus import chance_sigma, maximize_score, sum_scores
+from calibgraph.matching.structure.consensus import maximize_score, sum_scores
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera
@@ -68,7 +68,7 @@ def measure_lens(
     )
     best = maximize_score(smooth, half_widths, seed=seed, prior=SEARCH_PRIOR)
     values = sum_scores(smooth, np.array([np.zeros(9), best]))
-    gain = float((values[1] - values[0]) / (chance_sigma(smooth) + 1e-12))
+    gain = float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
     rough = _fit_at_peaks(camera, scores, best)
     if rough is None:
         return LensEvidence(gain=gain)

@@ -13,18 +13,14 @@ from calibgraph.matching.structure.shift_scores import ShiftScores
 Array = NDArray[np.float64]
 
 SAMPLES, STEPS = 400, 14  # of a search
+SAME_MAXIMUM = 1e-3  # relative difference of two searches' ends at the same maximum
 PRIOR = 6.0
 """Penalty, in standard deviations of chance agreement, of a twist sqrt(2 / 6) of the box from 0."""
 
 
-def chance_sigma(scores: ShiftScores) -> float:
-    """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
-    return float(np.sqrt(scores.grids.var(axis=(1, 2), dtype=np.float64).sum()))
-
-
 def z_score(scores: ShiftScores, unknowns: Array) -> float:
     """Summed score at unknowns (k,), in standard deviations of chance agreement."""
-    return float(sum_scores(scores, unknowns[None])[0]) / (chance_sigma(scores) + 1e-12)
+    return float(sum_scores(scores, unknowns[None])[0]) / (scores.chance_sigma + 1e-12)
 
 
 def find_consensus(scores: ShiftScores, level: Level, *, seed: int) -> tuple[Array, float]:
@@ -52,15 +48,23 @@ def maximize_score(
         scores: the groups of one camera; the Jacobian may have more columns than a twist's six.
         half_widths: (k,) of the box that is searched.
         seed: of the search's samples.
-        searches: number of searches, of which the best counts.
+        searches: number of searches, of which the best counts; no more after two that end at the
+            same maximum.
         prior: see ``PRIOR``.
 
     Returns:
         (k,) the best unknowns.
     """
     rng = np.random.default_rng(seed)
-    maxima = [_maximize_once(scores, half_widths, prior, rng) for _ in range(searches)]
-    return max(maxima, key=lambda pair: pair[1])[0]
+    best, highest = np.zeros(len(half_widths)), -np.inf
+    for _ in range(searches):
+        unknowns, value = _maximize_once(scores, half_widths, prior, rng)
+        found_again = abs(value - highest) < SAME_MAXIMUM * abs(highest)
+        if value > highest:
+            best, highest = unknowns, value
+        if found_again:
+            break
+    return best
 
 
 def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
@@ -75,7 +79,7 @@ def _maximize_once(
     scores: ShiftScores, half_widths: Array, prior: float, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """One cross-entropy search: the unknowns and their penalised score."""
-    weight = 0.5 * prior * chance_sigma(scores)
+    weight = 0.5 * prior * scores.chance_sigma
 
     def penalised(unknowns: Array) -> Array:
         penalty = weight * ((unknowns / half_widths) ** 2).sum(axis=1)

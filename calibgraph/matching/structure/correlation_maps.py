@@ -20,7 +20,7 @@ from calibgraph.matching.structure.correlation_kernels import find_best_shifts, 
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import downscale_log_gray
+from calibgraph.matching.structure.shift_scores import downscale_log_gray, name_cells
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
@@ -248,11 +248,9 @@ def _group_windows(centres_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32
     Returns:
         The windows (w,), by group; the group of each (w,); the groups' mean points (g, 3).
     """
-    distance = np.linalg.norm(centres_m, axis=1)
-    bins = np.floor(np.log2(distance) / OCTAVES_PER_BIN)
-    cells = np.column_stack([np.floor(view_angles(centres_m) / GROUP_RAD), bins])
-    _, group, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
+    octaves = np.log2(np.linalg.norm(centres_m, axis=1)) / OCTAVES_PER_BIN
+    cells = np.column_stack([view_angles(centres_m) / GROUP_RAD, octaves])
+    _, group, counts = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
     sums = [np.bincount(group, column, minlength=len(counts)) for column in centres_m.T]
     order = np.argsort(group, kind="stable")
     return order, group[order].astype(np.int32), np.stack(sums, axis=1) / counts[:, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.visibility import find_in_view, find_visible
-from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
+from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
+from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
@@ -53,6 +54,11 @@ class ShiftScores:
     counts: NDArray[np.int64]
     steps_per_px: Array
 
+    @cached_property
+    def chance_sigma(self) -> float:
+        """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
+        return float(np.sqrt(self.grids.var(axis=(1, 2), dtype=np.float64).sum()))
+
 
 def score_frame(
     gray: Gray, cloud: PreparedCloud, camera: Camera, level: Level, *, frame: int, max_windows: int
@@ -73,9 +79,7 @@ def score_frame(
     centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
     kept, group, groups = _group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
     windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
-    points = (windows.rays_m.reshape(-1, 3) + viewpoint_m) @ T[:3, :3].T + T[:3, 3]
-    pixels = (camera.lens.project(points)[0] + 0.5) * scale - 0.5
-    places = np.rint(pixels).astype(np.int32).reshape(-1, WINDOW_POINTS, 2)
+    places = find_places(windows.rays_m, viewpoint_m, camera, scale)
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
     grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
@@ -144,19 +148,23 @@ def _group_windows(
     Returns:
         The kept windows (k,), by group; the group of each (k,); and the number of groups.
     """
-    distance = np.linalg.norm(centres_camera_m, axis=1)
-    cells = np.column_stack(
-        [
-            np.floor(view_angles(centres_camera_m) / cell_rad),
-            np.floor(np.log2(distance) / OCTAVES_PER_BIN),
-        ]
-    )
-    _, cell, sizes = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    cell = cell.reshape(-1)
+    octaves = np.log2(np.linalg.norm(centres_camera_m, axis=1)) / OCTAVES_PER_BIN
+    cells = np.column_stack([view_angles(centres_camera_m) / cell_rad, octaves])
+    _, cell, sizes = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
     kept = np.flatnonzero(sizes[cell] >= MIN_GROUP_WINDOWS)
     names, group = np.unique(cell[kept], return_inverse=True)
-    order = np.argsort(group.reshape(-1), kind="stable")
-    return kept[order], group.reshape(-1)[order].astype(np.int32), len(names)
+    order = np.argsort(group, kind="stable")
+    return kept[order], group[order].astype(np.int32), len(names)
+
+
+def name_cells(places: Array) -> NDArray[np.int64]:
+    """(n,) a number per cell of places (n, 3) on a grid of step 1, in the order of the columns."""
+    cells = np.floor(places).astype(np.int64)
+    if not len(cells):
+        return np.empty(0, np.int64)
+    cells -= cells.min(axis=0)
+    rows, columns = cells[:, 1].max() + 1, cells[:, 2].max() + 1
+    return np.asarray((cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2])
 
 
 def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:

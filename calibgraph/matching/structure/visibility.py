@@ -56,6 +56,30 @@ def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
     return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[name] + HIDDEN_M)
 
 
+def find_places(
+    rays_m: NDArray[np.float32], viewpoint_lidar_m: Array, camera: Camera, scale: Array
+) -> NDArray[np.int32]:
+    """(w, l, 2) nearest pixels, of an image scaled by (2,), to the ends of rays (w, l, 3)."""
+    lens, T = camera.lens, np.ascontiguousarray(camera.T_camera_lidar, dtype=np.float64)
+    places = np.empty((*rays_m.shape[:2], 2), np.int32)
+    _find_places(lens.kind, lens.packed, T, viewpoint_lidar_m, scale, rays_m, places)
+    return places
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
+    for w in range(rays_m.shape[0]):
+        for p in range(rays_m.shape[1]):
+            px, py = rays_m[w, p, 0] + viewpoint[0], rays_m[w, p, 1] + viewpoint[1]
+            pz = rays_m[w, p, 2] + viewpoint[2]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            projection = project_one(kind, lens, x, y, z)
+            places[w, p, 0] = round((projection[0] + 0.5) * scale[0] - 0.5)
+            places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: ignore[no-untyped-def]
     count = 0
