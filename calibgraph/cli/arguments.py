@@ -70,7 +70,8 @@ def matcher_from(
         from calibgraph.matching.cmrnext import CmrNextMatcher
 
         return CmrNextMatcher(weights, seed=seed, **given)
-    _refuse_cmrnext_options(weights, given)
+    if name != "cmrnext":
+        _refuse_cmrnext_options(weights, given)
     if name == "structure":
         return _structure_matcher(search, seed=seed, all_frames=all_frames)
     from calibgraph.matching.named import find_matcher
@@ -79,8 +80,7 @@ def matcher_from(
 
 
 def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
-    """Raise if an option of cmrnext was given; ``device`` has a default, so always is."""
-    for option in (*(["weights"] if weights else []), *(given.keys() - {"device"})):
+    for option in (*(["weights"] if weights else []), *given):
         raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
 
 

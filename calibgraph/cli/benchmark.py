@@ -180,10 +180,11 @@ def tune(
     share no frame. FILE.yaml is read by --config.
     """
     from calibgraph.evaluation.sources import Displacement, source_from
-    from calibgraph.evaluation.tune import Candidates, tune
+    from calibgraph.evaluation.tune import Candidates, require_replaceable_settings, tune
     from calibgraph.files import require_place_for_file
 
     require_place_for_file(out, ".yaml", ".yml")
+    require_replaceable_settings(out)
     with checked_arguments(), progress_bar() as progress:
         candidates = Candidates(
             _parse_numbers("--lambda", prior_weight),

@@ -29,6 +29,8 @@ from factors import Lens, LensModel
 
 Array = NDArray[np.float64]
 
+RIG_FORMAT: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
+
 ROUNDING = 1e-3
 """Largest deviation of R^T R from the identity that counts as rounded digits, not as an error."""
 
@@ -162,7 +164,7 @@ class RelativePose(_Model):
 class Rig(_Model):
     """A LiDAR and its cameras, in a fixed order."""
 
-    format: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
+    format: Literal["calibgraph-rig/1"] = RIG_FORMAT
     lidar: str = "lidar"
     cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
     relative_poses: tuple[RelativePose, ...] = ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -56,10 +56,6 @@ class Verdict:
         failing = [check for check in self.checks if check.status != "PASS"]
         failing.sort(key=lambda check: -_ORDER.index(check.status))
         return tuple(check.text for check in failing)
-
-    def and_also(self, checks: Iterable[Check]) -> Verdict:
-        """The verdict with more checks."""
-        return Verdict((*self.checks, *checks))
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
