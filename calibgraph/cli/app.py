@@ -98,8 +98,11 @@ def _require_utf8(arguments: list[str]) -> None:
     from calibgraph.errors import CalibrationError
 
     for argument in arguments:
-        if any("\ud800" <= letter <= "\udfff" for letter in argument):
-            raise CalibrationError(f"{argument}: is not UTF-8; rename the file or folder")
+        try:
+            argument.encode()
+        except UnicodeEncodeError as error:
+            message = f"{argument}: is not UTF-8; rename the file or folder"
+            raise CalibrationError(message) from error
 
 
 def _run_app() -> int:
@@ -118,9 +121,10 @@ def _print_error(text: str) -> None:
 
 def _flush(stream: TextIO | None) -> None:
     """Write what is left, or discard it: Python would try again at its exit, and report it."""
+    if stream is None:  # closed
+        return
     try:
-        if stream is not None:
-            stream.flush()
+        stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 

@@ -37,9 +37,8 @@ def dataset_from(folders: list[Path], rig: Path | None, frames: str | None) -> D
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
-    data = load_dataset(folders, load_rig(rig) if rig else None)
     with checked_arguments():
-        return data.select(frames) if frames is not None else data
+        return load_dataset(folders, load_rig(rig) if rig else None, frames=frames)
 
 
 def matcher_from(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.options import JsonOption, RigArgument, SeedOption
+from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, terminal
 
 
@@ -68,8 +68,12 @@ def evaluate(
 
 
 def perturb(
-    rig: RigArgument,
-    out: Annotated[Path, typer.Option(metavar="RIG", help="Rig file to write.")],
+    rig: Annotated[
+        Path, typer.Argument(metavar="RIG", help="Rig to displace, usually a reference.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
+    ],
     rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
     translation_m: Annotated[
         float, typer.Option(min=0, help="Length, in a random direction.")

@@ -114,15 +114,21 @@ def error_bar_table(result: Calibration) -> Table:
         "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
     )  # fmt: skip
     for name in (*result.covariance, *result.pair_covariance):
-        sigmas = result.sigmas(name)
-        if sigmas is None:
-            table.add_row(escape(name), "too few", "frames", "", "", "", "")
-        else:
-            table.add_row(escape(name), *_sigma_cells(*sigmas))
+        table.add_row(escape(name), *_error_bar_cells(result, name))
     for name, covariance in result.bootstrap.items():
-        sigmas = degrees_and_centimetres(covariance)
-        table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
+        if result.error_bar_holds(name):
+            sigmas = degrees_and_centimetres(covariance)
+            table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
     return table
+
+
+def _error_bar_cells(result: Calibration, name: str) -> list[str]:
+    """Six numbers, or why there are none."""
+    sigmas = result.error_bar(name)
+    if sigmas is not None:
+        return _sigma_cells(*sigmas)
+    why = "too few frames" if result.error_bar_holds(name) else "unknown: FAIL"
+    return [*why.split(), *[""] * 6][:6]
 
 
 def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:

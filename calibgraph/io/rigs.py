@@ -28,6 +28,8 @@ def load_rig(path: Path | str) -> Rig:
     content = read_yaml(path)
     if is_calibration(content):
         return rig_of_calibration(content, path)
+    if "format" not in content:
+        raise FileError(path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`")
     return checked_model(Rig, content, path)
 
 
@@ -35,14 +37,15 @@ def rig_file(path: Path | str) -> Path:
     """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder.
 
     Raises:
-        FileError: if a folder holds none.
+        FileError: if there is no such path, or a folder holds none.
     """
     found = find_rig_file(path)
-    if found is None:
+    if found is None or not found.exists():
+        what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
         raise FileError(
             path,
-            f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI); name a "
-            "rig file, a result, a dataset with a rig, or a KITTI odometry sequence",
+            f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
+            "dataset folder with a rig.yaml, or a KITTI odometry sequence",
         )
     return found
 

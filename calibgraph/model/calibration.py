@@ -140,6 +140,18 @@ class Calibration:
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else degrees_and_centimetres(covariance)
 
+    def error_bar_holds(self, name: str) -> bool:
+        """Whether the covariance of a camera or pair "A->B" describes its error.
+
+        It is computed around the result, so that it means nothing where a verdict is FAIL.
+        """
+        cameras = [name] if name in self.camera_verdicts else name.split("->")
+        return all(self.camera_verdicts[camera].status != "FAIL" for camera in cameras)
+
+    def error_bar(self, name: str) -> tuple[Array, Array] | None:
+        """The standard deviations of :meth:`sigmas` where they hold, else None."""
+        return self.sigmas(name) if self.error_bar_holds(name) else None
+
     @property
     def pair_covariance(self) -> dict[str, Array]:
         """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
@@ -203,6 +215,10 @@ class Calibration:
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
+            "error_bar_holds": {
+                name: self.error_bar_holds(name)
+                for name in (*self.rig.cameras, *self.pair_covariance)
+            },
             "rig": self.rig.model_dump(),
             "covariance_of": TANGENT_SENTENCE,
             "covariance": dict(self.covariance),

@@ -93,7 +93,10 @@ def require_not_read(path: Path, read: Iterable[Path | None]) -> None:
 def is_calibration_file(path: Path) -> bool:
     """Whether a file is a result's, by its first line."""
     start = f"format: {CALIBRATION_FORMAT}\n".encode()
-    return path.is_file() and path.open("rb").read(len(start)) == start
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(start)) == start
 
 
 def is_table_of_result(path: Path) -> bool:

@@ -26,6 +26,7 @@ from pydantic import (
 from calibgraph.errors import RigError
 from calibgraph.files import write_yaml
 from factors import Lens, LensModel
+from factors.lens import ORDERS
 
 Array = NDArray[np.float64]
 
@@ -85,6 +86,28 @@ def _checked_name(name: str) -> str:
     return name
 
 
+_MODELS_OF_OTHERS: dict[str, LensModel] = {
+    "plumb_bob": "pinhole",
+    "radtan": "pinhole",
+    "rational_polynomial": "pinhole",
+    "equidistant": "fisheye",
+    "equi": "fisheye",
+    "kannala_brandt": "fisheye",
+}
+
+
+def _checked_model(name: Any) -> Any:
+    """The name of a lens model, as it is.
+
+    Raises:
+        ValueError: if it is the name that ROS or Kalibr give to one of ours.
+    """
+    ours = _MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
+    if ours is not None:
+        raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")
+    return name
+
+
 CameraName = Annotated[str, AfterValidator(_checked_name)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
@@ -108,7 +131,7 @@ class Intrinsics(_Model):
 class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference."""
 
-    model: LensModel = "pinhole"
+    model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
     width_px: Size
     height_px: Size
     intrinsics_px: Intrinsics

@@ -44,10 +44,11 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     }
 
 
-def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | None]:
-    """Standard deviations of a camera or a pair, about and along x, y, z."""
+def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | None]:
+    """Standard deviations of a camera or a pair, about and along x, y, z, and if they hold."""
     sigmas = result.sigmas(name)
     return {
+        "error_bar_holds": result.error_bar_holds(name),
         "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
         "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
     }

@@ -74,7 +74,7 @@ def _coverage_diagrams(camera: Camera, after: ReprojectionErrors) -> tuple[Diagr
 
 
 def _error_bar_diagrams(result: Calibration, name: str) -> tuple[Diagram, ...]:
-    sigmas = result.sigmas(name)
+    sigmas = result.error_bar(name)
     if sigmas is None:
         return ()
     bootstrap = result.bootstrap.get(name)

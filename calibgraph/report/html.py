@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined
+from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import write_text
@@ -15,6 +18,8 @@ from calibgraph.report.camera_section import camera_section
 from calibgraph.report.check_table import group_reasons
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.reprojection_errors import errors_before_after
+
+Array = NDArray[np.float64]
 
 _GENERATOR = b'<meta name="generator" content="calibgraph">'
 _HEAD_BYTES = 1000
@@ -78,7 +83,7 @@ def report_html(result: Calibration) -> str:
         cameras=cameras,
         usable=_CAN_I_USE_IT[result.verdict.status],
         accuracy=_accuracy(result),
-        pairs={name: result.sigmas(name) for name in result.pair_covariance},
+        pairs={name: result.error_bar(name) for name in result.pair_covariance},
         reasons=group_reasons(verdicts, weaknesses),
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
@@ -89,16 +94,24 @@ def report_html(result: Calibration) -> str:
 
 
 def _accuracy(result: Calibration) -> str:
-    """The largest standard deviations over all cameras, in a sentence."""
-    sigmas = {name: result.sigmas(name) for name in result.rig.cameras}
-    known = {name: both for name, both in sigmas.items() if both is not None}
-    if not known:
-        return "Unknown: too few frames for an error bar."
+    """The largest standard deviations over all cameras, and where there are none, in sentences."""
+    bars = {name: result.error_bar(name) for name in result.rig.cameras}
+    known = {name: both for name, both in bars.items() if both is not None}
+    failed = [name for name in bars if not result.error_bar_holds(name)]
+    few = [name for name in bars if name not in known and name not in failed]
+    sentences = [_worst_axes(known)] if known else []
+    if failed:
+        names = ", ".join(failed)
+        sentences.append(f"Unknown for {names}: FAIL, an error bar would not hold.")
+    if few:
+        sentences.append(f"Unknown for {', '.join(few)}: too few frames for an error bar.")
+    return " ".join(sentences)
+
+
+def _worst_axes(known: Mapping[str, tuple[Array, Array]]) -> str:
     rotation = max(known, key=lambda name: float(known[name][0].max()))
     translation = max(known, key=lambda name: float(known[name][1].max()))
-    text = (
+    return (
         f"Worst axis of any camera: {known[rotation][0].max():.3f} deg ({rotation}) and "
         f"{known[translation][1].max():.2f} cm ({translation}), one standard deviation."
     )
-    unknown = [name for name in sigmas if name not in known]
-    return f"{text} Unknown for {', '.join(unknown)}: too few frames." if unknown else text

@@ -122,7 +122,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               5.0, 10.0, "cm",
               "The same, how far would they move it?",
               "Right intrinsics, recorded and rendered: up to 1.4 cm (4.2 sigma)."),
-    Threshold("focal_sensitivity", "a focal length wrong by 1 % would move the camera by",
+    Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances"),
     # the rounds of matching

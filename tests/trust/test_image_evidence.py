@@ -18,6 +18,8 @@ from tests.conftest import SAMPLE
 
 NAME = "front_left"
 
+NAMES = {n: f"{n:06}" for n in range(6)}
+
 
 @pytest.fixture(scope="module")
 def truth() -> Rig:
@@ -47,7 +49,7 @@ def with_clouds_of(dataset: Dataset, order: list[int]) -> Dataset:
 
 
 def statuses(found: ImageEvidence) -> dict[str, str]:
-    checks = (*evidence_checks(found), *pairing_checks(found))
+    checks = (*evidence_checks(found, NAMES), *pairing_checks(found))
     return {check.name: check.status for check in checks}
 
 
