@@ -145,7 +145,8 @@ class Calibration:
 
         It is computed around the result, so that it means nothing where a verdict is FAIL.
         """
-        cameras = [name] if name in self.camera_verdicts else name.split("->")
+        pairs = {f"{a}->{b}": (a, b) for a, b in combinations(self.rig.cameras, 2)}
+        cameras = (name,) if name in self.rig.cameras else pairs[name]
         return all(self.camera_verdicts[camera].status != "FAIL" for camera in cameras)
 
     def error_bar(self, name: str) -> tuple[Array, Array] | None:

@@ -12,7 +12,7 @@ from calibgraph.model.calibration import Calibration, degrees_and_centimetres
 from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.verdict import Verdict
 from calibgraph.report import plots
-from calibgraph.report.check_table import CheckRow, check_row
+from calibgraph.report.check_table import CheckRow, check_rows
 from calibgraph.report.diagrams import Diagram, camera_diagrams
 from calibgraph.report.page_overlays import Overlays
 from calibgraph.report.reprojection_errors import BeforeAfter
@@ -112,7 +112,7 @@ def camera_section(
         name=name,
         anchor=f"camera-{index}",
         verdict=verdict,
-        rows=tuple(check_row(check) for check in verdict.checks),
+        rows=check_rows(verdict.checks),
         weaknesses=tuple(result.weaknesses.get(name, ())),
         prior_share=result.prior_share.get(name, 0.0),
         moved=moved,

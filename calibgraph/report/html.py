@@ -100,11 +100,12 @@ def _accuracy(result: Calibration) -> str:
     failed = [name for name in bars if not result.error_bar_holds(name)]
     few = [name for name in bars if name not in known and name not in failed]
     sentences = [_worst_axes(known)] if known else []
-    if failed:
-        names = ", ".join(failed)
-        sentences.append(f"Unknown for {names}: FAIL, an error bar would not hold.")
-    if few:
-        sentences.append(f"Unknown for {', '.join(few)}: too few frames for an error bar.")
+    for names, why in (
+        (failed, "FAIL, an error bar would not hold"),
+        (few, "too few frames for an error bar"),
+    ):
+        of_some = f" for {', '.join(names)}" if len(names) < len(bars) else ""
+        sentences += [f"Unknown{of_some}: {why}."] if names else []
     return " ".join(sentences)
 
 
