@@ -62,6 +62,7 @@ def test_named_files_of_another_kind_are_not_replaced(
     simulated: Path, calibrated_sample: CommandRun, call: Call
 ) -> None:
     result = Path(shutil.copytree(calibrated_sample.folder, simulated / "result"))
+    (simulated / "paper.png").write_text("mine")
     (simulated / "notes.html").write_text("<p>mine</p>")
     table = simulated / "table.parquet"
     load_correspondences(simulated / "correspondences.parquet").save(table)
@@ -72,6 +73,7 @@ def test_named_files_of_another_kind_are_not_replaced(
         "is read by this command": ("match", SAMPLE, "--matcher", table, "--out", table),
         "is not a report": ("report", result, "--out", simulated / "notes.html"),
         "or no rig file": ("perturb", simulated, "--out", result / "calibration.yaml"),
+        "paper.png: is not of a benchmark": ("bench", "paper", "kitti", "--out", simulated),
         "no file of settings": ("tune", "kitti", "--out", simulated / "rig.yaml"),
     }  # fmt: skip
     before = {path: path.read_bytes() for path in simulated.rglob("*") if path.is_file()}
