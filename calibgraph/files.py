@@ -78,6 +78,11 @@ def require_place_for_folder(folder: Path) -> None:
         raise FileError(existing, "may not be written to; choose another folder")
 
 
+def is_utf8(name: str) -> bool:
+    """Whether a path is text: Python reads other bytes as surrogates, which no result can hold."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
 def sync_folder(folder: Path) -> None:
     """Make the renames in a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)

@@ -25,8 +25,12 @@ MIN_DEPTH_M = 0.05
 """Points with a smaller z are not projectable by a pinhole."""
 
 PINHOLE, RADTAN, FISHEYE = 0, 1, 2
-_PINHOLE_COEFFICIENTS = (0, 4, 5, 8)
-_FISHEYE_COEFFICIENTS = (4,)
+_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+ORDERS: dict[LensModel, str] = {
+    "pinhole": "[], [k1, k2, p1, p2], [k1, k2, p1, p2, k3] or [k1, k2, p1, p2, k3, k4, k5, k6]",
+    "fisheye": "[k1, k2, k3, k4]",
+}
+"""The distortion coefficients of each model in their order, which is OpenCV's."""
 _MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
 _LIMIT = 12  # index of the domain's limit in the packed parameters
 
@@ -54,7 +58,7 @@ class Lens:
         Raises:
             ValueError: on another number of coefficients, or a focal length that is not positive.
         """
-        coefficients = _checked(fx, fy, distortion, _PINHOLE_COEFFICIENTS)
+        coefficients = _checked(fx, fy, distortion, "pinhole")
         limit = _radtan_limit(coefficients)
         kind = RADTAN if np.any(coefficients) else PINHOLE
         return Lens(kind, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
@@ -66,7 +70,7 @@ class Lens:
         Raises:
             ValueError: unless there are 4 coefficients and positive focal lengths.
         """
-        coefficients = _checked(fx, fy, distortion, _FISHEYE_COEFFICIENTS)
+        coefficients = _checked(fx, fy, distortion, "fisheye")
         limit = _fisheye_limit(coefficients)
         return Lens(FISHEYE, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
 
@@ -91,12 +95,14 @@ class Lens:
         return pixels, jacobians
 
 
-def _checked(fx: float, fy: float, distortion: Sequence[float], counts: tuple[int, ...]) -> Array:
+def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
     if not (fx > 0 and fy > 0):
         raise ValueError(f"focal lengths must be positive, found fx={fx}, fy={fy}")
-    if len(distortion) not in counts:
-        allowed = ", ".join(str(count) for count in counts)
-        raise ValueError(f"{len(distortion)} distortion coefficients found, expected {allowed}")
+    if len(distortion) not in _COEFFICIENTS[model]:
+        allowed = ", ".join(map(str, _COEFFICIENTS[model]))
+        raise ValueError(
+            f"{len(distortion)} distortion coefficients found, expected {allowed}: {ORDERS[model]}"
+        )
     return np.pad(np.asarray(distortion, dtype=np.float64), (0, 8 - len(distortion)))
 
 

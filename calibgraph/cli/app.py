@@ -7,9 +7,11 @@ WARN), 1 the calibration FAILed (its files are written and marked FAIL), 2 bad i
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
-from typing import Annotated
+from contextlib import suppress
+from typing import Annotated, TextIO
 
 import typer
 
@@ -69,7 +71,8 @@ def main() -> None:
 
     sys.argv[1:] = list(_repeat_weights_option(sys.argv[1:]))
     try:
-        code = app(standalone_mode=False) or 0
+        _require_utf8(sys.argv[1:])
+        code = _run_app()
         if code == _INTERRUPTED:  # what typer returns after Ctrl-C
             raise KeyboardInterrupt
         sys.exit(code)
@@ -77,11 +80,53 @@ def main() -> None:
         if "--debug" in sys.argv:
             raise
         if str(error) or not isinstance(error, _UsageError):  # else the help has been printed
-            print(f"calibgraph: {_one_line(error)}", file=sys.stderr)
+            _print_error(_one_line(error))
         sys.exit(2)
     except (typer.Abort, KeyboardInterrupt):
-        print("calibgraph: interrupted", file=sys.stderr)
+        _print_error("interrupted")
         sys.exit(_INTERRUPTED)
+    finally:
+        _flush(sys.stdout)
+
+
+def _require_utf8(arguments: list[str]) -> None:
+    """Check the arguments: results hold the paths of their input, as text.
+
+    Raises:
+        CalibrationError: if one is not UTF-8.
+    """
+    from calibgraph.errors import CalibrationError
+
+    for argument in arguments:
+        try:
+            argument.encode()
+        except UnicodeEncodeError as error:
+            message = f"{argument}: is not UTF-8; rename the file or folder"
+            raise CalibrationError(message) from error
+
+
+def _run_app() -> int:
+    """The exit code of the command."""
+    try:
+        return app(standalone_mode=False, prog_name="calibgraph") or 0
+    except SystemExit:  # of typer and rich when the reader of the help has gone: 1, our FAIL
+        return 0
+
+
+def _print_error(text: str) -> None:
+    with suppress(BrokenPipeError):
+        print(f"calibgraph: {text}", file=sys.stderr)
+    _flush(sys.stderr)
+
+
+def _flush(stream: TextIO | None) -> None:
+    """Write what is left, or discard it: Python would try again at its exit, and report it."""
+    if stream is None:  # closed
+        return
+    try:
+        stream.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _repeat_weights_option(arguments: list[str]) -> Iterator[str]:
@@ -102,5 +147,13 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     text = error.format_message() if hasattr(error, "format_message") else str(error)
-    more = "; see calibgraph --help" if isinstance(error, _UsageError) else ""
-    return " ".join(text.split()).removesuffix(".") + more
+    return " ".join(text.split()).removesuffix(".") + _help_hint(error)
+
+
+def _help_hint(error: Exception) -> str:
+    """Where the options are described: in the help of the command that was called, if one was."""
+    if not isinstance(error, _UsageError):
+        return ""
+    context = getattr(error, "ctx", None)
+    names = context.command_path.split()[1:] if context is not None else []
+    return "; see " + " ".join(["calibgraph", *names, "--help"])

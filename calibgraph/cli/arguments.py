@@ -37,9 +37,8 @@ def dataset_from(folders: list[Path], rig: Path | None, frames: str | None) -> D
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
-    data = load_dataset(folders, load_rig(rig) if rig else None)
     with checked_arguments():
-        return data.select(frames) if frames is not None else data
+        return load_dataset(folders, load_rig(rig) if rig else None, frames=frames)
 
 
 def matcher_from(
@@ -70,7 +69,8 @@ def matcher_from(
         from calibgraph.matching.cmrnext import CmrNextMatcher
 
         return CmrNextMatcher(weights, seed=seed, **given)
-    _refuse_cmrnext_options(weights, given)
+    if name != "cmrnext":
+        _refuse_cmrnext_options(weights, given)
     if name == "structure":
         return _structure_matcher(search, seed=seed, all_frames=all_frames)
     from calibgraph.matching.named import find_matcher
@@ -79,8 +79,7 @@ def matcher_from(
 
 
 def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
-    """Raise if an option of cmrnext was given; ``device`` has a default, so always is."""
-    for option in (*(["weights"] if weights else []), *(given.keys() - {"device"})):
+    for option in (*(["weights"] if weights else []), *given):
         raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
 
 

@@ -7,37 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli.arguments import (
-    checked_arguments,
-    config_from,
-    dataset_from,
-    matcher_from,
-    terms_from,
-)
+from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
+from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
 from calibgraph.cli.options import (
-    BatchOption,
     BootstrapOption,
     ConfigOption,
     ConfigSeedOption,
     DatasetArgument,
-    DeviceOption,
-    EstimateOption,
-    FramesOption,
-    HalfOption,
-    IterationsOption,
     JsonOption,
-    MatcherOption,
-    OcclusionOption,
     OutOption,
     PresetOption,
     RigArgument,
-    RigOption,
-    SearchDegOption,
-    SearchMetresOption,
     SeedOption,
     TermsOption,
-    TimeLimitOption,
-    WeightsOption,
 )
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 
@@ -47,58 +29,34 @@ if TYPE_CHECKING:
     from calibgraph.model.correspondences import Correspondences
 
 
+@with_matching_options
 def calibrate(
     dataset: DatasetArgument,
-    rig: RigOption = None,
-    matcher: MatcherOption = "structure",
-    frames: FramesOption = None,
+    matching: MatchingOptions,
     config: ConfigOption = None,
     preset: PresetOption = None,
     terms: TermsOption = "full",
     out: OutOption = Path("calibration"),
     seed: ConfigSeedOption = None,
     bootstrap: BootstrapOption = None,
-    time_limit_s: TimeLimitOption = None,
     as_json: JsonOption = False,
-    search_deg: SearchDegOption = None,
-    search_m: SearchMetresOption = None,
-    weights: WeightsOption = None,
-    estimate: EstimateOption = None,
-    device: DeviceOption = "auto",
-    iterations: IterationsOption = None,
-    half_resolution: HalfOption = None,
-    occlusion_filter: OcclusionOption = None,
-    batch: BatchOption = None,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
-    from calibgraph.files import require_place_for_folder
+    from calibgraph.model.result_files import require_place_for_result
     from calibgraph.pipeline import calibrate
 
-    require_place_for_folder(out)
+    require_place_for_result(out, config, *matching.files_read(dataset))
     with checked_arguments():
         settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
-        chosen = matcher_from(
-            matcher,
-            weights,
-            seed=settings.seed,
-            search_deg=search_deg,
-            search_m=search_m,
-            all_frames=frames is not None,
-            device=device,
-            estimate=estimate,
-            iterations=iterations,
-            half_resolution=half_resolution,
-            occlusion_filter=occlusion_filter,
-            batch=batch,
-        )
-    data = dataset_from(dataset, rig, frames)
+        chosen = matching.find_matcher(seed=settings.seed)
+    data = matching.load_dataset(dataset)
     with progress_bar() as progress:
         result = calibrate(
             data,
             matcher=chosen,
             config=settings,
             terms=checked_terms,
-            time_limit_s=time_limit_s,
+            time_limit_s=matching.time_limit_s,
             progress=progress,
         )
         written = _write_result(result, data, out)
@@ -106,52 +64,32 @@ def calibrate(
     _print_and_exit(result, written, as_json=as_json)
 
 
+@with_matching_options
 def match(
     dataset: DatasetArgument,
-    rig: RigOption = None,
-    matcher: MatcherOption = "structure",
-    frames: FramesOption = None,
+    matching: MatchingOptions,
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
     ] = Path("correspondences.parquet"),
     seed: SeedOption = 0,
-    time_limit_s: TimeLimitOption = None,
     as_json: JsonOption = False,
-    search_deg: SearchDegOption = None,
-    search_m: SearchMetresOption = None,
-    weights: WeightsOption = None,
-    estimate: EstimateOption = None,
-    device: DeviceOption = "auto",
-    iterations: IterationsOption = None,
-    half_resolution: HalfOption = None,
-    occlusion_filter: OcclusionOption = None,
-    batch: BatchOption = None,
 ) -> None:
     """Find correspondences and write them as a table; exit 1 if a camera was not found."""
     from calibgraph.files import require_place_for_file
+    from calibgraph.model.result_files import require_replaceable_table
     from calibgraph.rounds import match_in_rounds
 
     require_place_for_file(out)
     with checked_arguments():
         if out.suffix not in (".parquet", ".csv"):
             raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
-        chosen = matcher_from(
-            matcher,
-            weights,
-            seed=seed,
-            search_deg=search_deg,
-            search_m=search_m,
-            all_frames=frames is not None,
-            device=device,
-            estimate=estimate,
-            iterations=iterations,
-            half_resolution=half_resolution,
-            occlusion_filter=occlusion_filter,
-            batch=batch,
-        )
-    data = dataset_from(dataset, rig, frames)
+        require_replaceable_table(out, matching.files_read(dataset))
+        chosen = matching.find_matcher(seed=seed)
+    data = matching.load_dataset(dataset)
     with progress_bar() as progress:
-        run = match_in_rounds(data, matcher=chosen, time_limit_s=time_limit_s, progress=progress)
+        run = match_in_rounds(
+            data, matcher=chosen, time_limit_s=matching.time_limit_s, progress=progress
+        )
     run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data)
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
@@ -175,23 +113,25 @@ def solve(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
-    from calibgraph.files import require_place_for_folder, sha256
-    from calibgraph.io.rigs import load_rig
+    from calibgraph.files import sha256
+    from calibgraph.io.rigs import find_rig_file, load_rig
+    from calibgraph.model.result_files import REPORT_FILE, require_place_for_result
     from calibgraph.pipeline import solve
     from calibgraph.report import write_report
 
-    require_place_for_folder(out)
+    require_place_for_result(out, find_rig_file(rig), correspondences, config)
     with checked_arguments():
         settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
     with progress_bar("solving"):
         result = solve(load_rig(rig), correspondences, settings, checked_terms)
         result = result.with_inputs({str(correspondences): sha256(correspondences)})
-        written = [result.save(out), write_report(result, out / "report.html")]
+        written = [result.save(out), write_report(result, out / REPORT_FILE)]
     _print_and_exit(result, written, as_json=as_json)
 
 
 def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path]:
     """Write the result, an overlay picture per camera and the report."""
+    from calibgraph.model.result_files import CORRESPONDENCES_FILE, REPORT_FILE
     from calibgraph.report import write_report
     from calibgraph.report.point_overlay import write_overlays
 
@@ -199,9 +139,9 @@ def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path
     mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
     return [
         result.save(folder),
-        folder / "correspondences.parquet",
+        folder / CORRESPONDENCES_FILE,
         *write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark),
-        write_report(result, folder / "report.html"),
+        write_report(result, folder / REPORT_FILE),
     ]
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.options import JsonOption, RigArgument, SeedOption
+from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, terminal
 
 
@@ -33,15 +33,17 @@ def report(
     from calibgraph.files import require_place_for_file
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.io.dataset import load_dataset
-    from calibgraph.report import relocate_frames, write_report
+    from calibgraph.model.result_files import REPORT_FILE
+    from calibgraph.report import relocate_frames, require_replaceable_page, write_report
 
     if out is not None:
         require_place_for_file(out, ".html", ".htm")
+        require_replaceable_page(out)
     loaded = load_calibration(result)
     if dataset:
         loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
     folder = result if result.is_dir() else result.parent
-    path = write_report(loaded, out or folder / "report.html")
+    path = write_report(loaded, out or folder / REPORT_FILE)
     print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
@@ -66,8 +68,12 @@ def evaluate(
 
 
 def perturb(
-    rig: RigArgument,
-    out: Annotated[Path, typer.Option(metavar="RIG", help="Rig file to write.")],
+    rig: Annotated[
+        Path, typer.Argument(metavar="RIG", help="Rig to displace, usually a reference.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
+    ],
     rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
     translation_m: Annotated[
         float, typer.Option(min=0, help="Length, in a random direction.")
@@ -79,16 +85,13 @@ def perturb(
 ) -> None:
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
     from calibgraph.files import require_place_for_file
-    from calibgraph.io.rigs import REFERENCE_FILE, load_rig, rig_file
+    from calibgraph.io.rigs import load_rig, require_replaceable_rig, rig_file
     from calibgraph.model.perturbation import perturb
 
     require_place_for_file(out, ".yaml", ".yml")
     given = load_rig(rig)
+    require_replaceable_rig(out, read=rig_file(rig))
     with checked_arguments():
-        if out.exists() and (out.name == REFERENCE_FILE or out.samefile(rig_file(rig))):
-            raise ValueError(
-                f"--out {out}: would overwrite a reference or the input; choose another name"
-            )
         displaced = perturb(
             given,
             rotation_deg=rotation_deg,

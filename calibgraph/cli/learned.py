@@ -21,10 +21,13 @@ def weights(
 ) -> None:
     """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
     from calibgraph.matching.cmrnext import load_checkpoint
+    from calibgraph.model.result_files import require_not_read
 
     with checked_arguments():
         if out is not None and out.suffix != ".safetensors":
             raise ValueError(f"--out {out}: the name must end in .safetensors")
+        if out is not None:
+            require_not_read(out, [file])
     checkpoint = load_checkpoint(file)
     if out is not None:
         checkpoint.save_safetensors(out)

@@ -70,7 +70,10 @@ EstimateOption = Annotated[
     ),
 ]
 DeviceOption = Annotated[
-    str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.", rich_help_panel=_CMRNEXT)
+    str | None,
+    typer.Option(
+        metavar="auto|cpu|cuda", help="Torch device. (default: auto)", rich_help_panel=_CMRNEXT
+    ),
 ]
 IterationsOption = Annotated[
     int | None,
@@ -144,4 +147,17 @@ ConfigSeedOption = Annotated[
         help="Seed of everything random. (default: that of --config, else 0)",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+def _require_stdout(as_json: bool) -> bool:
+    """Refuse ``--json`` to a closed stdout before the work, not after it."""
+    if as_json:
+        from calibgraph.report.as_json import require_stdout
+
+        require_stdout()
+    return as_json
+
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", callback=_require_stdout, help="Print JSON on stdout.")
+]

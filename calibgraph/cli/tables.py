@@ -19,6 +19,7 @@ from calibgraph.model.calibration import (
     degrees_and_centimetres,
 )
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
+from calibgraph.report.check_table import group_reasons
 
 if TYPE_CHECKING:
     from calibgraph.evaluation.paper import Report, Row
@@ -33,15 +34,12 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
     status = result.verdict.status
     console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
-    reasons = result.verdict.reasons
+    reasons = group_reasons(result.camera_verdicts, result.weaknesses)
     for reason in reasons[:MAX_REASONS]:
-        print_plain(console, f"  {reason}")
+        print_plain(console, f"  {reason.status:5}{reason.cameras}: {reason.text}")
     if len(reasons) > MAX_REASONS:
         more = len(reasons) - MAX_REASONS
         print_plain(console, f"  and {more} more: see camera_verdicts in calibration.yaml")
-    for name, sentences in result.weaknesses.items():
-        if sentences:
-            print_plain(console, f"  {name}: {'; '.join(sentences)}")
     console.print(result_table(result))
     console.print(
         "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
@@ -114,15 +112,21 @@ def error_bar_table(result: Calibration) -> Table:
         "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
     )  # fmt: skip
     for name in (*result.covariance, *result.pair_covariance):
-        sigmas = result.sigmas(name)
-        if sigmas is None:
-            table.add_row(escape(name), "too few", "frames", "", "", "", "")
-        else:
-            table.add_row(escape(name), *_sigma_cells(*sigmas))
+        table.add_row(escape(name), *_error_bar_cells(result, name))
     for name, covariance in result.bootstrap.items():
-        sigmas = degrees_and_centimetres(covariance)
-        table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
+        if result.error_bar_holds(name):
+            sigmas = degrees_and_centimetres(covariance)
+            table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
     return table
+
+
+def _error_bar_cells(result: Calibration, name: str) -> list[str]:
+    """Six numbers, or why there are none."""
+    sigmas = result.error_bar(name)
+    if sigmas is not None:
+        return _sigma_cells(*sigmas)
+    why = "too few frames" if result.error_bar_holds(name) else "unknown: FAIL"
+    return [*why.split(), *[""] * 6][:6]
 
 
 def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -13,10 +15,16 @@ if TYPE_CHECKING:
 
 
 def terminal() -> Console:
-    """A console on stderr; stdout is for ``--json``."""
+    """A console on stderr, on which a reader that has gone is no error; stdout is for JSON."""
     from rich.console import Console
 
-    return Console(stderr=True)
+    class Stderr(Console):
+        def on_broken_pipe(self) -> None:
+            """Go on without output: the files and the exit code are what counts."""
+            self.quiet = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+    return Stderr(stderr=True)
 
 
 def print_plain(console: Console, text: str) -> None:

@@ -52,7 +52,7 @@ def track(
     preset: PresetOption = None,
     seed: ConfigSeedOption = None,
     weights: WeightsOption = None,
-    device: DeviceOption = "auto",
+    device: DeviceOption = None,
 ) -> None:
     """Keep all cameras calibrated while driving: one frame in, one line of JSON out.
 
@@ -62,11 +62,11 @@ def track(
     the current update first.
     """
     from calibgraph.cli.tables import print_result
-    from calibgraph.files import require_place_for_folder
-    from calibgraph.io.rigs import load_rig
+    from calibgraph.io.rigs import find_rig_file, load_rig
+    from calibgraph.model.result_files import require_place_for_result
     from calibgraph.tracking.command import Tracking, track
 
-    require_place_for_folder(out)
+    require_place_for_result(out, *map(find_rig_file, (rig, *source)), config)
     with checked_arguments():
         settings = config_from(config, preset, seed)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
@@ -81,7 +81,12 @@ def track(
 
 
 def _tracking_matcher(
-    name: str | None, weights: list[Path] | None, source: list[Path], *, seed: int, device: str
+    name: str | None,
+    weights: list[Path] | None,
+    source: list[Path],
+    *,
+    seed: int,
+    device: str | None,
 ) -> Matcher | None:
     """The matcher for the frames of datasets; None for a source of correspondences.
 
@@ -90,8 +95,9 @@ def _tracking_matcher(
     """
     if name:
         return matcher_from(name, weights, seed=seed, device=device)
-    if weights:
-        raise ValueError("--weights is for --matcher cmrnext only")
+    for option, value in (("--weights", weights), ("--device", device)):
+        if value:
+            raise ValueError(f"{option} is for --matcher cmrnext only")
     if len(source) > 1:
         raise ValueError(f"{len(source)} sources given; several go with --matcher only")
     return None

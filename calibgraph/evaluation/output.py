@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibgraph.errors import FileError
 from calibgraph.evaluation.methods import HEADLINE
 from calibgraph.evaluation.paper import (
     IMPROVEMENT,
@@ -56,12 +58,31 @@ _COLUMN_IN, _ROW_IN, _NAMES_IN = 3.3, 0.27, 2.6
 
 def write_report(report: Report, folder: Path) -> list[Path]:
     """Write ``paper.md``, ``paper.json`` and ``paper.png``; returns their paths."""
-    written = [folder / f"paper.{kind}" for kind in ("md", "json", "png")]
+    written = _paths(folder)
     write_text(written[0], markdown(report))
     content = finite(json.loads(json.dumps(to_mapping(report))))
     write_text(written[1], json.dumps(content, indent=1, allow_nan=False) + "\n")
     write_atomically(written[2], lambda path: _plot(report, path))
     return written
+
+
+def require_replaceable_report(folder: Path) -> None:
+    """Check, before hours of work, that files of these names in a folder are of a report.
+
+    Raises:
+        FileError: if not: something else wrote them.
+    """
+    content: Any = {}
+    with suppress(OSError, ValueError):
+        content = json.loads(_paths(folder)[1].read_text("utf-8"))
+    for path in _paths(folder):
+        if path.exists() and not (isinstance(content, dict) and "blocks" in content):
+            raise FileError(path, "is not of a benchmark and would be replaced; choose another "
+                            "--out")  # fmt: skip
+
+
+def _paths(folder: Path) -> list[Path]:
+    return [folder / f"paper.{kind}" for kind in ("md", "json", "png")]
 
 
 def to_mapping(report: Report) -> dict[str, Any]:

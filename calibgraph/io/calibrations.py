@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_yaml
+from calibgraph.files import checked_model, read_yaml, sha256
 from calibgraph.io.correspondence_tables import load_correspondences
-from calibgraph.model.calibration import (
+from calibgraph.model.calibration import Calibration, Residuals
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
     CORRESPONDENCES_FILE,
-    Calibration,
-    Residuals,
 )
-from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 
@@ -57,7 +56,7 @@ def load_calibration(path: Path | str) -> Calibration:
             bootstrap={k: np.array(v) for k, v in content["bootstrap_covariance"].items()},
             frames=tuple(content["frames_used"]),
             rounds=tuple(content["rounds"]),
-            correspondences=_correspondences(path.with_name(CORRESPONDENCES_FILE)),
+            correspondences=_correspondences(path.with_name(CORRESPONDENCES_FILE), content),
             **{name: content[name] for name in _PLAIN},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -96,10 +95,24 @@ _PLAIN = ("counts", "timings_s", "terms", "prior_share", "inputs", "versions")
 assert {*_PLAIN} <= {f.name for f in fields(Calibration)}
 
 
-def _correspondences(path: Path) -> Correspondences | None:
-    """The table, if there is one."""
+def _correspondences(path: Path, content: Mapping[str, Any]) -> Correspondences | None:
+    """The table, if there is one.
+
+    Args:
+        path: of the table.
+        content: of the result, with the table's hash; results of earlier versions have none.
+
+    Raises:
+        FileError: if it is another table than that of the result.
+    """
     if not path.is_file():
         return None
+    found = sha256(path)
+    if found != content.get("correspondences_sha256", found):
+        raise FileError(
+            path, f"is not the table of the {CALIBRATION_FILE} beside it; move it, or put the "
+            "result's own there"
+        )  # fmt: skip
     return load_correspondences(path)
 
 

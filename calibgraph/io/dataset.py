@@ -115,16 +115,24 @@ class Dataset:
         return replace(self, frames=tuple(frames), recorded=self.recorded or self.frames)
 
 
-def load_dataset(folders: Path | str | Sequence[Path | str], rig: Rig | None = None) -> Dataset:
+def load_dataset(
+    folders: Path | str | Sequence[Path | str],
+    rig: Rig | None = None,
+    *,
+    frames: str | None = None,
+) -> Dataset:
     """Find the frames of a dataset folder, a KITTI odometry sequence, or several of one rig.
 
     Args:
         folders: one folder or several; several form one calibration problem.
         rig: used instead of the rig in the folder.
+        frames: which to keep, see :meth:`Dataset.select`; all if None. Those left out may lack
+            images.
 
     Raises:
         FileError, DatasetError: if a folder is missing, frames do not pair up, or the folders'
             rigs differ.
+        ValueError: if ``frames`` selects nothing, or is no selection.
     """
     if isinstance(folders, (str, Path)):
         folders = [folders]
@@ -139,13 +147,33 @@ def load_dataset(folders: Path | str | Sequence[Path | str], rig: Rig | None = N
     found = [
         (f"{path.name}/" if len(paths) > 1 else "", files)
         for path in paths
-        for files in frames_of_folder(path, list(rigs[0].cameras))
+        for files in frames_of_folder(path, list(rigs[0].cameras), complete=frames is None)
     ]
-    frames = tuple(
+    recorded = tuple(
         Frame(index, prefix + files.stem, files.cloud, files.images)
         for index, (prefix, files) in enumerate(found)
     )
-    return Dataset(rig=rigs[0], frames=frames, folders=paths)
+    data = Dataset(rig=rigs[0], frames=recorded, folders=paths)
+    return data if frames is None else _complete(data.select(frames))
+
+
+def _complete(data: Dataset) -> Dataset:
+    """The dataset, of whose frames that are not selected only complete ones are kept.
+
+    Raises:
+        DatasetError: if a selected frame lacks an image.
+    """
+    cameras = data.rig.cameras.keys()
+    for frame in data.frames:
+        for name in cameras - frame.image_paths.keys():
+            raise DatasetError(
+                f"{frame.cloud_path}: frame {frame.name!r} has a cloud but no image of camera "
+                f"{name!r}; give both the same name, or choose other frames",
+                camera=name,
+                frame=frame.name,
+            )
+    recorded = (frame for frame in data.recorded if cameras <= frame.image_paths.keys())
+    return replace(data, recorded=tuple(recorded))
 
 
 def spread_out(items: Sequence[Item], most: int) -> list[Item]:

@@ -8,8 +8,8 @@ from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
-from calibgraph.model.calibration import CALIBRATION_FILE
-from calibgraph.model.rig import Rig
+from calibgraph.model.result_files import CALIBRATION_FILE, require_not_read
+from calibgraph.model.rig import RIG_FORMAT, Rig
 
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 
@@ -28,6 +28,8 @@ def load_rig(path: Path | str) -> Rig:
     content = read_yaml(path)
     if is_calibration(content):
         return rig_of_calibration(content, path)
+    if "format" not in content:
+        raise FileError(path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`")
     return checked_model(Rig, content, path)
 
 
@@ -35,17 +37,49 @@ def rig_file(path: Path | str) -> Path:
     """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder.
 
     Raises:
-        FileError: if a folder holds none.
+        FileError: if there is no such path, or a folder holds none.
     """
+    found = find_rig_file(path)
+    if found is None or not found.exists():
+        what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
+        raise FileError(
+            path,
+            f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
+            "dataset folder with a rig.yaml, or a KITTI odometry sequence",
+        )
+    return found
+
+
+def find_rig_file(path: Path | str) -> Path | None:
+    """The path itself, or the rig file of a folder; None if a folder holds none."""
     folder = Path(path)
     if not folder.is_dir():
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it
         names = (RIG_FILE, CALIBRATION_FILE)
-    for name in (*names, CALIBRATION_NAME):
-        if (folder / name).is_file():
-            return folder / name
-    raise FileError(
-        folder, f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
-    )
+    paths = (folder / name for name in (*names, CALIBRATION_NAME))
+    return next((path for path in paths if path.is_file()), None)
+
+
+def require_replaceable_rig(path: Path, *, read: Path) -> None:
+    """Check that a rig file to write replaces nothing but another guess.
+
+    Args:
+        path: of the file.
+        read: the rig file that the command reads.
+
+    Raises:
+        FileError: if it is the file that is read, a reference, or no rig file.
+    """
+    require_not_read(path, [read])
+    if path.exists() and (path.name == REFERENCE_FILE or not _is_rig_file(path)):
+        raise FileError(path, "is a reference or no rig file, and would be replaced; choose "
+                        "another --out")  # fmt: skip
+
+
+def _is_rig_file(path: Path) -> bool:
+    try:
+        return read_yaml(path).get("format") == RIG_FORMAT
+    except FileError:
+        return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
@@ -13,18 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.files import write_yaml
+from calibgraph.files import sha256, write_yaml
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_covariance, relative_transform
+from calibgraph.model.result_files import (
+    CALIBRATION_FILE,
+    CALIBRATION_FORMAT,
+    CORRESPONDENCES_FILE,
+    VERDICT_KEY,
+    require_replaceable,
+)
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check, Verdict, rig_verdict
+from calibgraph.model.verdict import Verdict, rig_verdict
 
 Array = NDArray[np.float64]
-
-CALIBRATION_FORMAT = "calibgraph-calibration/1"
-CALIBRATION_FILE = "calibration.yaml"
-CORRESPONDENCES_FILE = "correspondences.parquet"
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
 TANGENT_SENTENCE = (
@@ -137,13 +140,18 @@ class Calibration:
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else degrees_and_centimetres(covariance)
 
-    def with_checks(self, checks: Mapping[str, Sequence[Check]]) -> Calibration:
-        """The same result with more checks per camera."""
-        verdicts = {
-            name: verdict.and_also(checks.get(name, ()))
-            for name, verdict in self.camera_verdicts.items()
-        }
-        return replace(self, camera_verdicts=verdicts)
+    def error_bar_holds(self, name: str) -> bool:
+        """Whether the covariance of a camera or pair "A->B" describes its error.
+
+        It is computed around the result, so that it means nothing where a verdict is FAIL.
+        """
+        pairs = {f"{a}->{b}": (a, b) for a, b in combinations(self.rig.cameras, 2)}
+        cameras = (name,) if name in self.rig.cameras else pairs[name]
+        return all(self.camera_verdicts[camera].status != "FAIL" for camera in cameras)
+
+    def error_bar(self, name: str) -> tuple[Array, Array] | None:
+        """The standard deviations of :meth:`sigmas` where they hold, else None."""
+        return self.sigmas(name) if self.error_bar_holds(name) else None
 
     @property
     def pair_covariance(self) -> dict[str, Array]:
@@ -169,15 +177,20 @@ class Calibration:
         """Write ``calibration.yaml``, and the correspondences if there are any, into a folder.
 
         Each file appears whole or not at all. Returns the path of the YAML file.
+
+        Raises:
+            FileError: if a file of these names is there that is not of a result.
         """
         path = Path(folder) / CALIBRATION_FILE
-        table = path.with_name(CORRESPONDENCES_FILE)
+        require_replaceable(path.parent)
+        table, table_hash = path.with_name(CORRESPONDENCES_FILE), None
         if self.correspondences is not None:
-            marked = {**self.correspondences.metadata, "verdict": self.verdict.status}
+            marked = {**self.correspondences.metadata, VERDICT_KEY: self.verdict.status}
             replace(self.correspondences, metadata=marked).save(table)
+            table_hash = sha256(table)
         else:
             table.unlink(missing_ok=True)  # an older result's
-        write_yaml(path, self._to_mapping())
+        write_yaml(path, {**self._to_mapping(), "correspondences_sha256": table_hash})
         return path
 
     def __repr__(self) -> str:
@@ -203,6 +216,10 @@ class Calibration:
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
+            "error_bar_holds": {
+                name: self.error_bar_holds(name)
+                for name in (*self.rig.cameras, *self.pair_covariance)
+            },
             "rig": self.rig.model_dump(),
             "covariance_of": TANGENT_SENTENCE,
             "covariance": dict(self.covariance),

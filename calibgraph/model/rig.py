@@ -26,8 +26,11 @@ from pydantic import (
 from calibgraph.errors import RigError
 from calibgraph.files import write_yaml
 from factors import Lens, LensModel
+from factors.lens import ORDERS
 
 Array = NDArray[np.float64]
+
+RIG_FORMAT: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
 
 ROUNDING = 1e-3
 """Largest deviation of R^T R from the identity that counts as rounded digits, not as an error."""
@@ -83,6 +86,28 @@ def _checked_name(name: str) -> str:
     return name
 
 
+_MODELS_OF_OTHERS: dict[str, LensModel] = {
+    "plumb_bob": "pinhole",
+    "radtan": "pinhole",
+    "rational_polynomial": "pinhole",
+    "equidistant": "fisheye",
+    "equi": "fisheye",
+    "kannala_brandt": "fisheye",
+}
+
+
+def _checked_model(name: Any) -> Any:
+    """The name of a lens model, as it is.
+
+    Raises:
+        ValueError: if it is the name that ROS or Kalibr give to one of ours.
+    """
+    ours = _MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
+    if ours is not None:
+        raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")
+    return name
+
+
 CameraName = Annotated[str, AfterValidator(_checked_name)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
@@ -106,7 +131,7 @@ class Intrinsics(_Model):
 class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference."""
 
-    model: LensModel = "pinhole"
+    model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
     width_px: Size
     height_px: Size
     intrinsics_px: Intrinsics
@@ -162,7 +187,7 @@ class RelativePose(_Model):
 class Rig(_Model):
     """A LiDAR and its cameras, in a fixed order."""
 
-    format: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
+    format: Literal["calibgraph-rig/1"] = RIG_FORMAT
     lidar: str = "lidar"
     cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
     relative_poses: tuple[RelativePose, ...] = ()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,6 +11,7 @@ Status = Literal["PASS", "WARN", "FAIL"]
 Direction = Literal["at most", "at least"]
 
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
+_LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,6 @@ class Verdict:
         failing = [check for check in self.checks if check.status != "PASS"]
         failing.sort(key=lambda check: -_ORDER.index(check.status))
         return tuple(check.text for check in failing)
-
-    def and_also(self, checks: Iterable[Check]) -> Verdict:
-        """The verdict with more checks."""
-        return Verdict((*self.checks, *checks))
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
@@ -168,6 +166,19 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
         text += f" is {side} {in_unit(limit, unit)}"
         text += f": {advice}" if advice else ""
     return Check(name, status, text, float(value), warn, fail, unit)
+
+
+def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
+    """Whether a value can lie beyond a limit.
+
+    Args:
+        limit: of the value.
+        unit: of the value; a count is not negative, a share of a score can be.
+        direction: "at most" or "at least": on which side of the limit PASS lies.
+    """
+    if direction == "at most":
+        return limit < _LARGEST.get(unit, math.inf)
+    return limit > 0 or unit == "share"
 
 
 def in_unit(value: float, unit: str, digits: int = 3) -> str:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from calibgraph.errors import FileError
 from calibgraph.model.calibration import Calibration
 
 
@@ -40,18 +44,52 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     }
 
 
-def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | None]:
-    """Standard deviations of a camera or a pair, about and along x, y, z."""
+def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | None]:
+    """Standard deviations of a camera or a pair, about and along x, y, z, and if they hold."""
     sigmas = result.sigmas(name)
     return {
+        "error_bar_holds": result.error_bar_holds(name),
         "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
         "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
     }
 
 
 def print_json(content: dict[str, Any]) -> None:
-    """Print one JSON document on stdout."""
-    print(json.dumps(finite(content), indent=2, allow_nan=False))
+    """Print one JSON document on stdout; a reader that has gone is no error."""
+    with suppress(BrokenPipeError):
+        print_line(json.dumps(finite(content), indent=2, allow_nan=False))
+
+
+def print_line(text: str) -> None:
+    """Print a line on stdout at once.
+
+    Raises:
+        BrokenPipeError: if the reader has closed the pipe.
+        FileError: if it cannot be written.
+    """
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        discard_stdout()
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise FileError("standard output", f"cannot be written to ({error}); restart") from error
+
+
+def require_stdout() -> None:
+    """Check, before hours of work, that there is a standard output.
+
+    Raises:
+        FileError: if it is closed.
+    """
+    if sys.stdout is None:
+        raise FileError("standard output", "is closed; give what is printed somewhere to go")
+
+
+def discard_stdout() -> None:
+    """Discard what else is written: Python would write it at its exit, and report the error."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def finite(value: Any) -> Any:

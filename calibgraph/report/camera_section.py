@@ -12,7 +12,7 @@ from calibgraph.model.calibration import Calibration, degrees_and_centimetres
 from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.verdict import Verdict
 from calibgraph.report import plots
-from calibgraph.report.check_table import CheckRow, check_row
+from calibgraph.report.check_table import CheckRow, check_rows
 from calibgraph.report.diagrams import Diagram, camera_diagrams
 from calibgraph.report.page_overlays import Overlays
 from calibgraph.report.reprojection_errors import BeforeAfter
@@ -78,7 +78,7 @@ class CameraSection:
     weaknesses: tuple[str, ...]
     prior_share: float
     moved: PoseError
-    has_sigmas: bool
+    no_error_bar: str  # why there is none; empty if there is one
     numbers: tuple[str, ...]
     overlays: Overlays | None
     overlay_width_px: int
@@ -112,11 +112,11 @@ def camera_section(
         name=name,
         anchor=f"camera-{index}",
         verdict=verdict,
-        rows=tuple(check_row(check) for check in verdict.checks),
+        rows=check_rows(verdict.checks),
         weaknesses=tuple(result.weaknesses.get(name, ())),
         prior_share=result.prior_share.get(name, 0.0),
         moved=moved,
-        has_sigmas=result.sigmas(name) is not None,
+        no_error_bar=_why_no_error_bar(result, name),
         numbers=_overview_cells(result, name, moved),
         overlays=overlays,
         overlay_width_px=round(_OVERLAY_HEIGHT_PX * camera.width_px / camera.height_px),
@@ -130,7 +130,7 @@ def camera_section(
 
 def _overview_cells(result: Calibration, name: str, moved: PoseError) -> tuple[str, ...]:
     """A camera's cells of the table on top: error bars, change, residuals, counts."""
-    sigmas, residuals = result.sigmas(name), result.residuals.get(name)
+    sigmas, residuals = result.error_bar(name), result.residuals.get(name)
     counts = result.counts.get(name, {})
     return (
         "-" if sigmas is None else f"{sigmas[0].max():.3f}",
@@ -145,8 +145,9 @@ def _overview_cells(result: Calibration, name: str, moved: PoseError) -> tuple[s
 
 
 def _axes(result: Calibration, name: str, moved: PoseError) -> tuple[Axis, ...]:
-    sigmas = _sigma_cells(result.covariance[name])
-    bootstrap = _sigma_cells(result.bootstrap.get(name))
+    holds = result.error_bar_holds(name)
+    sigmas = _sigma_cells(result.covariance[name] if holds else None)
+    bootstrap = _sigma_cells(result.bootstrap.get(name) if holds else None)
     return tuple(
         Axis(
             name=label,
@@ -156,6 +157,12 @@ def _axes(result: Calibration, name: str, moved: PoseError) -> tuple[Axis, ...]:
         )
         for row, (label, unit, key) in enumerate(_AXES)
     )
+
+
+def _why_no_error_bar(result: Calibration, name: str) -> str:
+    if not result.error_bar_holds(name):
+        return "since the verdict is FAIL"
+    return "too few frames" if result.sigmas(name) is None else ""
 
 
 def _sigma_cells(covariance: Array | None) -> list[str]:

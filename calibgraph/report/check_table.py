@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from calibgraph.model.verdict import Check, Verdict, in_unit
+from calibgraph.model.verdict import Check, Direction, Verdict, in_unit, is_reachable
 
 _ROUNDED_FROM = 1000  # three digits would need an exponent
+_WORST_FIRST = ("FAIL", "WARN", "PASS")
+_NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,15 @@ class Reason:
     text: str
 
 
+def check_rows(checks: Sequence[Check]) -> tuple[CheckRow, ...]:
+    """The rows of a camera's checks, the worst first."""
+    return tuple(check_row(check) for check in sorted(checks, key=_severity))
+
+
+def _severity(check: Check) -> int:
+    return _WORST_FIRST.index(check.status)
+
+
 def check_row(check: Check) -> CheckRow:
     """A check with its thresholds; their order gives the side on which values are bad."""
     if check.value is None:
@@ -37,14 +49,15 @@ def check_row(check: Check) -> CheckRow:
     found = _quantity(check.value, check.unit)
     if check.warn is None or check.fail is None:
         return CheckRow(check, found, "", "")
-    sign = "<" if check.warn > check.fail else ">"
-    unreachable = sign == "<" and check.fail <= 0
-    warn, fail = (_threshold(sign, limit, check.unit) for limit in (check.warn, check.fail))
-    return CheckRow(check, found, warn, "" if unreachable else fail)
+    side: Direction = "at least" if check.warn > check.fail else "at most"
+    warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
+    return CheckRow(check, found, warn, fail)
 
 
-def _threshold(sign: str, limit: float, unit: str) -> str:
-    return f"{sign} {_quantity(limit, unit)}" if math.isfinite(limit) else ""
+def _threshold(side: Direction, limit: float, unit: str) -> str:
+    """When a value is bad; empty if no value can be."""
+    sign = ">" if side == "at most" else "<"
+    return f"{sign} {_quantity(limit, unit)}" if is_reachable(limit, unit, side) else ""
 
 
 def _quantity(value: float, unit: str) -> str:
@@ -67,12 +80,18 @@ def group_reasons(
     for camera, verdict in verdicts.items():
         for check in verdict.checks:
             measured = check.value is not None and check.warn is not None
-            key = (check.status, check.name, check.unit, "" if measured else check.text)
+            key = (check.name, check.unit, "" if measured else _NUMBER.sub("", check.text))
             if check.status != "PASS":
                 alike.setdefault(key, {})[camera] = check
-    reasons = [Reason(key[0], ", ".join(each), _summary(each)) for key, each in alike.items()]
-    reasons.sort(key=lambda reason: ("FAIL", "WARN").index(reason.status))
+    reasons = [_reason(each) for each in alike.values()]
+    reasons.sort(key=lambda reason: _WORST_FIRST.index(reason.status))
     return [*reasons, *_group_sentences(weaknesses)]
+
+
+def _reason(checks: Mapping[str, Check]) -> Reason:
+    """The same check of several cameras, the worst first."""
+    ordered = dict(sorted(checks.items(), key=lambda item: _severity(item[1])))
+    return Reason(next(iter(ordered.values())).status, ", ".join(ordered), _summary(ordered))
 
 
 def _group_sentences(weaknesses: Mapping[str, Sequence[str]]) -> list[Reason]:
@@ -86,10 +105,27 @@ def _group_sentences(weaknesses: Mapping[str, Sequence[str]]) -> list[Reason]:
 def _summary(checks: Mapping[str, Check]) -> str:
     """The same check of several cameras in one sentence, with the advice of the first."""
     first = next(iter(checks.values()))
-    limit = first.fail if first.status == "FAIL" else first.warn
-    if len({check.text for check in checks.values()}) == 1 or limit is None:
-        return first.text
-    found = [f"{name} {_quantity(c.value or 0.0, c.unit)}" for name, c in checks.items()]
+    texts = [check.text for check in checks.values()]
+    if len(set(texts)) == 1 or first.warn is None:
+        return _merge_numbers(texts)
     advice = first.text.removeprefix(first.name).partition(": ")[2]
-    text = f"{first.name}: {', '.join(found)}; limit {_quantity(limit, first.unit)}"
+    text = f"{first.name}: {_values(checks)}"
     return f"{text}: {advice}" if advice else text
+
+
+def _values(checks: Mapping[str, Check]) -> str:
+    """The values of all cameras, by status, each with its limit."""
+    parts = []
+    for status in _WORST_FIRST:
+        of_status = {name: check for name, check in checks.items() if check.status == status}
+        for check in list(of_status.values())[:1]:
+            limit = (check.fail if status == "FAIL" else check.warn) or 0.0
+            found = [f"{n} {_quantity(c.value or 0.0, c.unit)}" for n, c in of_status.items()]
+            parts.append(f"{', '.join(found)} ({status}: limit {_quantity(limit, check.unit)})")
+    return "; ".join(parts)
+
+
+def _merge_numbers(texts: Sequence[str]) -> str:
+    """Sentences that differ in their numbers at most, as one with the numbers of all."""
+    parts = zip(*(_NUMBER.split(text) for text in texts), strict=True)
+    return "".join(", ".join(dict.fromkeys(part)) for part in parts)

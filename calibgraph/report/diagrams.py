@@ -42,7 +42,8 @@ def _residual_diagrams(
             "Residuals",
             plots.residual_scatter(after, sigma_px),
             "Projected less matched pixel, all frames. For a match on an edge, which is known "
-            "across the edge only, that component.",
+            "across the edge only, that component. The axes end at twice this camera's gate; "
+            "other cameras have other scales.",
         ),
         Diagram(
             "Residual against distance",
@@ -52,8 +53,8 @@ def _residual_diagrams(
         Diagram(
             "Residuals over the image",
             plots.residual_map(camera, after),
-            "Arrows point from match to projection. Random directions are noise; a pattern "
-            "hints at wrong intrinsics.",
+            "Arrows point from match to projection, at this camera's own scale. Random "
+            "directions are noise; a pattern hints at wrong intrinsics.",
         ),
     )
 
@@ -74,7 +75,7 @@ def _coverage_diagrams(camera: Camera, after: ReprojectionErrors) -> tuple[Diagr
 
 
 def _error_bar_diagrams(result: Calibration, name: str) -> tuple[Diagram, ...]:
-    sigmas = result.sigmas(name)
+    sigmas = result.error_bar(name)
     if sigmas is None:
         return ()
     bootstrap = result.bootstrap.get(name)

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import yaml
 from jinja2 import Environment, StrictUndefined
+from numpy.typing import NDArray
 
+from calibgraph.errors import FileError
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.report.camera_section import camera_section
 from calibgraph.report.check_table import group_reasons
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.reprojection_errors import errors_before_after
+
+Array = NDArray[np.float64]
+
+_GENERATOR = b'<meta name="generator" content="calibgraph">'
+_HEAD_BYTES = 1000
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
@@ -44,6 +53,17 @@ def write_report(result: Calibration, path: Path | str) -> Path:
     return path
 
 
+def require_replaceable_page(path: Path) -> None:
+    """Check that a page to write replaces nothing but such a page.
+
+    Raises:
+        FileError: if it does.
+    """
+    if path.is_file() and _GENERATOR not in path.read_bytes()[:_HEAD_BYTES]:
+        message = "is not a report, and would be replaced; choose another --out"
+        raise FileError(path, message)
+
+
 def report_html(result: Calibration) -> str:
     """The page as text; see :func:`write_report`."""
     errors = errors_before_after(result)
@@ -63,7 +83,7 @@ def report_html(result: Calibration) -> str:
         cameras=cameras,
         usable=_CAN_I_USE_IT[result.verdict.status],
         accuracy=_accuracy(result),
-        pairs={name: result.sigmas(name) for name in result.pair_covariance},
+        pairs={name: result.error_bar(name) for name in result.pair_covariance},
         reasons=group_reasons(verdicts, weaknesses),
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
@@ -74,16 +94,25 @@ def report_html(result: Calibration) -> str:
 
 
 def _accuracy(result: Calibration) -> str:
-    """The largest standard deviations over all cameras, in a sentence."""
-    sigmas = {name: result.sigmas(name) for name in result.rig.cameras}
-    known = {name: both for name, both in sigmas.items() if both is not None}
-    if not known:
-        return "Unknown: too few frames for an error bar."
+    """The largest standard deviations over all cameras, and where there are none, in sentences."""
+    bars = {name: result.error_bar(name) for name in result.rig.cameras}
+    known = {name: both for name, both in bars.items() if both is not None}
+    failed = [name for name in bars if not result.error_bar_holds(name)]
+    few = [name for name in bars if name not in known and name not in failed]
+    sentences = [_worst_axes(known)] if known else []
+    for names, why in (
+        (failed, "FAIL, an error bar would not hold"),
+        (few, "too few frames for an error bar"),
+    ):
+        of_some = f" for {', '.join(names)}" if len(names) < len(bars) else ""
+        sentences += [f"Unknown{of_some}: {why}."] if names else []
+    return " ".join(sentences)
+
+
+def _worst_axes(known: Mapping[str, tuple[Array, Array]]) -> str:
     rotation = max(known, key=lambda name: float(known[name][0].max()))
     translation = max(known, key=lambda name: float(known[name][1].max()))
-    text = (
+    return (
         f"Worst axis of any camera: {known[rotation][0].max():.3f} deg ({rotation}) and "
         f"{known[translation][1].max():.2f} cm ({translation}), one standard deviation."
     )
-    unknown = [name for name in sigmas if name not in known]
-    return f"{text} Unknown for {', '.join(unknown)}: too few frames." if unknown else text

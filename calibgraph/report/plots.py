@@ -166,7 +166,7 @@ def _bars(axes: Axes, sigma: Array, other: Array | None) -> None:
 def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
     """Change of the extrinsic in each round of matching, and its number of matches."""
     figure = new_figure(3.1)
-    moved = figure.add_axes((0.15, 0.46, 0.82, 0.51))
+    moved = figure.add_axes((0.15, 0.46, 0.82, 0.45))
     matches = figure.add_axes((0.15, 0.14, 0.82, 0.24), sharex=moved)
     numbers = np.arange(1, len(rounds) + 1)
     for key, style, colour, label in (
@@ -177,7 +177,8 @@ def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
         moved.plot(numbers, values, style, color=colour, markersize=4, label=label)
     moved.set_yscale("log")
     moved.tick_params(labelbottom=False)
-    add_legend(moved, markerscale=1)
+    # Above the axes: inside, it would cover points.
+    add_legend(moved, markerscale=1, loc="lower center", bbox_to_anchor=(0.5, 0.99), ncols=2)
     matches.bar(numbers, [r["matches"] for r in rounds], color="0.6", width=0.6)
     matches.set(xlabel="round of matching", ylabel="matches")
     matches.set_xticks(numbers)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +16,7 @@ from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
+from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
@@ -64,8 +63,7 @@ def track(
     Raises:
         CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
     """
-    if sys.stdout is None:
-        raise FileError("standard output", "is closed; give the updates somewhere to go")
+    require_stdout()
     history = History()
     with _stopped_by_signals() as stop:
         items, calibrator = _opened(settings, source, stop, notify)
@@ -76,7 +74,7 @@ def track(
                 history,
                 every=settings.every if settings.matcher is None else 1,
                 stop=stop,
-                write=_write_line,
+                write=print_line,
                 notify=notify,
             )
             if calibrator.tracker.frame is None and not stop():
@@ -164,21 +162,3 @@ def _stopped_by_signals() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(received)
     finally:
         restore()
-
-
-def _write_line(line: str) -> None:
-    """Print a line at once.
-
-    Raises:
-        BrokenPipeError: if the reader has closed the pipe.
-        FileError: if it cannot be written.
-    """
-    try:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        # Otherwise Python writes the rest at its exit, and reports the error again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):
-            raise
-        raise FileError("standard output", f"cannot be written to ({error}); restart") from error

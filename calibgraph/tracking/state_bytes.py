@@ -55,6 +55,11 @@ _DATACLASSES: dict[str, type] = {
                  EpochSummary, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
                  ProjectionBlock)
 }  # fmt: skip
+_DECODING_ERRORS = (
+    ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError, EOFError,
+    NotImplementedError, RecursionError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What JSON, zipfile, numpy and the constructors of values raise on damaged bytes."""
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
 
@@ -95,9 +100,7 @@ def decode(data: bytes) -> Any:
         return _decode(data)
     except StateError:
         raise
-    except (ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError) as error:
-        raise StateError(f"is not a tracker's state ({error!r})") from error
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RecursionError) as error:
+    except _DECODING_ERRORS as error:
         raise StateError(f"is not a tracker's state ({error!r})") from error
 
 

@@ -82,9 +82,12 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
-    """Whether a convention error in the guess explains a failure, if there is time to find out."""
+    """Whether a convention error in the guess explains a failure.
+
+    It takes seconds, so that a time limit that has passed does not prevent it.
+    """
     failed = any(check.status == "FAIL" for each in checks.values() for check in each)
-    if not failed or evidence.run.out_of_time:
+    if not failed:
         return {}
     error = likely_intended_guess(evidence.run.dataset, evidence.run.guess)
     if error is None:

@@ -55,7 +55,8 @@ def restart_checks(evidence: Evidence) -> Checks:
         return {}
     solution = evidence.solution
     ends = [_solve_from_displaced_start(solution, seed) for seed in range(RESTARTS)]
-    name = f"after starts {RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off, the solution differs by"
+    starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
+    name = f"solving again from starts {starts}: largest difference"
     checks = {}
     for camera in evidence.fitted_blocks:
         differences = [

@@ -72,8 +72,9 @@ def check_images(
         name: (*pairing_checks(found), *offset_checks(offsets.get(name)))
         for name, found in evidence.items()
     }
+    names = {frame.index: frame.name for frame in dataset.frames}
     return {
-        name: (*evidence_checks(found), *of_time[name], *_clouds_checks(name, of_time))
+        name: (*evidence_checks(found, names), *of_time[name], *_clouds_checks(name, of_time))
         for name, found in evidence.items()
     }
 
@@ -90,8 +91,13 @@ def _clouds_checks(camera: str, of_time: Mapping[str, Sequence[Check]]) -> list[
     ]
 
 
-def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """The checks of one camera's extrinsic and lens by the image evidence."""
+def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Check, ...]:
+    """The checks of one camera's extrinsic and lens by the image evidence.
+
+    Args:
+        found: the evidence.
+        names: of the frames, by number.
+    """
     if math.isnan(found.displaced_z_score):
         text = (
             f"the images could not be checked: only {found.groups} places with structure in both "
@@ -99,7 +105,7 @@ def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
         )
         return (Check("image evidence", "WARN", text, found.groups),)
     displaced = threshold("displaced_z_score").check(found.displaced_z_score)
-    frames = _check_frames(found)
+    frames = _check_frames(found, names)
     mispaired = found.frames_best <= threshold("frames_best").fail
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
         return displaced, frames  # at a wrong extrinsic the lens cannot be measured
@@ -107,8 +113,9 @@ def evidence_checks(found: ImageEvidence) -> tuple[Check, ...]:
     return displaced, frames, *lens, *_gain_checks(found, lens)
 
 
-def _check_frames(found: ImageEvidence) -> Check:
-    lost = ", ".join(map(str, found.frames_lost[:5])) + (", ..." if found.frames_lost[5:] else "")
+def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
+    numbers = found.frames_lost
+    lost = ", ".join(f"{n} ({names[n]})" for n in numbers[:5]) + (", ..." if numbers[5:] else "")
     advice = (
         f"frames {lost} have higher scores at displaced extrinsics; do their images and clouds "
         "belong together?"

@@ -16,29 +16,31 @@ from calibgraph.trust.thresholds import threshold
 def matcher_checks(evidence: Evidence) -> Checks:
     """The checks of every camera's matches.
 
-    The error that all frames share is part of the error bar; it is checked where there is none.
+    The error that all frames share is part of the error bar, with which it is checked; where there
+    is no error bar it is checked alone.
     """
     findings = evidence.findings
-    alone = evidence.joint_covariance is None
-    shared_sigmas = findings.systematic_sigmas if alone else (0.0, 0.0)
+    shared_sigmas = findings.systematic_sigmas if evidence.joint_covariance is None else None
     return {name: check_findings(findings, name, shared_sigmas) for name in evidence.cameras}
 
 
 def check_findings(
-    findings: MatcherFindings, camera: str, shared_sigmas: tuple[float, float] = (0.0, 0.0)
+    findings: MatcherFindings, camera: str, shared_sigmas: tuple[float, float] | None = None
 ) -> list[Check]:
     """The checks of one camera's matches.
 
     Args:
         findings: of the matcher.
         camera: whose.
-        shared_sigmas: rotation [rad], translation [m] of the error that all its frames share.
+        shared_sigmas: rotation [rad], translation [m] of the error that all its frames share; None
+            where the error bar holds it.
     """
     z_score = findings.z_score.get(camera)
+    shared = None if shared_sigmas is None else np.repeat(shared_sigmas, 3)
     return [
         *_search_checks(findings, camera),
         *_share_checks(findings, camera),
-        *check_sigmas("error that the matcher's frames share", np.repeat(shared_sigmas, 3)),
+        *check_sigmas("error that the matcher's frames share", shared),
         *([] if z_score is None else [threshold("z_score").check(z_score)]),
     ]
 

@@ -64,14 +64,14 @@ def compare_ends(rematch: Rematch | None) -> Checks:
     """Per camera, the difference between the two ends; nothing if there is only one."""
     if rematch is None:
         return {}
-    start = f"matching again from {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
+    start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
     if rematch.again is None:
         check = Check("matching again", "FAIL", f"{start} failed: {rematch.failure}")
         return {name: [check] for name in rematch.first.cameras}
     again, checks = rematch.again.T_camera_lidar, {}
     for name, T in rematch.first.T_camera_lidar.items():
         degrees, centimetres = pose_difference(T, again[name])
-        words = f"{start}, the result differs by"
+        words = f"{start}: difference"
         checks[name] = [
             threshold("rematch_rotation").check(degrees, name=words),
             threshold("rematch_translation").check(centimetres, name=words),

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from calibgraph.model.verdict import Threshold, in_unit
+from calibgraph.model.verdict import Threshold, in_unit, is_reachable
 from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR
 
 _COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."
@@ -122,7 +122,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               5.0, 10.0, "cm",
               "The same, how far would they move it?",
               "Right intrinsics, recorded and rendered: up to 1.4 cm (4.2 sigma)."),
-    Threshold("focal_sensitivity", "a focal length wrong by 1 % would move the camera by",
+    Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances"),
     # the rounds of matching
@@ -237,7 +237,6 @@ LIMITS: tuple[Limit, ...] = (
 
 _ROWS = {row.key: row for row in THRESHOLDS}
 _LIMITS = {row.key: row for row in LIMITS}
-_LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be: a limit from there on never fails
 
 
 def threshold(key: str) -> Threshold:
@@ -267,15 +266,11 @@ def thresholds_markdown() -> str:
 def _line(row: Threshold) -> str:
     beyond = "above" if row.direction == "at most" else "below"
     passes = f"{row.direction} {in_unit(row.warn, row.unit, digits=4)}"
-    fails = "never" if _never_fails(row) else f"{beyond} {in_unit(row.fail, row.unit, digits=4)}"
+    fails = "never"
+    if is_reachable(row.fail, row.unit, row.direction):
+        fails = f"{beyond} {in_unit(row.fail, row.unit, digits=4)}"
     cells = (f"`{row.key}`", row.question, row.name, passes, fails, row.reason)
     return f"| {' | '.join(cells)} |"
-
-
-def _never_fails(row: Threshold) -> bool:
-    if row.direction == "at most":
-        return row.fail >= _LARGEST.get(row.unit, math.inf)
-    return row.unit != "share" and row.fail <= 0
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ def test_bad_rigs_and_tables_are_one_line(problem: Path, call: Call) -> None:
     (problem / "half.parquet").write_bytes(table.read_bytes()[:1000])
     (problem / "bad.yaml").write_text("format: calibgraph-rig/1\ncameras: {a: {fov: 3}}\n")
     (problem / "config.yaml").write_text("preset: kitti\nlambda: 3\n")
+    (problem / "empty").mkdir()
     (problem / "negative.yaml").write_text("gate_px: -1\n")
     cases: dict[str, tuple[object, ...]] = {
         "no such file": ("solve", problem / "nothing.yaml", table),
@@ -33,6 +34,10 @@ def test_bad_rigs_and_tables_are_one_line(problem: Path, call: Call) -> None:
         "exclude each other": (
             "solve", rig, table, "--preset", "kitti", "--config", problem / "config.yaml",
         ),
+        "nothing.yaml: no such file or folder; name a rig file": (
+            "evaluate", problem / "nothing.yaml", rig,
+        ),
+        "name a rig file, a result": ("evaluate", problem / "empty", rig),
         "not in the reference": ("evaluate", rig, SAMPLE / "reference.yaml"),
         "unknown matcher 'magic'": ("calibrate", SAMPLE, "--matcher", "magic"),
         "no such folder": ("calibrate", problem / "nothing"),
@@ -95,6 +100,20 @@ def test_an_unwritable_folder_is_one_line(problem: Path, call: Call) -> None:
 )
 def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -> None:
     error_line(*call(*arguments))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (("calibrate", SAMPLE, "--colour", "red"), "see calibgraph calibrate --help"),
+        (("bench", "paper"), "see calibgraph bench paper --help"),
+        (("guess", SAMPLE), "see calibgraph --help"),
+    ],
+)
+def test_a_wrong_call_leads_to_the_help_of_its_command(
+    arguments: tuple[object, ...], hint: str, call: Call
+) -> None:
+    assert error_line(*call(*arguments)).endswith(f"; {hint}\n")
 
 
 def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None:

@@ -47,6 +47,10 @@ def test_options_of_the_other_matcher_are_refused() -> None:
         matcher_from("structure", None, seed=0, iterations=3)
     with pytest.raises(ValueError, match="--weights is for --matcher cmrnext only"):
         matcher_from("structure", [Path("a.tar")], seed=0)
+    with pytest.raises(ValueError, match="--device is for --matcher cmrnext only"):
+        matcher_from("structure", None, seed=0, device="cpu")
+    with pytest.raises(ValueError, match="needs weights"):
+        matcher_from("cmrnext", None, seed=0, device="cpu")
     with pytest.raises(ValueError, match="--search-m is for --matcher structure only"):
         matcher_from("table.csv", None, seed=0, search_m="1")
     with pytest.raises(ValueError, match="--search-deg few: give a number, or none"):

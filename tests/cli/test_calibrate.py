@@ -92,7 +92,13 @@ def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, ca
     code, _, stderr = call("solve", problem / "rig.yaml", problem / "bad.parquet", "--out", out)
     assert code == 1
     assert "FAIL" in stderr
-    assert load_calibration(out).verdict.status == "FAIL"
+    result = load_calibration(out)
+    assert result.verdict.status == "FAIL"
+    assert [line.split()[1:] for line in stderr.splitlines() if line.startswith(" left->")] == [
+        ["unknown:", "FAIL"]
+    ]
+    content = yaml.safe_load((out / "calibration.yaml").read_text())
+    assert content["error_bar_holds"]["left->right"] is False
 
 
 def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:

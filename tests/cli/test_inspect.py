@@ -56,7 +56,7 @@ def test_results_that_cannot_be_reported_are_one_line(
         "no such file": (tmp_path / "nothing",),
         "calibration.yaml: no such file": (SAMPLE,),
         "no such folder": (tmp_path / "sample", "--dataset", tmp_path / "nothing"),
-        "is not in the rig": (strange,),
+        "is not the table of": (strange,),
         "it was edited": (edit(sample, tmp_path / "verdict"),),
         "its counts are not of the cameras": (edit(sample, tmp_path / "counts"),),
     }

@@ -31,6 +31,8 @@ def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: 
     assert line.count("\n") == 1
     converted = tmp_path / "good.safetensors"
     assert call("weights", weights, "--out", converted)[0] == 0
+    code, _, line = call("weights", converted, "--out", converted)
+    assert code == 2 and "is read by this command" in line
     described = json.loads(call("weights", converted, "--json")[1])
     assert described["network"]["fourier_levels"] == 12
     assert described["config"]["max_r"] == 1.0

@@ -30,11 +30,48 @@ def test_missing_folders_are_named(sample: Path, tmp_path: Path) -> None:
         load_dataset(tmp_path / "nothing")
     shutil.rmtree(sample / "cameras" / "left")
     with pytest.raises(
-        FileError, match=r"no images of the rig's camera 'left'; it has front_left, front_right"
+        FileError,
+        match=r"no images of the rig's camera 'left'; it has front_left, front_right: give .* the "
+        "same name, or remove the camera",
     ):
         load_dataset(sample)
-    shutil.rmtree(sample / "lidar")
-    with pytest.raises(FileError, match="lidar"):
+    (sample / "lidar").rename(sample / "velodyne")
+    with pytest.raises(
+        FileError, match=r"lidar: no such folder; put the files \(\.npy.*folders cameras, velodyne"
+    ):
+        load_dataset(sample)
+
+
+def test_an_empty_folder_is_told_what_it_lacks(sample: Path) -> None:
+    for path in (sample / "lidar").iterdir():
+        path.rename(path.with_suffix(".las"))
+    with pytest.raises(FileError, match=r"no file of a known kind; write or convert to \.npy"):
+        load_dataset(sample)
+
+
+def test_frames_that_are_not_chosen_may_lack_images(sample: Path) -> None:
+    (sample / "cameras" / "left" / "000003.jpg").unlink()
+    (sample / "lidar" / "000005.npy").unlink()
+    data = load_dataset(sample, frames="0,2,4")
+    assert [frame.name for frame in data.frames] == ["000000", "000002", "000004"]
+    assert data.neighbour(data.frames[1], 1) is None  # 000003 is not complete
+    assert data.neighbour(data.frames[0], 1).name == "000001"
+    with pytest.raises(DatasetError, match="'000003' has a cloud but no image of camera 'left'"):
+        load_dataset(sample, frames="2:4")
+
+
+def test_the_number_of_lonely_files_is_named_if_there_are_more(sample: Path) -> None:
+    (sample / "cameras" / "left" / "000003.jpg").unlink()
+    with pytest.raises(DatasetError, match=r"camera 'left'; give both"):
+        load_dataset(sample)
+    (sample / "cameras" / "left" / "000004.jpg").unlink()
+    with pytest.raises(DatasetError, match=r"camera 'left', and 1 more do not pair up; give both"):
+        load_dataset(sample)
+
+
+def test_names_that_are_not_utf8_are_refused(sample: Path) -> None:
+    (sample / "lidar" / "000000.npy").rename(sample / "lidar" / "\udcff.npy")
+    with pytest.raises(FileError, match="not UTF-8; rename it"):
         load_dataset(sample)
 
 

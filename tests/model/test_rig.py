@@ -67,7 +67,16 @@ BAD = {
     "not a rotation": ({"T_camera_lidar": (2 * np.eye(4)).tolist()}, r"last row"),
     "scaled": ({"T_camera_lidar": np.diag([2.0, 2, 2, 1]).tolist()}, r"not a rotation"),
     "mirrored": ({"T_camera_lidar": turned(np.eye(4))}, r"determinant -1"),
-    "distortion": ({"distortion": [0.1, 0.2]}, r"2 distortion coefficients"),
+    "distortion": (
+        {"distortion": [0.1, 0.2]},
+        r"2 distortion coefficients found, expected 0, 4, 5, 8: .*\[k1, k2, p1, p2, k3\]",
+    ),
+    "lens of ROS": ({"model": "plumb_bob"}, r"called 'pinhole' here; .*k1, k2, p1, p2"),
+    "lens of Kalibr": (
+        {"model": "equidistant"},
+        r"called 'fisheye' here; its distortion is \[k1, k2, k3, k4\]",
+    ),
+    "unknown lens": ({"model": "omni"}, r"'pinhole' or 'fisheye', found 'omni'"),
     "fisheye without": ({"model": "fisheye", "distortion": []}, r"0 distortion"),
     "size": ({"width_px": 0}, r"width_px"),
 }
@@ -83,11 +92,18 @@ def test_a_bad_rig_file_is_refused_in_one_line(case: str, pair: Rig, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
+def test_a_rig_file_without_a_format_is_refused(pair: Rig, tmp_path: Path) -> None:
+    path = written(pair, tmp_path)
+    path.write_text(path.read_text().replace("format: calibgraph-rig/1\n", ""))
+    with pytest.raises(FileError, match="add the line `format: calibgraph-rig/1`"):
+        load_rig(path)
+
+
 def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
     T = pair.T_camera_lidar["left"].tolist()
     path = tmp_path / "rig.yaml"
     path.write_text(
-        "cameras:\n"
+        "format: calibgraph-rig/1\ncameras:\n"
         "  a: &a {width_px: 640, height_px: 480, intrinsics_px: {fx: 500, fy: 500, cx: 320, cy: 9}"
         f", T_camera_lidar: {T}}}\n"
         "  b: {<<: *a, width_px: 320}\n"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import perturb
+from calibgraph import Calibration, perturb
 from tests.conftest import CommandRun
 from tests.report.conftest import write_page
 
@@ -88,3 +88,22 @@ def test_real_recordings_are_reported(realdata: Path, name: str, tmp_path: Path)
     assert text.count("data:image/jpeg") == 4 * len(result.rig.cameras)
     rendering = render(tmp_path / "report.html", tmp_path)
     assert (rendering.errors, rendering.requests) == ([], [])
+
+
+def test_the_knob_of_the_slider_is_above_the_line(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    """The way of a knob 16 px wide is the width of the picture."""
+    script = """<script>addEventListener("load", () => {
+      const box = document.querySelector(".overlays");
+      const way = box.querySelector("input[type=range]").getBoundingClientRect();
+      const picture = box.querySelector(".pair").getBoundingClientRect();
+      document.title = [way.left + 8 - picture.left, way.right - 8 - picture.right].join(" ");
+    });</script>"""
+    page = tmp_path / "page.html"
+    page.write_text(write_page(sample_result, tmp_path).replace("</body>", f"{script}</body>"))
+    command = [browser(), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1280,2000",
+               f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]  # fmt: skip
+    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    (title,) = re.findall(r"<title>([^<]*)</title>", dom)
+    assert [abs(float(number)) < 0.5 for number in title.split()] == [True, True]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import calibgraph
-from calibgraph import Calibration, Rig, simulate_correspondences
+from calibgraph import Calibration, Check, Rig, Verdict, simulate_correspondences
 from tests.conftest import ROOT, make_camera, stereo_relative_pose
 from tests.report.conftest import solve_simulated, write_page
 
@@ -58,6 +58,19 @@ def test_a_failure_is_marked_prominently(pair: Rig, tmp_path: Path) -> None:
     assert 'class="verdict FAIL"' in text
     for reason in result.camera_verdicts["left"].reasons:
         assert reason.split(":")[0] in text
+
+
+def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_path: Path) -> None:
+    failed = Verdict((Check("search", "FAIL", "not found"),))
+    result = replace(solved_pair, camera_verdicts={**solved_pair.camera_verdicts, "left": failed})
+    text = write_page(result, tmp_path)
+    assert "Unknown for left: FAIL, an error bar would not hold." in text
+    assert "(right), one standard deviation" in text
+    assert "Error bar per axis: unknown, since the verdict is FAIL" in text
+    assert "unknown: the verdict of a camera is FAIL" in text  # of left->right
+    assert text.count('alt="Error bars of ') == 1
+    assert result.error_bar("left") is None and result.error_bar("right") is not None
+    assert result.error_bar("left->right") is None and result.sigmas("left") is not None
 
 
 def test_too_few_frames_for_an_error_bar_are_reported(pair: Rig, tmp_path: Path) -> None:

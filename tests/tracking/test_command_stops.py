@@ -93,7 +93,7 @@ def test_a_second_signal_ends_it_at_once_and_loses_nothing(
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
     try:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(command, "_write_line", write)
+            patch.setattr(command, "print_line", write)
             patch.setattr(sys, "stdin", SimpleNamespace(buffer=lines))
             track(wanted, [Path("-")], notify=print)
     finally:
@@ -117,7 +117,7 @@ def test_a_growing_folder_is_followed_until_a_signal(
         elif len(given) % 7 == 0:
             concatenate(world.tables[7:]).save(folder / "2.parquet")
 
-    monkeypatch.setattr(command, "_write_line", write)
+    monkeypatch.setattr(command, "print_line", write)
     concatenate(world.tables[:7]).save(folder / "1.parquet")
     code, _, _ = call("track", world.rig, folder, "--follow", "--out", tmp_path / "out")
     assert code == 0 and given == world.lines

@@ -88,7 +88,7 @@ def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
                 raise Crashed
             given.append(line)
 
-        monkeypatch.setattr(command, "_write_line", write)
+        monkeypatch.setattr(command, "print_line", write)
         wanted = Tracking(rig=recorded.rig, config=Config(), out=out, matcher=matcher)
         try:
             track(wanted, recorded.folders, notify=messages.append)

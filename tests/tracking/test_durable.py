@@ -242,7 +242,7 @@ def test_after_a_crash_the_last_line_comes_again(
         given.append(line)
 
     with monkeypatch.context() as patch:
-        patch.setattr(command, "_write_line", write)
+        patch.setattr(command, "print_line", write)
         with pytest.raises(Crashed):
             call("track", world.rig, world.source, "--out", tmp_path)
     code, out, err = call("track", world.rig, world.source, "--out", tmp_path)

@@ -18,6 +18,8 @@ from tests.conftest import SAMPLE
 
 NAME = "front_left"
 
+NAMES = {n: f"{n:06}" for n in range(6)}
+
 
 @pytest.fixture(scope="module")
 def truth() -> Rig:
@@ -47,7 +49,7 @@ def with_clouds_of(dataset: Dataset, order: list[int]) -> Dataset:
 
 
 def statuses(found: ImageEvidence) -> dict[str, str]:
-    checks = (*evidence_checks(found), *pairing_checks(found))
+    checks = (*evidence_checks(found, NAMES), *pairing_checks(found))
     return {check.name: check.status for check in checks}
 
 
@@ -102,3 +104,9 @@ def test_a_camera_without_structure_gets_a_warning(
     checks = check_images(replace(dataset, frames=frames), truth, empty)[NAME]
     assert [check.status for check in checks] == ["WARN"]
     assert "structure in both image and cloud" in checks[0].text
+
+
+def test_frames_are_named_by_number_and_file() -> None:
+    found = ImageEvidence(100, displaced_z_score=5.0, frames_best=0.5, frames_lost=(3, 5))
+    (check,) = (c for c in evidence_checks(found, NAMES) if c.value == 0.5)
+    assert "frames 3 (000003), 5 (000005) have higher scores" in check.text

@@ -59,7 +59,7 @@ def test_a_shifted_principal_point_is_a_warning(pair: Rig) -> None:
 def test_matches_at_far_points_alone_depend_on_the_focal_length(pair: Rig) -> None:
     far = solve(pair, simulated(pair, depth_m=(40.0, 80.0)))
     near = solve(pair, simulated(pair))
-    words = "focal length wrong by 1 %"
+    words = "per 1 % of the focal length"
     assert named(near, "left", words)[0].status == "PASS"
     assert named(far, "left", words)[0].status == "WARN"
 
@@ -76,5 +76,5 @@ def test_a_wall_hides_a_wrong_focal_length_which_is_a_warning(pair: Rig) -> None
         camera="left", frame=table.frame, pixels_px=table.pixels_px, points_lidar_m=wall
     )
     result = solve(rig, flat)
-    (check,) = named(result, "left", "focal length wrong by 1 %")
+    (check,) = named(result, "left", "per 1 % of the focal length")
     assert check.status == "WARN" and check.value == pytest.approx(20.0, rel=0.02)

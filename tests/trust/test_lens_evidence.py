@@ -24,6 +24,8 @@ from tests.conftest import KANNALA, RADTAN5, SAMPLE, make_camera, points_in_fron
 NAME = "front_left"
 LENS_CHECKS = ("focal length", "radial distortion", "principal point")
 
+NAMES = {n: f"{n:06}" for n in range(6)}
+
 
 @pytest.fixture(scope="module")
 def truth() -> Camera:
@@ -49,7 +51,7 @@ def statuses(lens: LensEvidence) -> dict[str, str]:
         displaced_z_score=5.0,
         frames_best=1.0,
     )
-    return {check.name: check.status for check in evidence_checks(found)}
+    return {check.name: check.status for check in evidence_checks(found, NAMES)}
 
 
 @pytest.mark.parametrize(

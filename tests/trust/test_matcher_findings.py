@@ -60,3 +60,10 @@ def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:
         assert verdict.status == "FAIL"
         rotations = [text for text in verdict.reasons if "rotation" in text]
         assert len(rotations) == 1 and rotations[0].startswith(reason)
+
+
+def test_an_error_that_is_in_the_error_bar_is_not_listed_as_zero(pair: Rig) -> None:
+    table = calibgraph.simulate_correspondences(pair, frames=8, matches=200)
+    with_error = replace(table, metadata={"systematic_rotation_rad": 0.001})
+    verdict = calibgraph.solve(pair, with_error).camera_verdicts["left"]
+    assert not [check.name for check in verdict.checks if "frames share" in check.name]

@@ -25,6 +25,7 @@ from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.matching.cmrnext.training.settings import (
     TrainSettings,
     adopt_architecture,
+    load_settings,
     settings_of,
     to_config,
 )
@@ -148,6 +149,7 @@ def start_run(
     if out.suffix.lower() not in TORCH_SUFFIXES:
         raise FileError(out, f"the weights' name must end in one of {', '.join(TORCH_SUFFIXES)}")
     require_place_for_file(out)
+    _require_replaceable_settings(out.with_suffix(SETTINGS_SUFFIX))
     if start is None:
         run = TrainingRun(settings, device)
     else:
@@ -156,6 +158,16 @@ def start_run(
         run.network.load_state_dict(checkpoint.state)
     run.settings.save(out.with_suffix(SETTINGS_SUFFIX))
     return run
+
+
+def _require_replaceable_settings(path: Path) -> None:
+    """Check that a file, if it is there, is one of settings, as of a training that was stopped."""
+    try:
+        if path.exists():
+            load_settings(path)
+    except FileError:
+        message = "is no file of settings, and would be replaced; choose another --out"
+        raise FileError(path, message) from None
 
 
 def resume_run(out: Path, device: str) -> TrainingRun:

@@ -1,0 +1,99 @@
+"""The options of matching, which ``calibrate`` and ``match`` share."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+from calibgraph.cli.arguments import dataset_from, matcher_from
+from calibgraph.cli.options import (
+    BatchOption,
+    DeviceOption,
+    EstimateOption,
+    FramesOption,
+    HalfOption,
+    IterationsOption,
+    MatcherOption,
+    OcclusionOption,
+    RigOption,
+    SearchDegOption,
+    SearchMetresOption,
+    TimeLimitOption,
+    WeightsOption,
+)
+
+if TYPE_CHECKING:
+    from calibgraph.io.dataset import Dataset
+    from calibgraph.matching.protocol import Matcher
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """Which frames are matched from which guess, and how; a field per option."""
+
+    rig: RigOption = None
+    matcher: MatcherOption = "structure"
+    frames: FramesOption = None
+    time_limit_s: TimeLimitOption = None
+    search_deg: SearchDegOption = None
+    search_m: SearchMetresOption = None
+    weights: WeightsOption = None
+    estimate: EstimateOption = None
+    device: DeviceOption = None
+    iterations: IterationsOption = None
+    half_resolution: HalfOption = None
+    occlusion_filter: OcclusionOption = None
+    batch: BatchOption = None
+
+    def find_matcher(self, *, seed: int) -> Matcher:
+        """The matcher; see :func:`calibgraph.cli.arguments.matcher_from`."""
+        own = ("rig", "matcher", "frames", "time_limit_s", "weights")
+        others = {name: value for name, value in vars(self).items() if name not in own}
+        return matcher_from(
+            self.matcher, self.weights, seed=seed, all_frames=self.frames is not None, **others
+        )
+
+    def load_dataset(self, folders: list[Path]) -> Dataset:
+        """The chosen frames of these folders."""
+        return dataset_from(folders, self.rig, self.frames)
+
+    def files_read(self, folders: list[Path]) -> list[Path]:
+        """The files that matching reads and a result might replace: rigs, a table, weights."""
+        from calibgraph.io.rigs import find_rig_file
+
+        rigs = [find_rig_file(path) for path in ([self.rig] if self.rig else folders)]
+        return [path for path in (*rigs, Path(self.matcher), *(self.weights or ())) if path]
+
+
+def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``.
+
+    Args:
+        command: a function for typer, one of whose parameters has this name.
+    """
+    hints = get_type_hints(MatchingOptions, include_extras=True)
+    names = [field.name for field in fields(MatchingOptions)]
+    options = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(MatchingOptions)
+    ]  # fmt: skip
+
+    @wraps(command)
+    def run(**values: Any) -> None:
+        matching = MatchingOptions(**{name: values.pop(name) for name in names})
+        command(**values, matching=matching)
+
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        parameters += options if parameter.name == "matching" else [keyword]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run

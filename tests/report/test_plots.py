@@ -1,0 +1,25 @@
+"""The diagrams of one camera."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+
+from calibgraph.report import plots
+
+
+def test_the_legend_of_the_convergence_covers_no_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(plots, "to_data_uri", lambda figure: drawn.append(figure) or "")
+    still = {"moved_deg": 1e-3, "moved_cm": 5.0, "matches": 100}  # the upper curve ends on top
+    plots.convergence([{**still, "moved_deg": 1e-2}, still, still])
+    (figure,) = drawn
+    figure.canvas.draw()
+    axes, legend = figure.axes[0], figure.axes[0].get_legend()
+    box = legend.get_window_extent()
+    assert box.y1 <= figure.bbox.y1  # inside the picture
+    assert {line.get_label() for line in axes.lines} == {"turned [deg]", "shifted [cm]"}
+    for line in axes.lines:
+        assert not any(
+            box.contains(*point) for point in line.get_transform().transform(line.get_xydata())
+        )
