@@ -56,7 +56,7 @@ def calibrate(
             matcher=chosen,
             config=settings,
             terms=checked_terms,
-            time_limit_s=matching.time_limit_s,
+            time_limit_s=matching.limit_s,
             progress=progress,
         )
         written = _write_result(result, data, out)
@@ -88,7 +88,7 @@ def match(
     data = matching.load_dataset(dataset)
     with progress_bar() as progress:
         run = match_in_rounds(
-            data, matcher=chosen, time_limit_s=matching.time_limit_s, progress=progress
+            data, matcher=chosen, time_limit_s=matching.limit_s, progress=progress
         )
     run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data)

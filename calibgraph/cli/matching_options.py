@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from calibgraph.matching.protocol import Matcher
 
 
+SEARCH_LIMIT_S = 1800.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions:
     """Which frames are matched from which guess, and how; a field per option."""
@@ -48,6 +51,12 @@ class MatchingOptions:
     half_resolution: HalfOption = None
     occlusion_filter: OcclusionOption = None
     batch: BatchOption = None
+
+    @property
+    def limit_s(self) -> float | None:
+        """The time limit; without one, that of the search. Networks may need hours on a CPU."""
+        default = SEARCH_LIMIT_S if self.matcher == "structure" else None
+        return default if self.time_limit_s is None else self.time_limit_s
 
     def find_matcher(self, *, seed: int) -> Matcher:
         """The matcher; see :func:`calibgraph.cli.arguments.matcher_from`."""

@@ -47,7 +47,8 @@ TimeLimitOption = Annotated[
     typer.Option(
         min=0.001,
         metavar="SECONDS",
-        help="Stop matching after this time; a result of fewer rounds is marked as partial.",
+        help="Stop matching after this time; a result of fewer rounds is marked as partial. "
+        "[default: 1800 with structure, else none; inf for none]",
     ),
 ]
 _CMRNEXT = "Matcher cmrnext"

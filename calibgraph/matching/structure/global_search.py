@@ -10,7 +10,7 @@ the rejected poses is never taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calibgraph.matching.structure.box_search import Box, search_box
 from calibgraph.matching.structure.correlation_maps import correlate
 from calibgraph.matching.structure.pose_refinement import (
+    ACCEPTED,
     CameraFrames,
     Candidate,
     refine,
@@ -90,7 +91,7 @@ def locate_cameras(
         if new:
             work = partial(search.try_proposals, state.count_proposers(new))
         else:
-            progress(f"searching: {', '.join(missing)}", sum(state.searches.values()), total)
+            progress(state.describe(missing), sum(state.searches.values()), total)
             work = partial(search.search_range, state.count_searches(missing))
         state.add(missing, pool.map(work, missing))
 
@@ -137,6 +138,15 @@ class _SearchState:
         """The missing cameras to search now: those with the fewest searches."""
         left = [name for name in self.missing(best) if self.searches[name] < SEARCHES]
         return sorted(left, key=self.searches.__getitem__)[:MAX_PARALLEL]
+
+    def describe(self, missing: Sequence[str]) -> str:
+        """What is searched now, and how little the searches before have found."""
+        words = []
+        for name in missing:
+            z_score = self.far[name].z_score if name in self.far else -math.inf
+            before = f" (best z-score {z_score:.1f}, {ACCEPTED:g} needed)" if z_score > 0 else ""
+            words.append(name + before)
+        return f"searching: {', '.join(words)}"
 
     def count_proposers(self, new: dict[str, Candidate]) -> dict[str, Candidate]:
         """Count these cameras among those that have proposed, and return them."""
