@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -40,3 +42,6 @@ def test_the_search_finds_where_the_maps_agree() -> None:
     off = Box(true, 1.0, 1.0).displacement(found[0])
     assert np.abs(off[:3]).max() < np.radians(0.6)  # a step of the maps
     assert np.abs(off[3:]).max() < 0.15  # a step at 15 m
+    with ThreadPoolExecutor(1) as alone:
+        again = search_box(correlation, box, alone, seed=0)
+    np.testing.assert_array_equal(again, found)  # whatever the number of threads

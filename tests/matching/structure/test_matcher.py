@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -174,6 +176,19 @@ class TestRounds:
         assert set(np.diff(seen[-1])) == {3, 4}
 
     @pytest.mark.slow
+    def test_the_number_of_threads_does_not_matter(
+        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        data = calibgraph.load_dataset(SAMPLE, truth)
+        tables = []
+        for threads in (1, 3):
+            pool = partial(ThreadPoolExecutor, threads)
+            monkeypatch.setattr("calibgraph.matching.structure.matcher.core_pool", pool)
+            matcher = without_search(LEVELS[3:4])
+            tables.append(matcher.match(data, data.rig, round_index=0, progress=no_progress))
+        for name in ("pixels_px", "points_lidar_m", "information_px", "frame"):
+            np.testing.assert_array_equal(*(getattr(table, name) for table in tables))
+
     def test_a_seed_determines_the_result(self) -> None:
         data = calibgraph.load_dataset(SAMPLE).select("0:2")
         one, two = (

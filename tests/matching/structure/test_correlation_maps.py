@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from calibgraph.matching.structure.correlation_maps import CorrelationMaps
+from calibgraph.matching.structure.directions import view_angles
+
+
+def make_maps(rng: np.random.Generator) -> CorrelationMaps:
+    smooth = rng.standard_normal((40, 30, 50)).cumsum(axis=1).cumsum(axis=2).astype(np.float32)
+    points = rng.uniform([-8, -4, 5], [8, 4, 30], (40, 3))
+    return CorrelationMaps(smooth, points, np.array([-0.5, -0.3]), 0.02)
+
+
+def make_transforms(rng: np.random.Generator, count: int) -> np.ndarray:
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (count, 3))).as_matrix()
+    T[:, :3, 3] = rng.uniform(-1, 1, (count, 3))
+    return T
+
+
+def literal_z_score(maps: CorrelationMaps, T: np.ndarray) -> float:
+    """The sum of interpolated scores over its standard deviation, group by group."""
+    total, variance = 0.0, maps._variance_floor
+    height, width = maps.maps.shape[1:]
+    for scores, point, of_group in zip(maps.maps, maps.points_lidar_m, maps.variances, strict=True):
+        angles = view_angles((T[:3, :3] @ point + T[:3, 3])[None])[0]
+        u, v = (angles - maps.origin_rad) / maps.step_rad
+        if 0 <= u < width - 1 and 0 <= v < height - 1:
+            total += map_coordinates(scores.astype(float), [[v], [u]], order=1)[0]
+            variance += of_group
+    return float(total / np.sqrt(variance))
+
+
+def test_z_scores_are_those_of_the_literal_formula() -> None:
+    rng = np.random.default_rng(0)
+    maps, transforms = make_maps(rng), make_transforms(rng, 50)
+    expected = [literal_z_score(maps, T) for T in transforms]
+    np.testing.assert_allclose(maps.z_scores(transforms), expected, rtol=2e-3, atol=2e-3)
+
+
+def test_the_best_shift_is_that_of_the_highest_sum() -> None:
+    """All maps peak where their points are after a turn of 4 cells right and 2 down."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-4, -2, 10], [4, 2, 30], (30, 3))
+    origin, step = np.array([-0.5, -0.3]), 0.02
+    cells = np.rint((view_angles(points) - origin) / step).astype(int) + [4, 2]
+    maps = np.zeros((30, 30, 50), np.float32)
+    maps[np.arange(30), cells[:, 1], cells[:, 0]] = 1.0
+    shifted = CorrelationMaps(maps, points, origin, step)
+    identity = np.tile(np.eye(4), (40, 1, 1))  # more than are taken at once
+    z_scores, shifts = shifted.find_best_shifts(identity, (0.2, 0.1))
+    np.testing.assert_allclose(shifts, np.tile([4 * step, 2 * step], (40, 1)), atol=1e-9)
+    assert np.ptp(z_scores) == 0 and z_scores[0] > 5

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+from calibgraph.parallel import Once, count_cores
+
+
+def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
+    made: list[int] = []
+    once: Once[str, int] = Once()
+    barrier = threading.Barrier(4)
+
+    def make() -> int:
+        time.sleep(0.05)
+        made.append(1)
+        return 7
+
+    def need(_: int) -> int:
+        barrier.wait()
+        return once.get("key", make)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(need, range(4))) == [7] * 4
+    assert made == [1]
+
+
+def test_values_used_longest_ago_are_dropped_first() -> None:
+    once: Once[str, int] = Once()
+    for name, size in (("a", 3), ("b", 3), ("c", 3)):
+        once.get(name, lambda size=size: size)
+    once.get("a", lambda: 0)
+    once.keep_last(7, float)
+    assert once.get("a", lambda: -1) == 3  # used last
+    assert once.get("b", lambda: -1) == -1  # dropped
+    once.keep_only(lambda key: key == "c")
+    assert once.values() == [3]
+
+
+def test_there_is_a_core() -> None:
+    assert count_cores() >= 1
