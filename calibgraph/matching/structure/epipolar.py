@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,8 +23,21 @@ THRESHOLD_PX = 1.0
 MIN_INLIERS = 40  # over all frames; fewer come together by chance
 
 
+@dataclass(frozen=True, eq=False)
+class Features:
+    """SIFT features of an image.
+
+    Attributes:
+        pixels_px: (n, 2).
+        descriptors: (n, 128).
+    """
+
+    pixels_px: Array
+    descriptors: NDArray[np.float32]
+
+
 def relative_pose_up_to_scale(
-    a: Camera, b: Camera, grays_a: Sequence[Gray], grays_b: Sequence[Gray], *, seed: int
+    a: Camera, b: Camera, images_a: Sequence[Features], images_b: Sequence[Features], *, seed: int
 ) -> Array | None:
     """Estimate the relative pose of two cameras, but for the length of its translation.
 
@@ -33,14 +47,14 @@ def relative_pose_up_to_scale(
     Args:
         a: lens of the one camera.
         b: lens of the other.
-        grays_a: (height, width) images of the one.
-        grays_b: of the other, in the same frames.
+        images_a: features of the one's images.
+        images_b: of the other's, in the same frames.
         seed: of the choice of samples.
 
     Returns:
         (4, 4) T_b_a with a translation of length one, or None if the views do not overlap.
     """
-    rays_a, rays_b = _match_rays((a, b), grays_a, grays_b)
+    rays_a, rays_b = _match_rays((a, b), images_a, images_b)
     if len(rays_a) < MIN_INLIERS:
         return None
     focal = min(a.intrinsics_px.fx, b.intrinsics_px.fx)
@@ -60,10 +74,10 @@ def relative_pose_up_to_scale(
 
 
 def _match_rays(
-    cameras: tuple[Camera, Camera], grays_a: Sequence[Gray], grays_b: Sequence[Gray]
+    cameras: tuple[Camera, Camera], images_a: Sequence[Features], images_b: Sequence[Features]
 ) -> tuple[Array, Array]:
     """Features that both cameras see, as points (n, 2) of their planes at distance one."""
-    pairs = [_match_features(*grays) for grays in zip(grays_a, grays_b, strict=True)]
+    pairs = [_match_features(*images) for images in zip(images_a, images_b, strict=True)]
     rays = [
         normalized(camera, np.concatenate([pair[side] for pair in pairs]))
         for side, camera in enumerate(cameras)
@@ -83,27 +97,23 @@ def _magsac_parameters(seed: int) -> cv2.UsacParams:
     return parameters
 
 
-def _match_features(gray_a: Gray, gray_b: Gray) -> tuple[Array, Array]:
+def _match_features(a: Features, b: Features) -> tuple[Array, Array]:
     """Pixels (n, 2) of the same features in two images."""
-    (pixels_a, features_a), (pixels_b, features_b) = (
-        _detect_features(gray_a),
-        _detect_features(gray_b),
-    )
-    if min(len(pixels_a), len(pixels_b)) < 2:  # noqa: PLR2004
+    if min(len(a.pixels_px), len(b.pixels_px)) < 2:  # noqa: PLR2004
         return np.empty((0, 2)), np.empty((0, 2))
-    pairs = cv2.BFMatcher().knnMatch(features_a, features_b, k=2)
+    pairs = cv2.BFMatcher().knnMatch(a.descriptors, b.descriptors, k=2)
     close = [(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < LOWE_RATIO * n.distance]
     rows = np.array(close).reshape(-1, 2).astype(np.intp)
-    return pixels_a[rows[:, 0]], pixels_b[rows[:, 1]]
+    return a.pixels_px[rows[:, 0]], b.pixels_px[rows[:, 1]]
 
 
-def _detect_features(gray: Gray) -> tuple[Array, NDArray[np.float32]]:
-    """Pixels (n, 2) and SIFT descriptors (n, 128) of an image's features."""
+def detect_features(gray: Gray) -> Features:
+    """The features of an image (height, width)."""
     factor = min(1.0, MAX_SIDE_PX / max(gray.shape))
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    points, features = cv2.SIFT.create(nfeatures=MAX_FEATURES).detectAndCompute(small, None)
+    points, found = cv2.SIFT.create(nfeatures=MAX_FEATURES).detectAndCompute(small, None)
     if not points:
-        return np.empty((0, 2)), np.empty((0, 128), np.float32)
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     scale = np.array([gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]])
-    pixels = (np.array([p.pt for p in points]) + 0.5) * scale - 0.5
-    return pixels, np.asarray(features, dtype=np.float32)
+    pixels_px = (np.array([p.pt for p in points]) + 0.5) * scale - 0.5
+    return Features(pixels_px, np.asarray(found, dtype=np.float32))

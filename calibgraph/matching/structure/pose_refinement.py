@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.consensus import find_consensus
+from calibgraph.matching.structure.epipolar import Features, detect_features
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
@@ -58,6 +59,11 @@ class CameraFrames:
     grays: Sequence[NDArray[np.uint8]]
     clouds: Sequence[PreparedCloud]
     cores: Executor
+
+    @cached_property
+    def features(self) -> list[Features]:
+        """The features of each image."""
+        return list(self.cores.map(detect_features, self.grays))
 
 
 @dataclass(frozen=True, eq=False)

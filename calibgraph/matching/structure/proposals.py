@@ -50,8 +50,8 @@ def propose(
         elif pair.b == name and pair.a in T_camera_lidar:
             yield [invert(pair.T_a_b) @ T_camera_lidar[pair.a]]
     for other, T_other_lidar in T_camera_lidar.items():
-        grays = frames[other].grays, frames[name].grays
-        T_this_other = relative_pose_up_to_scale(rig.cameras[other], camera, *grays, seed=seed)
+        images = frames[other].features, frames[name].features
+        T_this_other = relative_pose_up_to_scale(rig.cameras[other], camera, *images, seed=seed)
         if T_this_other is not None:
             yield _at_lengths(T_this_other, T_other_lidar, box)
     for other, T_other_lidar in T_camera_lidar.items():
