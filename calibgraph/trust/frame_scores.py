@@ -17,7 +17,9 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
+from calibgraph.matching.structure.window_table import WindowTables
 from calibgraph.model.rig import Camera
+from calibgraph.parallel import Once
 
 Images = Sequence[NDArray[np.uint8]]
 """Gray images of one camera, (height, width) each, one per frame."""
@@ -39,7 +41,8 @@ class FrameScorer:
         self.frames = frames
         self._dataset = dataset
         self._pool = pool
-        self._clouds: dict[int, PreparedCloud] = {}
+        self._clouds: Once[int, PreparedCloud] = Once()
+        self._tables = WindowTables()
 
     def load_images(self, name: str, camera: Camera) -> list[NDArray[np.uint8]]:
         """Gray images of a camera, one per frame."""
@@ -63,8 +66,8 @@ class FrameScorer:
         other = self._dataset.neighbour(frame, offset) if offset else frame
         if other is None:
             return None
-        if other.index not in self._clouds:
-            self._clouds[other.index] = PreparedCloud.from_points(other.load_cloud())
+        cloud = self._clouds.get(
+            other.index, lambda: PreparedCloud.from_points(other.load_cloud(), self._tables)
+        )
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud = self._clouds[other.index]
         return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)

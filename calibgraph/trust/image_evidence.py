@@ -11,7 +11,9 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -82,15 +84,17 @@ def measure_image_evidence(
     report = progress or no_progress
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}
-    with core_pool() as pool:
-        scorer = FrameScorer(dataset, frames, pool)
-        for index, (name, camera) in enumerate(rig.cameras.items()):
+    with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+        scorer = FrameScorer(dataset, frames, cores)
+        measure = partial(_measure_camera, scorer, seed=seed)
+        measured = pool.map(measure, rig.cameras, rig.cameras.values())
+        for index, name in enumerate(rig.cameras):
             report(f"checking: {name}", index, len(rig.cameras))
-            evidence[name] = _measure_camera(scorer, name, camera, seed)
+            evidence[name] = next(measured)
     return evidence
 
 
-def _measure_camera(scorer: FrameScorer, name: str, camera: Camera, seed: int) -> ImageEvidence:
+def _measure_camera(scorer: FrameScorer, name: str, camera: Camera, *, seed: int) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
     groups = len(scores.counts)
