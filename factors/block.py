@@ -13,6 +13,7 @@ that is concave in s with rho(0) = 0.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -125,6 +126,14 @@ class ProjectionBlock:
         )
         return other
 
+    @staticmethod
+    def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
+        """The correspondences of blocks of one lens under each other; loss as of the first."""
+        roots = _joined_roots(parts)
+        joined, columns = copy.copy(parts[0]), np.hstack([part._columns for part in parts])
+        joined._initialize(columns, _whitening(roots, columns.shape[1]), roots)
+        return joined
+
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
         edges = np.append(np.arange(0, len(self), _CHUNK), len(self))
@@ -222,6 +231,17 @@ def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
+
+
+def _joined_roots(parts: Sequence[ProjectionBlock]) -> Array | None:
+    """Whitening matrices of blocks under each other; the identity where a block has none."""
+    roots = [part.sqrt_information for part in parts]
+    if all(root is None for root in roots):
+        return None
+    return np.concatenate([
+        np.tile([1.0, 0.0, 1.0], (len(part), 1)) if root is None else root
+        for root, part in zip(roots, parts, strict=True)
+    ])  # fmt: skip
 
 
 def _whitening(root: Array | None, n: int) -> Array:

@@ -212,11 +212,12 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
         start = near[-1].T_lidar_camera if near else state.T_lidar_camera[camera]
         raw = merge(parts)
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
-        used = raw.without_outliers(to_T_camera_lidar(T_lidar_camera), camera_state.scale)
-        if len(used.frame) >= MIN_MATCHES:
+        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
+        inliers = residuals.inliers(camera_state.scale)
+        if np.count_nonzero(inliers) >= MIN_MATCHES:
             reference = state.references[camera]
             hessian[camera], gradient[camera] = quadratic(
-                raw, used, camera_state.scale, T_lidar_camera, reference
+                residuals, inliers, camera_state.scale, T_lidar_camera, reference
             )
             frames[camera] = len(parts)
     return Posterior(hessian, gradient, np.zeros((6 * n, 6 * n)), frames)

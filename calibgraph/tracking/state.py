@@ -38,14 +38,14 @@ class LiveFrame:
     Attributes:
         number: of the frame.
         raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
-        used: those within the gate.
+        inliers: per camera, (m,) which of them are within the gate.
         hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
         gradient: (n, 6) at the cameras' references.
     """
 
     number: int
     raw: dict[int, CameraBlock]
-    used: dict[int, CameraBlock]
+    inliers: dict[int, NDArray[np.bool_]]
     hessian: Array
     gradient: Array
 
@@ -54,17 +54,25 @@ class LiveFrame:
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         hessian[camera], gradient[camera] = 0.0, 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
-        used = {c: m for c, m in self.used.items() if c != camera}
-        return LiveFrame(self.number, raw, used, hessian, gradient)
+        inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
+        return LiveFrame(self.number, raw, inliers, hessian, gradient)
 
     def add(
-        self, camera: int, raw: CameraBlock, used: CameraBlock, sums: tuple[Array, Array]
+        self,
+        camera: int,
+        raw: CameraBlock,
+        inliers: NDArray[np.bool_],
+        sums: tuple[Array, Array],
     ) -> LiveFrame:
         """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         hessian[camera], gradient[camera] = sums
         return LiveFrame(
-            self.number, {**self.raw, camera: raw}, {**self.used, camera: used}, hessian, gradient
+            self.number,
+            {**self.raw, camera: raw},
+            {**self.inliers, camera: inliers},
+            hessian,
+            gradient,
         )
 
     @staticmethod

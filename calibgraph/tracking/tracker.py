@@ -224,23 +224,31 @@ class IncrementalCalibrator:
         if not agreeing:
             return {}
         scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
-        places = self._window.add({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
-        gated = {
-            c: block.without_outliers(to_T_camera_lidar(self._window.T_lidar_camera(c)), scales[c])
-            for c, block in agreeing.items()
-        }
-        used = {c: block for c, block in gated.items() if len(block.frame) >= MIN_MATCHES}
-        self._window.replace(places, {c: block.with_scale(scales[c]) for c, block in used.items()})
+        self._window.fit({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
+        inliers = self._inliers(agreeing)
+        used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
+        self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
         self._copy_estimates()
         open_frame = self._state.epochs[-1].frames[-1]
-        for camera, inliers in used.items():
-            T_lidar_camera = self._state.T_lidar_camera[camera]
-            raw, reference = agreeing[camera], self._state.references[camera]
-            sums = quadratic(raw, inliers, scales[camera], T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, raw, inliers, sums)
-            self._state = count_absorbed(self._state, camera, raw, len(inliers.frame))
+        for camera, rows in inliers.items():
+            T_lidar_camera, scale = self._state.T_lidar_camera[camera], scales[camera]
+            residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
+            reference = self._state.references[camera]
+            sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
+            open_frame = open_frame.add(camera, agreeing[camera], rows, sums)
+            self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
         self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
         return used
+
+    def _inliers(self, blocks: dict[int, CameraBlock]) -> dict[int, NDArray[np.bool_]]:
+        """Per camera which matches are within the gate at the new estimate, if enough are."""
+        inliers = {}
+        for camera, block in blocks.items():
+            T_camera_lidar = to_T_camera_lidar(self._window.T_lidar_camera(camera))
+            rows = block.at(T_camera_lidar).inliers(self._state.cameras[camera].scale)
+            if np.count_nonzero(rows) >= MIN_MATCHES:
+                inliers[camera] = rows
+        return inliers
 
     def _copy_estimates(self) -> None:
         """Copy the estimates of the last epoch from iSAM2 to the state."""
