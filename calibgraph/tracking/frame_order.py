@@ -22,7 +22,8 @@ def number_and_stamp(
     Raises:
         CorrespondenceError: if the table holds several frames, or one that is not after the last.
     """
-    numbers = np.unique(table.frame)
+    same = len(table) > 0 and (table.frame == table.frame[0]).all()
+    numbers = table.frame[:1] if same else np.unique(table.frame)
     if len(numbers) > 1:
         raise CorrespondenceError(
             f"an update takes one frame, found {len(numbers)} (from {numbers[0]} to "

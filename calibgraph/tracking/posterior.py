@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -157,6 +157,20 @@ def closed_posterior(state: State, before: int | None = None) -> Posterior:
     for epoch in state.epochs[:-1]:
         sums = sums.add(_until(epoch, before), steps).propagate(state, len(epoch.frames))
     return sums
+
+
+def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
+    """Per live epoch but the first, its place and the sums over the frames before it.
+
+    As ``posterior(state, number of its first frame)``, each frame added once.
+    """
+    sums, steps = Posterior.from_summaries(state), _steps(state)
+    for place, epoch in enumerate(state.epochs[:-1]):
+        sums = sums.add(epoch.frames, steps).propagate(state, len(epoch.frames))
+        before = sums
+        for later in state.epochs[place + 1 : -1]:
+            before = before.propagate(state, len(later.frames))
+        yield place + 1, before
 
 
 def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:

@@ -20,6 +20,7 @@ from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
     inflation,
+    median,
     no_groups,
     widening,
 )
@@ -149,7 +150,7 @@ class CameraState:
     @property
     def inlier_share(self) -> float:
         """Median share of inliers of the last absorbed frames."""
-        return float(np.median(self.recent[:, 0]))
+        return median(self.recent[:, 0])
 
     def count(self, **more: int) -> CameraState:
         """The camera with some counts raised."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,10 +24,11 @@ from calibgraph.tracking.absorption import (
     set_aside,
     with_open_frame,
 )
-from calibgraph.tracking.assessment import assess, prior_hessian, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, prior_hessian, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import number_and_stamp
+from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
@@ -66,13 +68,18 @@ class IncrementalCalibrator:
     _epoch_start: State
     _since_epoch_start: list[tuple[int, Correspondences]]
 
+    _rig_at: tuple[gtsam.Pose3, ...] | None = None
+
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
 
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return current_rig(self._state)
+        estimates = self._state.T_lidar_camera
+        if self._rig_at is not estimates:
+            self._rig_at, self._rig = estimates, current_rig(self._state)
+        return self._rig
 
     @property
     def initial_rig(self) -> Rig:
@@ -144,10 +151,13 @@ class IncrementalCalibrator:
         events += seen + self._restart_after_step()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
-        sums = with_open_epoch(self._closed, self._state)
-        return make_update(
-            self._state, assess(self._state, sums, self._prior_hessian), tuple(events), used
-        )
+        return make_update(self._state, self.rig, self._assess(), tuple(events), used)
+
+    def _assess(self) -> Assessment:
+        """Assess the estimates: the sums over closed epochs are at hand."""
+        state = self._state
+        sums, halves = with_open_epoch(self._closed, state), self._closed_halves
+        return assess(state, sums, halves.add(state.epochs[-1].frames), self._prior_hessian)
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
@@ -197,6 +207,7 @@ class IncrementalCalibrator:
         self._prior_hessian = prior_hessian(self._state)
         self._copy_estimates()
         self._closed = closed_posterior(self._state)
+        self._closed_halves = Halves.of_closed_epochs(self._state)
 
     def _blocks_by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
         """The preprocessed matches of each camera that has enough."""
@@ -293,4 +304,4 @@ class IncrementalCalibrator:
 def _with_findings_per_frame(table: Correspondences) -> Correspondences:
     """The table with only those findings of its matcher that hold for a single frame."""
     kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
-    return replace(table, metadata=kept)
+    return table if kept == table.metadata else replace(table, metadata=kept)
