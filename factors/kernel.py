@@ -64,6 +64,15 @@ accumulate_alone = njit(cache=True, nogil=True, error_model="numpy")(_accumulate
 accumulate_shared = njit(cache=True, parallel=True, error_model="numpy")(_accumulate)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def accumulate_at_poses(kind, lens, poses, columns, whitening, loss, scale, edges):  # type: ignore[no-untyped-def]
+    """(p, segments, 28) sums at each of (p, 4, 4) T_camera_lidar: one call instead of p."""
+    out = np.empty((len(poses), len(edges) - 1, 28))
+    for k in range(len(poses)):
+        out[k] = accumulate_alone(kind, lens, poses[k], columns, whitening, loss, scale, edges)
+    return out
+
+
 def _residuals(kind, lens, T, columns):  # type: ignore[no-untyped-def]
     """(n, 2) residuals pi - u [px], and (n,) whether each point is projectable."""
     n = columns.shape[1]

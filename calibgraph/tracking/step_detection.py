@@ -44,6 +44,8 @@ def detect_step(state: State) -> DetectedStep | None:
     as many frames to show whether it moved too.
     """
     needed = state.config.tracking.step_frames
+    if not any(_has_enough(camera_state, needed) for camera_state in state.cameras):
+        return None
     clusters = {c: _cluster(camera_state) for c, camera_state in enumerate(state.cameras)}
     found_by = {
         c: near
@@ -64,6 +66,15 @@ def detect_step(state: State) -> DetectedStep | None:
     if waiting and longest < needed + _PATIENCE:
         return None
     return DetectedStep(since, frozenset(found_by), clusters)
+
+
+def _has_enough(camera_state: CameraState, needed: int) -> bool:
+    """Whether a cluster of outlier frames may be large enough: if all since its first agree."""
+    frames = camera_state.outlier_frames
+    return any(
+        count >= max(needed, _OUTVOTE * _count_agreeing(camera_state, frames[-count].number))
+        for count in range(needed, len(frames) + 1)
+    )
 
 
 def _cluster(camera_state: CameraState) -> tuple[OutlierFrame, ...]:
