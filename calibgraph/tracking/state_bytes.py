@@ -42,8 +42,8 @@ from calibgraph.tracking.state import (
 )
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/2"
-"""Of the archive; 1 was a layout of its own without an archive."""
+FORMAT = "calibgraph-tracker-state/3"
+"""Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
 _EARLIER_MARK = b"calibgraph-tracker/1\n"
