@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from factors.conditioning import unit_diagonal
 from factors.kernel import (
     accumulate_alone,
-    accumulate_at_poses,
     accumulate_shared,
     residuals_alone,
     residuals_shared,
@@ -137,34 +136,29 @@ class ProjectionBlock:
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        return _unpacked(self._segment_sums(T_lidar_camera, self._chunk_edges()).sum(axis=0))
+        return _unpacked(self._segment_sums([T_lidar_camera], self._chunk_edges())[0].sum(axis=0))
+
+    def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
+        """H, b and c of the whole block at each of some T_lidar_camera, stacked."""
+        return _unpacked(self._segment_sums(poses, self._chunk_edges()).sum(axis=1))
+
+    def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
+        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
+        runs = np.asarray(edges, dtype=np.int64)
+        return _unpacked(self._segment_sums([T_lidar_camera], runs)[0])
 
     def _chunk_edges(self) -> NDArray[np.int64]:
         """Where runs of _CHUNK correspondences begin, and the end."""
         count = -(-len(self) // _CHUNK)
         return np.minimum(np.arange(count + 1) * _CHUNK, len(self))
 
-    def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
-        """H, b and c of the whole block at each T_lidar_camera, stacked."""
-        if len(self) >= _WORTH_SHARING:
-            each = [self.sums(T_lidar_camera) for T_lidar_camera in poses]
-            return BlockSums(*(np.array([getattr(one, name) for one in each]) for name in _SUMS))
-        sums: Array = accumulate_at_poses(
-            self.lens.kind, self.lens.packed, np.array([_T_camera_lidar(T) for T in poses]),
-            self._columns, self._whitening, loss_id(self.loss), self.scale * self.sigma,
-            self._chunk_edges(),
-        )  # fmt: skip
-        return _unpacked(sums.sum(axis=1) / self.sigma**2)
-
-    def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
-        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
-        return _unpacked(self._segment_sums(T_lidar_camera, np.asarray(edges, dtype=np.int64)))
-
-    def _segment_sums(self, T_lidar_camera: gtsam.Pose3, edges: NDArray[np.int64]) -> Array:
+    def _segment_sums(self, poses: Sequence[gtsam.Pose3], edges: NDArray[np.int64]) -> Array:
+        """(p, s, 28) sums of the kernel at each T_lidar_camera, over each run."""
         run = accumulate_alone if len(self) < _WORTH_SHARING else accumulate_shared
+        T_camera_lidar = np.array([T.inverse().matrix() for T in poses])
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
+            self.lens.kind, self.lens.packed, T_camera_lidar, self._columns,
             self._whitening, loss_id(self.loss), self.scale * self.sigma, edges,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
@@ -270,7 +264,6 @@ def _whitening(root: Array | None, n: int) -> Array:
 
 
 _UPPER = np.triu_indices(6)
-_SUMS = ("hessian", "gradient", "cost")
 
 
 def _unpacked(sums: Array) -> BlockSums:
