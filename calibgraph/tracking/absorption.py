@@ -11,9 +11,10 @@ from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
 from calibgraph.tracking.cause import squared_sigmas
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import find_outlier_frame
 from calibgraph.tracking.start import count_residuals
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state import State
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector

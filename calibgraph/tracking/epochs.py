@@ -14,8 +14,9 @@ from calibgraph.solver.camera_block import MIN_MATCHES, merge
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.posterior import true_hessian
-from calibgraph.tracking.state import CameraState, Epoch, State, block_diagonal
+from calibgraph.tracking.state import CameraState, State, block_diagonal
 
 Array = NDArray[np.float64]
 

@@ -1,12 +1,16 @@
-"""Frames come in the order of their numbers, and of their times if they have them."""
+"""What an update takes: a frame after the last one, and what holds for it alone."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.tracking.state import State
+
+_FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
 
 
 def number_and_stamp(
@@ -53,3 +57,9 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
             "before; correct the clock: it is left out",
             frame=number,
         )
+
+
+def with_findings_per_frame(table: Correspondences) -> Correspondences:
+    """The table with only those findings of its matcher that hold for a single frame."""
+    kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
+    return table if kept == table.metadata else replace(table, metadata=kept)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import is_determined
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state import State
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,8 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.factor_graph import optimize, projection_graph
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.state import CameraState, OutlierFrame
+from calibgraph.tracking.live_frames import OutlierFrame
+from calibgraph.tracking.state import CameraState
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,8 @@ from calibgraph.solver.camera_block import BlockResiduals
 from calibgraph.solver.covariance import robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import STRENGTHS, gain_of_walk, step_between
-from calibgraph.tracking.state import Epoch, LiveFrame, State, block_diagonal
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
+from calibgraph.tracking.state import State, block_diagonal
 from factors import ProjectionBlock
 
 Array = NDArray[np.float64]

@@ -15,16 +15,11 @@ from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary, step_between
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.posterior import Posterior, inverse, posterior, quadratic
 from calibgraph.tracking.start import absorb_frames
-from calibgraph.tracking.state import (
-    DriftWatch,
-    LiveFrame,
-    State,
-    block_diagonal,
-    replace_item,
-)
+from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
 
 Array = NDArray[np.float64]

@@ -20,9 +20,10 @@ from calibgraph.solver.camera_block import (
     camera_blocks,
 )
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.posterior import quadratic
-from calibgraph.tracking.state import HISTORY, CameraState, Epoch, LiveFrame, State, replace_item
+from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 

@@ -31,15 +31,9 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
-from calibgraph.tracking.state import (
-    CameraState,
-    DriftWatch,
-    Epoch,
-    LiveFrame,
-    OutlierFrame,
-    State,
-)
+from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
 
 FORMAT = "calibgraph-tracker-state/3"

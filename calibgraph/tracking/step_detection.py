@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
+from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import Posterior, posteriors_before_epochs
-from calibgraph.tracking.state import CameraState, OutlierFrame, State
+from calibgraph.tracking.state import CameraState, State
 
 Array = NDArray[np.float64]
 

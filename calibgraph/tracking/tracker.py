@@ -27,13 +27,14 @@ from calibgraph.tracking.absorption import (
 from calibgraph.tracking.assessment import Assessment, assess, prior_hessian, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import number_and_stamp
+from calibgraph.tracking.frame_order import number_and_stamp, with_findings_per_frame
 from calibgraph.tracking.halves import Halves
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import try_to_start
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
     StateError,
     decode,
@@ -45,10 +46,7 @@ from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.update import Update, current_rig, make_update
 from calibgraph.tracking.window import Window
 
-Array = NDArray[np.float64]
-
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-_FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
 
 
 class IncrementalCalibrator:
@@ -111,7 +109,7 @@ class IncrementalCalibrator:
             CorrespondenceError: if the table holds several frames, a camera that the rig does not
                 have, or a frame that does not come after the last one. Nothing has changed then.
         """
-        table = _with_findings_per_frame(table)
+        table = with_findings_per_frame(table)
         number, stamp = number_and_stamp(table, frame, self._state)
         blocks = self._blocks_by_camera(table)
         start, since = self._epoch_start, list(self._since_epoch_start)
@@ -299,9 +297,3 @@ class IncrementalCalibrator:
             events += more
         self._resume(self._state)
         return events
-
-
-def _with_findings_per_frame(table: Correspondences) -> Correspondences:
-    """The table with only those findings of its matcher that hold for a single frame."""
-    kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
-    return table if kept == table.metadata else replace(table, metadata=kept)

@@ -24,7 +24,8 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
 
 Array = NDArray[np.float64]

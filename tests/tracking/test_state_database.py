@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from calibgraph.errors import FileError
-from calibgraph.tracking.state_database import DATABASE, Recovered, StateDatabase
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from calibgraph.tracking.state_recovery import Recovered
 from tests.tracking.state_data import (
     INPUT_BYTES,
     LOG,
