@@ -24,7 +24,7 @@ from pathlib import Path
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
-from calibgraph.tracking.state_recovery import digest, log_of, read
+from calibgraph.tracking.state_recovery import checksum, log_of, read
 
 DATABASE = "state.sqlite"
 LAYOUT = 2  # 1 was a folder of files snapshot-*.state and journal-*.log
@@ -85,7 +85,7 @@ class StateDatabase:
         """
         number = self._number + 1
         with self._writing() as connection:
-            row = number, content, digest(number, content)
+            row = number, content, checksum(number, content)
             connection.execute("INSERT INTO journal VALUES (?, ?, ?)", row)
             connection.execute("UPDATE status SET number = ?", (number,))
         self._number = number
@@ -104,7 +104,7 @@ class StateDatabase:
             OSError: if it cannot be written; the earlier snapshot and the inputs are safe.
         """
         number = self._number if number is None else number
-        row = number, state, digest(number, state)
+        row = number, state, checksum(number, state)
         with self._writing() as connection:
             connection.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", row)
             (kept,) = connection.execute(

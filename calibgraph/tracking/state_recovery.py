@@ -70,7 +70,7 @@ def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered
     start, snapshot = 0, None
     query = "SELECT number, content, digest FROM snapshot ORDER BY number DESC"
     for number, content, digest in database.execute(query):
-        if digest == digest(number, content):
+        if digest == checksum(number, content):
             start, snapshot = number, content
             break
         damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
@@ -79,12 +79,12 @@ def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered
     query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
     rows = database.execute(query, (start,)).fetchall()
     for expected, row in zip_longest(range(start + 1, newest + 1), rows):
-        if row is None or row[0] != expected or row[2] != digest(*row[:2]):
+        if row is None or row[0] != expected or row[2] != checksum(*row[:2]):
             raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
     return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
 
 
-def digest(number: int, content: object) -> bytes:
+def checksum(number: int, content: object) -> bytes:
     """Checksum of a row, none of one that is not bytes."""
     if not isinstance(content, bytes):
         return b""
