@@ -13,6 +13,7 @@ that is concave in s with rho(0) = 0.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -125,20 +126,39 @@ class ProjectionBlock:
         )
         return other
 
+    @staticmethod
+    def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
+        """The correspondences of blocks of one lens under each other; loss as of the first."""
+        roots = _joined_roots(parts)
+        joined, columns = copy.copy(parts[0]), np.hstack([part._columns for part in parts])
+        joined._initialize(columns, _whitening(roots, columns.shape[1]), roots)
+        return joined
+
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        edges = np.append(np.arange(0, len(self), _CHUNK), len(self))
-        return _unpacked(self._segment_sums(T_lidar_camera, edges).sum(axis=0))
+        return _unpacked(self._segment_sums([T_lidar_camera], self._chunk_edges())[0].sum(axis=0))
+
+    def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
+        """H, b and c of the whole block at each of some T_lidar_camera, stacked."""
+        return _unpacked(self._segment_sums(poses, self._chunk_edges()).sum(axis=1))
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
-        return _unpacked(self._segment_sums(T_lidar_camera, np.asarray(edges, dtype=np.int64)))
+        runs = np.asarray(edges, dtype=np.int64)
+        return _unpacked(self._segment_sums([T_lidar_camera], runs)[0])
 
-    def _segment_sums(self, T_lidar_camera: gtsam.Pose3, edges: NDArray[np.int64]) -> Array:
+    def _chunk_edges(self) -> NDArray[np.int64]:
+        """Where runs of _CHUNK correspondences begin, and the end."""
+        count = -(-len(self) // _CHUNK)
+        return np.minimum(np.arange(count + 1) * _CHUNK, len(self))
+
+    def _segment_sums(self, poses: Sequence[gtsam.Pose3], edges: NDArray[np.int64]) -> Array:
+        """(p, s, 28) sums of the kernel at each T_lidar_camera, over each run."""
         run = accumulate_alone if len(self) < _WORTH_SHARING else accumulate_shared
+        T_camera_lidar = np.array([T.inverse().matrix() for T in poses])
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
+            self.lens.kind, self.lens.packed, T_camera_lidar, self._columns,
             self._whitening, loss_id(self.loss), self.scale * self.sigma, edges,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
@@ -222,6 +242,17 @@ def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
+
+
+def _joined_roots(parts: Sequence[ProjectionBlock]) -> Array | None:
+    """Whitening matrices of blocks under each other; the identity where a block has none."""
+    roots = [part.sqrt_information for part in parts]
+    if all(root is None for root in roots):
+        return None
+    return np.concatenate([
+        np.tile([1.0, 0.0, 1.0], (len(part), 1)) if root is None else root
+        for root, part in zip(roots, parts, strict=True)
+    ])  # fmt: skip
 
 
 def _whitening(root: Array | None, n: int) -> Array:

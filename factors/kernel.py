@@ -3,9 +3,6 @@
 Points come as columns (structure of arrays); a run of correspondences is cut into tiles, and each
 tile goes through a few loops that the compiler vectorizes: ``kernel_projection`` gives residuals
 and derivatives, ``kernel_sums`` weighs and adds them up.
-
-numba caches what it compiles by the file that a function is defined in: after an edit of a file
-that this one imports, delete ``factors/__pycache__``.
 """
 
 from __future__ import annotations
@@ -13,9 +10,10 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numba.core.errors import NumbaWarning
 
+from factors.compiled import compiled
 from factors.kernel_projection import project, project_pinhole, project_radtan, project_rays
 from factors.kernel_sums import (
     apply_weights,
@@ -32,36 +30,38 @@ from factors.tile import MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
 
 
-def _accumulate(kind, lens, T, columns, whitening, loss, scale, edges):  # type: ignore[no-untyped-def]
-    """(segments, 28) sums over the runs ``edges[i]:edges[i + 1]``: 21 of H, 6 of b, 1 of c.
+def _accumulate(kind, lens, poses, columns, whitening, loss, scale, edges):  # type: ignore[no-untyped-def]
+    """(p, s, 28) sums at each pose over each run ``edges[i]:edges[i + 1]``: H (21), b (6), c (1).
 
-    ``T`` is T_camera_lidar; ``columns`` (5, n) are x y z u v; ``whitening`` is (3, n): triangular
-    matrices; (1, n): numbers; or (0, n): none.
+    ``poses`` (p, 4, 4) are T_camera_lidar; ``columns`` (5, n) are x y z u v; ``whitening`` is
+    (3, n): triangular matrices; (1, n): numbers; or (0, n): none.
     """
-    out = np.zeros((len(edges) - 1, 28))
-    for segment in prange(len(edges) - 1):
+    segments = len(edges) - 1
+    out = np.zeros((len(poses) * segments, 28))
+    for row in prange(len(poses) * segments):
+        T, segment = poses[row // segments], row % segments
         tile = np.empty((ROWS, TILE))
         for start in range(edges[segment], edges[segment + 1], TILE):
             n = min(TILE, edges[segment + 1] - start)
             rays = kind == PINHOLE and whitening.shape[0] < MATRICES
             if rays and project_rays(lens, T, columns, start, n, tile):
                 scale_residuals(whitening, start, n, tile)
-                out[segment, 27] += weigh(loss, scale, n, tile)
+                out[row, 27] += weigh(loss, scale, n, tile)
                 apply_weights(whitening, start, n, tile)
-                sum_rays(lens, n, tile, out, segment)
+                sum_rays(lens, n, tile, out, row)
                 continue
             if kind == PINHOLE:
                 project_pinhole(lens, T, columns, start, n, tile)
             elif kind != RADTAN or not project_radtan(lens, T, columns, start, n, tile):
                 project(kind, lens, T, columns, start, n, tile)
             whiten(whitening, start, n, tile)
-            out[segment, 27] += weigh(loss, scale, n, tile)
-            sum_tile(n, tile, out, segment)
-    return out
+            out[row, 27] += weigh(loss, scale, n, tile)
+            sum_tile(n, tile, out, row)
+    return out.reshape((len(poses), segments, 28))
 
 
-accumulate_alone = njit(cache=True, nogil=True, error_model="numpy")(_accumulate)
-accumulate_shared = njit(cache=True, parallel=True, error_model="numpy")(_accumulate)
+accumulate_alone = compiled(nogil=True, error_model="numpy")(_accumulate)
+accumulate_shared = compiled(parallel=True, error_model="numpy")(_accumulate)
 
 
 def _residuals(kind, lens, T, columns):  # type: ignore[no-untyped-def]
@@ -86,5 +86,5 @@ def _residuals(kind, lens, T, columns):  # type: ignore[no-untyped-def]
     return residuals, valid
 
 
-residuals_alone = njit(cache=True, nogil=True, error_model="numpy")(_residuals)
-residuals_shared = njit(cache=True, parallel=True, error_model="numpy")(_residuals)
+residuals_alone = compiled(nogil=True, error_model="numpy")(_residuals)
+residuals_shared = compiled(parallel=True, error_model="numpy")(_residuals)

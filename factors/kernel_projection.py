@@ -7,13 +7,12 @@ the rows that are taken out before a loop, and Python's exception on a division 
 
 from __future__ import annotations
 
-from numba import njit
-
+from factors.compiled import compiled
 from factors.lens import MIN_DEPTH_M, project_one
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals of a pinhole, x/z, y/z and 1/z. False, if a point is too near for these to hold."""
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
@@ -36,7 +35,7 @@ def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-d
     return too_near == 0.0
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for a pinhole without distortion: no branch, so that it vectorizes."""
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
@@ -59,7 +58,7 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         rx[i], ry[i], rz[i] = x, y, z
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for radial-tangential distortion, without branches, as ``lens._radtan_inside``.
 
@@ -102,7 +101,7 @@ def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped
     return outside == 0.0
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals, their derivatives by the point, and the point in the camera frame."""
     for i in range(n):

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from factors.compiled import compiled
 from factors.loss import CAUCHY, loss_and_weight
 from factors.tile import FAST, PRODUCT, PSI, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals and derivatives by the whitening matrices, or by numbers."""
     if whitening.shape[0] == 0:
@@ -32,7 +31,7 @@ def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         tile[VZ, i] *= s11
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals by their weights w, if these are numbers."""
     if whitening.shape[0] == 0:
@@ -43,7 +42,7 @@ def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         rv[i] *= weights[i]
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     """Fill in the weights psi; return the sum of rho."""
     if loss != CAUCHY:
@@ -61,7 +60,7 @@ def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     return -_sum_of_logarithms(psi, n, tile[PRODUCT]) / k
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     """The logarithm of the product of ``n`` values, taken before it leaves the range of a float.
 
@@ -85,7 +84,7 @@ def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     return logarithms + math.log(even) + math.log(odd)
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
     """Add J^T psi J and J^T psi r of a tile to the 27 sums of a segment."""
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
@@ -139,7 +138,7 @@ def sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
         out[segment, k] += sums[k]
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Turn the residuals w r into psi w^2 r, and psi into psi w^2, if the weights are numbers."""
     ru, rv, psi = tile[RU], tile[RV], tile[PSI]
@@ -156,7 +155,7 @@ def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         psi[i] *= w * w
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def sum_rays(lens, n, tile, out, segment):  # type: ignore[no-untyped-def]
     """Add the 27 sums of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 

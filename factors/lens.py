@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye"]
@@ -135,7 +136,7 @@ def _fisheye_limit(coefficients: Array) -> float:
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
 
 
-@njit(cache=True)
+@compiled()
 def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a point in the camera frame and the rows of its Jacobian by x, y, z.
 
@@ -168,7 +169,7 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@compiled()
 def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted normalised point and its 2x2 Jacobian (row major), continued past the limit."""
     limit = lens[12]
@@ -190,7 +191,7 @@ def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@compiled()
 def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     k4, k5, k6 = lens[9], lens[10], lens[11]
@@ -211,7 +212,7 @@ def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@compiled()
 def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Kannala-Brandt; the angle from atan2, so that fields of view over 180 degrees are seen."""
     fx, fy = lens[0], lens[1]
@@ -249,7 +250,7 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@compiled()
 def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies inside the lens' injective domain."""
     if kind == FISHEYE:
@@ -257,7 +258,7 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
     pixels = np.empty((n, 2))
@@ -271,7 +272,7 @@ def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     return pixels, valid
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
     pixels = np.empty((n, 2))

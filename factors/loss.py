@@ -12,7 +12,8 @@ import math
 from typing import Literal, get_args
 
 import gtsam
-from numba import njit
+
+from factors.compiled import compiled
 
 LossName = Literal["l2", "huber", "cauchy", "geman_mcclure", "tukey"]
 LOSSES: tuple[LossName, ...] = get_args(LossName)
@@ -31,7 +32,7 @@ def loss_id(name: str) -> int:
     return LOSSES.index(name)
 
 
-@njit(cache=True)
+@compiled()
 def loss_and_weight(loss, scale, s):  # type: ignore[no-untyped-def]
     """Return rho(s) and psi = rho'(s); ``scale`` is the residual norm at which the loss bends."""
     if loss == L2:

@@ -9,8 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 Albedo = tuple[float, ...]
@@ -71,7 +72,7 @@ FACADE = Paint(cell_m=(9.0, 0.375), line_m=0.03, ink=BARK, pattern=_FACADE)
 ROAD = Paint(roughness=0.2, pattern=_ROAD)
 
 
-@njit(cache=True)
+@compiled()
 def paint_one(packed, u, v, grain, base):  # type: ignore[no-untyped-def]
     """The albedo of one point: blue, green, red, near infrared.
 
@@ -97,7 +98,7 @@ def paint_one(packed, u, v, grain, base):  # type: ignore[no-untyped-def]
     return (base[0] * light, base[1] * light, base[2] * light, base[3] * light)
 
 
-@njit(cache=True)
+@compiled()
 def _in_facade(x, y):  # type: ignore[no-untyped-def]
     """Framed windows in every bay, some with curtains, and a door in every third bay."""
     bay, storey = x // BAY_M, y // STOREY_M
@@ -114,7 +115,7 @@ def _in_facade(x, y):  # type: ignore[no-untyped-def]
     return CURTAIN if has_curtain else GLASS
 
 
-@njit(cache=True)
+@compiled()
 def _on_road(x, y, grain):  # type: ignore[no-untyped-def]
     """Markings that are not worn off, manhole covers, repairs."""
     if abs(y) < KERB_Y_M and grain < _WORN and _is_marked(x, y):
@@ -125,7 +126,7 @@ def _on_road(x, y, grain):  # type: ignore[no-untyped-def]
     return PATCH if is_patch else _NOTHING
 
 
-@njit(cache=True)
+@compiled()
 def _is_marked(x, y):  # type: ignore[no-untyped-def]
     """Lane lines, parking bays, stop lines, crossings and arrows."""
     off_lane, block, arrow = abs(abs(y) - LANE_M / 2), x % 34, x % 17
@@ -139,7 +140,7 @@ def _is_marked(x, y):  # type: ignore[no-untyped-def]
     return lane_line or bay or stop_line or shaft or head
 
 
-@njit(cache=True)
+@compiled()
 def _scramble(i, j):  # type: ignore[no-untyped-def]
     """A pseudo-random number in [0, 1) for a cell."""
     return math.sin(i * 12.9898 + j * 78.233) * 43758.5453 % 1

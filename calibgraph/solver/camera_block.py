@@ -224,25 +224,15 @@ def _error_gradient(residuals: Array, errors: Array, information: Array | None) 
 
 def merge(parts: Sequence[CameraBlock]) -> CameraBlock:
     """The correspondences of one camera's frames under each other, in the order given."""
-
-    def stack(columns: Sequence[Array | None]) -> Array | None:
-        """Rows of 2x2 matrices; the identity where a part has none."""
-        if all(column is None for column in columns):
-            return None
-        filled = [
-            np.tile(IDENTITY, (len(part.frame), 1)) if column is None else column
-            for column, part in zip(columns, parts, strict=True)
-        ]
-        return np.concatenate(filled)
-
-    block = replace(
-        parts[0].block,
-        points_lidar_m=np.concatenate([part.block.points_lidar_m for part in parts]),
-        pixels_px=np.concatenate([part.block.pixels_px for part in parts]),
-        sqrt_information=stack([part.block.sqrt_information for part in parts]),
-    )
-    information = stack([part.information for part in parts])
-    return CameraBlock(block, information, np.concatenate([part.frame for part in parts]))
+    block = ProjectionBlock.join([part.block for part in parts])
+    frame = np.concatenate([part.frame for part in parts])
+    if all(part.information is None for part in parts):
+        return CameraBlock(block, None, frame)
+    information = [
+        np.tile(IDENTITY, (len(part.frame), 1)) if part.information is None else part.information
+        for part in parts
+    ]
+    return CameraBlock(block, np.concatenate(information), frame)
 
 
 def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str, CameraBlock]:

@@ -177,13 +177,9 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         block: correspondences of one camera.
         T_lidar_camera: where; the Hessian is in its tangent.
     """
-    steps = np.eye(6) * _STEP
-    rows = [
-        block.sums(T_lidar_camera.retract(step)).gradient
-        - block.sums(T_lidar_camera.retract(-step)).gradient
-        for step in steps
-    ]
-    hessian = np.array(rows) / (2 * _STEP)
+    steps = np.vstack([np.eye(6), -np.eye(6)]) * _STEP
+    gradients = block.sums_at([T_lidar_camera.retract(step) for step in steps]).gradient
+    hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
     hessian = (hessian + hessian.T) / 2
     if np.linalg.eigvalsh(hessian)[0] > 0:
         return hessian

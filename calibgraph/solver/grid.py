@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def _cells(
     return np.asarray(rows * config.grid_columns + columns)
 
 
-@njit(cache=True)
+@compiled()
 def _best_of_equal_keys(camera, frame, cell, confidence):  # type: ignore[no-untyped-def]
     """(n,) which rows have the largest confidence, the first of them, among those of equal keys.
 

@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
 from calibgraph.tracking.cause import squared_sigmas
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import find_outlier_frame
 from calibgraph.tracking.start import count_residuals
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state import State
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -52,21 +53,20 @@ def set_aside(state: State, camera: int, block: CameraBlock) -> State:
     return state.with_camera(camera, camera_state.count(left_out=1, failed=1 if own is None else 0))
 
 
-def count_absorbed(state: State, camera: int, block: CameraBlock, used: int) -> State:
+def count_absorbed(state: State, camera: int, residuals: BlockResiduals, used: int) -> State:
     """The state with a camera's block counted as absorbed, and its residuals counted.
 
     Args:
-        state: with the estimate after the block was absorbed.
+        state: after the block was absorbed.
         camera: its place in the rig.
-        block: all matches of the frame.
-        used: how many of them are within the gate.
+        residuals: of all matches of the frame, at the estimate.
+        used: how many of them were absorbed.
     """
-    T_lidar_camera = state.T_lidar_camera[camera]
-    camera_state = count_residuals(state.cameras[camera], block, T_lidar_camera)
+    camera_state = count_residuals(state.cameras[camera], residuals)
     agreements = (*camera_state.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
     camera_state = replace(camera_state, agreements=agreements)
     return state.with_camera(
-        camera, camera_state.count(absorbed=1, given=len(block.frame), used=used)
+        camera, camera_state.count(absorbed=1, given=len(residuals.errors_px), used=used)
     )
 
 
@@ -77,12 +77,12 @@ def add_to_totals(state: State, frame: LiveFrame) -> State:
     """
     steps = np.array([*map(step_between, state.references, state.T_lidar_camera)])
     scores = frame.gradient + np.einsum("nij,nj->ni", frame.hessian, steps)
-    for camera in frame.used:
+    for camera in frame.raw:
         noise = state.frame_noise(camera)
         if noise is not None:
             unusual = squared_sigmas(scores[camera], noise)
             scores[camera] *= min(1.0, (_UNUSUAL / unusual) ** 0.5)
-    seen = np.array([camera in frame.used for camera in range(len(steps))])
+    seen = np.array([camera in frame.raw for camera in range(len(steps))])
     flat = scores.ravel()
     return replace(
         state,

@@ -11,6 +11,8 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR, pose_hessian, with_pseudo_frames
+from calibgraph.tracking.halves import Halves
+from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 from calibgraph.tracking.window import pose_priors
@@ -66,24 +68,33 @@ def _scaled(scatter: Array, factors: Array) -> Array:
     return scatter * np.outer(each, each)
 
 
-def assess(state: State, sums: Posterior, prior: Array) -> Assessment:
+def assess(state: State, sums: Posterior, halves: Halves, prior: Array) -> Assessment:
     """Assess the present estimates.
 
     Args:
         state: the tracker's.
         sums: over its summaries and live frames.
+        halves: the same sums, of every other epoch.
         prior: (6 n, 6 n) Hessian of priors and relative poses.
     """
     covariance = joint_covariance(state, sums, prior)
     conflicts = _conflicts(state, sums, covariance)
     verdicts = {}
     for camera, name in enumerate(state.names):
-        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts)
+        own = tuple(c for c in conflicts if name in (c.pair.a, c.pair.b))
+        estimates = halves.estimates(state, camera)
+        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=estimates)
     return Assessment(covariance, verdicts)
 
 
 def _verdict(
-    state: State, sums: Posterior, camera: int, covariance: Array, conflicts: list[Conflict]
+    state: State,
+    sums: Posterior,
+    camera: int,
+    covariance: Array,
+    *,
+    conflicts: tuple[Conflict, ...],
+    halves: tuple[Array, Array] | None,
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
@@ -97,8 +108,8 @@ def _verdict(
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=_data_sigmas(sums.hessian[camera]),
-        halves=_halves(state, camera),
-        conflicts=tuple(c for c in conflicts if name in (c.pair.a, c.pair.b)),
+        halves=halves,
+        conflicts=conflicts,
         pull=None,
         converged=True,
         terms="full",
@@ -137,7 +148,7 @@ def _recent_checks(state: State, one: CameraState) -> list[Check]:
 def recent_residuals(one: CameraState) -> Residuals:
     """Residuals of the recent frames."""
     return Residuals(
-        median_px=float(np.median(one.recent[:, 1])),
+        median_px=median(one.recent[:, 1]),
         inlier_share=one.inlier_share,
         sigma_px=one.scale.sigma_px,
         loss_scale_px=one.scale.loss_scale,
@@ -150,23 +161,6 @@ def _data_sigmas(hessian: Array) -> Array:
     if not is_determined(hessian):
         return np.full(6, np.inf)
     return np.sqrt(np.diag(np.linalg.inv(hessian)))
-
-
-def _halves(state: State, camera: int) -> tuple[Array, Array] | None:
-    """Two (4, 4) T_camera_lidar, from the even and from the odd epochs."""
-    summary = state.cameras[camera].summary
-    hessian, gradient = summary.halves_hessian.copy(), summary.halves_gradient.copy()
-    half = summary.next_half
-    for epoch in state.epochs:
-        for frame in epoch.frames:
-            hessian[half] += frame.hessian[camera]
-            gradient[half] += frame.gradient[camera]
-        half = 1 - half
-    if not all(map(is_determined, hessian)):
-        return None
-    steps = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
-    first, second = (to_T_camera_lidar(state.references[camera].retract(step)) for step in steps)
-    return first, second
 
 
 def _conflicts(state: State, sums: Posterior, covariance: Array) -> list[Conflict]:
@@ -226,7 +220,8 @@ def _counts(one: CameraState) -> dict[str, int]:
 def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
-    assessment = assess(state, sums, prior_hessian(state))
+    halves = Halves.of_closed_epochs(state).add(state.epochs[-1].frames)
+    assessment = assess(state, sums, halves, prior_hessian(state))
     estimates = zip(state.names, state.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

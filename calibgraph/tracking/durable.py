@@ -57,6 +57,7 @@ class DurableCalibrator:
             recovered = self._database.recovered
             self.damages = recovered.damages
             self._pending = len(recovered.inputs)
+            self._unwritten: tuple[bytes, int] | None = None
             if recovered.snapshot is None:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
                 self._snapshot()
@@ -81,12 +82,18 @@ class DurableCalibrator:
             OSError: if it cannot be written; then close this, and make a new one.
         """
         record = _encode_input(table, frame, self.tracker.initial_rig)
-        if self._pending >= _SNAPSHOT_EVERY:
-            self._snapshot()  # before this update: the journal always holds the last one
+        self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
         self._database.append(record)
         self._pending += 1
         return update
+
+    def _continue_snapshot(self) -> None:
+        """Encode the state when it is due, write it with the next update: neither waits long."""
+        if self._unwritten is not None:
+            self._write_snapshot(*self._unwritten)
+        elif self._pending >= _SNAPSHOT_EVERY:
+            self._unwritten = self.tracker.to_bytes(), self._database.number
 
     def close(self) -> None:
         """Write a last snapshot and release the folder."""
@@ -96,8 +103,12 @@ class DurableCalibrator:
             self._database.close()
 
     def _snapshot(self) -> None:
-        self._database.snapshot(self.tracker.to_bytes())
-        self._pending = 0
+        self._write_snapshot(self.tracker.to_bytes(), self._database.number)
+
+    def _write_snapshot(self, state: bytes, number: int) -> None:
+        self._database.snapshot(state, number)
+        self._pending = self._database.number - number
+        self._unwritten = None
 
     def __enter__(self) -> Self:
         return self

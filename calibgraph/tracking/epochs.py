@@ -14,8 +14,9 @@ from calibgraph.solver.camera_block import MIN_MATCHES, merge
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.posterior import true_hessian
-from calibgraph.tracking.state import CameraState, Epoch, State, block_diagonal
+from calibgraph.tracking.state import CameraState, State, block_diagonal
 
 Array = NDArray[np.float64]
 
@@ -50,17 +51,20 @@ def close_epoch(
 
 def _regate(state: State, epoch: Epoch) -> Epoch:
     """The epoch with its frames gated at its newest estimate."""
-    frames = []
-    for frame in epoch.frames:
-        used = {
-            camera: raw.without_outliers(
-                to_T_camera_lidar(epoch.T_lidar_camera[camera]), state.cameras[camera].scale
-            )
-            for camera, raw in frame.raw.items()
-        }
-        kept = {camera: m for camera, m in used.items() if len(m.frame) >= MIN_MATCHES}
-        frames.append(replace(frame, used={**frame.used, **kept}))
-    return replace(epoch, frames=tuple(frames))
+    inliers = [dict(frame.inliers) for frame in epoch.frames]
+    for camera, camera_state in enumerate(state.cameras):
+        seen = [place for place, frame in enumerate(epoch.frames) if camera in frame.raw]
+        if not seen:
+            continue
+        raw = [epoch.frames[place].raw[camera] for place in seen]
+        T_camera_lidar = to_T_camera_lidar(epoch.T_lidar_camera[camera])
+        rows = merge(raw).at(T_camera_lidar).inliers(camera_state.scale)
+        edges = np.cumsum([len(part.frame) for part in raw])[:-1]
+        for place, own in zip(seen, np.split(rows, edges), strict=True):
+            if np.count_nonzero(own) >= MIN_MATCHES:
+                inliers[place][camera] = own
+    frames = zip(epoch.frames, inliers, strict=True)
+    return replace(epoch, frames=tuple(replace(frame, inliers=own) for frame, own in frames))
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
@@ -115,14 +119,15 @@ def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
         return nothing
     T_lidar_camera, scale = epoch.T_lidar_camera[camera], state.cameras[camera].scale
     everything = merge(raw)
-    inliers = everything.without_outliers(to_T_camera_lidar(T_lidar_camera), scale)
+    residuals = everything.at(to_T_camera_lidar(T_lidar_camera))
+    inliers = everything.select(residuals.inliers(scale))
     if len(inliers.frame) < MIN_MATCHES:
         return nothing
     block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
     gradients = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame))).gradient
     scores[np.searchsorted(numbers, own)] = gradients
-    hessian = true_hessian(everything, block, scale, T_lidar_camera)
+    hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     to_reference = step_between(T_lidar_camera, state.references[camera])
     gradient = gradients.sum(axis=0) + hessian @ to_reference
     return _EpochSums(hessian, gradient, scores, len(own))

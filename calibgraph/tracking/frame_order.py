@@ -1,12 +1,16 @@
-"""Frames come in the order of their numbers, and of their times if they have them."""
+"""What an update takes: a frame after the last one, and what holds for it alone."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.tracking.state import State
+
+_FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
 
 
 def number_and_stamp(
@@ -22,7 +26,8 @@ def number_and_stamp(
     Raises:
         CorrespondenceError: if the table holds several frames, or one that is not after the last.
     """
-    numbers = np.unique(table.frame)
+    same = len(table) > 0 and (table.frame == table.frame[0]).all()
+    numbers = table.frame[:1] if same else np.unique(table.frame)
     if len(numbers) > 1:
         raise CorrespondenceError(
             f"an update takes one frame, found {len(numbers)} (from {numbers[0]} to "
@@ -52,3 +57,9 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
             "before; correct the clock: it is left out",
             frame=number,
         )
+
+
+def with_findings_per_frame(table: Correspondences) -> Correspondences:
+    """The table with only those findings of its matcher that hold for a single frame."""
+    kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
+    return table if kept == table.metadata else replace(table, metadata=kept)

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.camera_block import BlockResiduals
 from calibgraph.solver.covariance import robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import STRENGTHS, gain_of_walk, step_between
-from calibgraph.tracking.state import Epoch, LiveFrame, State, block_diagonal
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
+from calibgraph.tracking.state import State, block_diagonal
 from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
 
 
 def quadratic(
-    raw: CameraBlock,
-    used: CameraBlock,
+    residuals: BlockResiduals,
+    inliers: NDArray[np.bool_],
     scale: ResidualScale,
     T_lidar_camera: gtsam.Pose3,
     reference: gtsam.Pose3,
@@ -30,8 +31,8 @@ def quadratic(
     """The quadratic approximation of one frame's cost for a camera.
 
     Args:
-        raw: its matches.
-        used: those within the gate at T_lidar_camera.
+        residuals: of its matches at T_lidar_camera.
+        inliers: (m,) which of them are within the gate.
         scale: of the residuals.
         T_lidar_camera: near the minimum.
         reference: T_lidar_camera at which the gradient is taken.
@@ -39,8 +40,8 @@ def quadratic(
     Returns:
         (6, 6) true Hessian of half the cost there; (6,) gradient at the reference.
     """
-    block = used.with_scale(scale)
-    hessian = true_hessian(raw, block, scale, T_lidar_camera)
+    block = residuals.block.select(inliers).with_scale(scale)
+    hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     gradient = block.sums(T_lidar_camera).gradient + hessian @ step_between(
         T_lidar_camera, reference
     )
@@ -48,12 +49,13 @@ def quadratic(
 
 
 def true_hessian(
-    raw: CameraBlock, block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3
+    residuals: BlockResiduals,
+    block: ProjectionBlock,
+    scale: ResidualScale,
+    T_lidar_camera: gtsam.Pose3,
 ) -> Array:
     """(6, 6) of the robust cost of the matches in the gate, which moves with T_lidar_camera."""
-    return robust_hessian(block, T_lidar_camera) + raw.gate_hessian(
-        to_T_camera_lidar(T_lidar_camera), scale
-    )
+    return robust_hessian(block, T_lidar_camera) + residuals.gate_hessian(scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +103,7 @@ class Posterior:
         gradient = np.array([frame.gradient for frame in listed])
         scores = gradient + np.einsum("fnij,nj->fni", hessian, steps)
         flat = scores.reshape(len(listed), -1)
-        seen = np.array([[c in frame.used for c in range(len(steps))] for frame in listed])
+        seen = np.array([[c in frame.raw for c in range(len(steps))] for frame in listed])
         return Posterior(
             self.hessian + hessian.sum(axis=0),
             self.gradient + gradient.sum(axis=0),
@@ -156,6 +158,20 @@ def closed_posterior(state: State, before: int | None = None) -> Posterior:
     for epoch in state.epochs[:-1]:
         sums = sums.add(_until(epoch, before), steps).propagate(state, len(epoch.frames))
     return sums
+
+
+def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
+    """Per live epoch but the first, its place and the sums over the frames before it.
+
+    As ``posterior(state, number of its first frame)``, each frame added once.
+    """
+    sums, steps = Posterior.from_summaries(state), _steps(state)
+    for place, epoch in enumerate(state.epochs[:-1]):
+        sums = sums.add(epoch.frames, steps).propagate(state, len(epoch.frames))
+        before = sums
+        for later in state.epochs[place + 1 : -1]:
+            before = before.propagate(state, len(later.frames))
+        yield place + 1, before
 
 
 def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:

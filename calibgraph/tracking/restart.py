@@ -15,19 +15,15 @@ from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary, step_between
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.posterior import Posterior, inverse, posterior, quadratic
 from calibgraph.tracking.start import absorb_frames
-from calibgraph.tracking.state import (
-    DriftWatch,
-    LiveFrame,
-    State,
-    block_diagonal,
-    replace_item,
-)
+from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
 
 Array = NDArray[np.float64]
+Measured = tuple[Steps, dict[int, Array]]
 
 _RECENTLY = 300  # frames: a second small step within them is a drift
 _GUESSED_OVERCONFIDENCE = 100.0  # of H, while the frames' scatter is not known
@@ -52,8 +48,7 @@ def handle_small_step(state: State, detected: DetectedStep) -> tuple[State, tupl
 
 def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tuple[Event, ...]]:
     """The state after a step, with the moved cameras restarted, and the events."""
-    detected = _date_step(state, detected)
-    steps, now = _measure_steps(state, detected)
+    detected, (steps, now) = _date_step(state, detected)
     cause = find_cause(steps, detected.found_by)
     events = _make_events(state, detected.since, steps, cause)
     targets = {camera: state.references[camera].retract(now[camera]) for camera in cause.cameras}
@@ -73,12 +68,15 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
     return state, events
 
 
-def _date_step(state: State, detected: DetectedStep) -> DetectedStep:
-    """The step with its first frame: the one from which the new estimates fit better."""
-    steps, now = _measure_steps(state, detected)
+def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Measured]:
+    """The step with its first frame: the one from which the new estimates fit better.
+
+    With it, what :func:`_measure_steps` gives for it.
+    """
+    measured = steps, now = _measure_steps(state, detected)
     found_by = [camera for camera in detected.found_by if camera in steps.cameras]
     if not found_by:
-        return detected
+        return detected, measured
     before_and_after = {
         camera: (state.references[camera].retract(now[camera] - steps.of(place)[0]),
                  state.references[camera].retract(now[camera]))
@@ -93,9 +91,14 @@ def _date_step(state: State, detected: DetectedStep) -> DetectedStep:
         and _fits_better(state, detected, frames[place], before_and_after) is False
     ):
         place += 1
-    dated = replace(detected, since=frames[min(place, len(frames) - 1)].number)
-    dated_steps, _ = _measure_steps(state, dated)
-    return dated if set(found_by) <= set(dated_steps.cameras) else detected
+    since = frames[min(place, len(frames) - 1)].number
+    if since == detected.since:
+        return detected, measured
+    dated = replace(detected, since=since)
+    remeasured = _measure_steps(state, dated)
+    if set(found_by) <= set(remeasured[0].cameras):
+        return dated, remeasured
+    return detected, measured
 
 
 def _fits_better(
@@ -212,17 +215,18 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
         start = near[-1].T_lidar_camera if near else state.T_lidar_camera[camera]
         raw = merge(parts)
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
-        used = raw.without_outliers(to_T_camera_lidar(T_lidar_camera), camera_state.scale)
-        if len(used.frame) >= MIN_MATCHES:
+        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
+        inliers = residuals.inliers(camera_state.scale)
+        if np.count_nonzero(inliers) >= MIN_MATCHES:
             reference = state.references[camera]
             hessian[camera], gradient[camera] = quadratic(
-                raw, used, camera_state.scale, T_lidar_camera, reference
+                residuals, inliers, camera_state.scale, T_lidar_camera, reference
             )
             frames[camera] = len(parts)
     return Posterior(hessian, gradient, np.zeros((6 * n, 6 * n)), frames)
 
 
-def _measure_steps(state: State, detected: DetectedStep) -> tuple[Steps, dict[int, Array]]:
+def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     """The steps of the cameras; and per camera its estimate now, from its reference."""
     before, after = posterior(state, detected.since), _sums_since(state, detected)
     cameras, steps, now = [], [], {}

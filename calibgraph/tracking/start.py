@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import gtsam
@@ -12,9 +13,15 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
+from calibgraph.solver.camera_block import (
+    MIN_MATCHES,
+    BlockResiduals,
+    CameraBlock,
+    camera_blocks,
+)
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.noise import ResidualHistogram
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
+from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
@@ -64,13 +71,14 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
     """The state with a camera's first frames absorbed at its first estimate."""
     parts = [_camera_block(state, camera, table) for table in state.cameras[camera].waiting]
     usable = [part for part in parts if part is not None]
-    residuals = ResidualHistogram()
-    for part in usable:
-        residuals = residuals.add(part, to_T_camera_lidar(T_lidar_camera))
-    scale = residuals.scale(state.config)  # the gate by which inliers are counted below
+    residuals = [part.at(to_T_camera_lidar(T_lidar_camera)) for part in usable]
+    histogram = ResidualHistogram()
+    for one in residuals:
+        histogram = histogram.add(one)
+    scale = histogram.scale(state.config)  # the gate by which inliers are counted below
     camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
-    for part in usable:
-        camera_state = count_residuals(camera_state, part, T_lidar_camera)
+    for one in residuals:
+        camera_state = count_residuals(camera_state, one)
     state = state.with_camera(camera, camera_state)
     state = replace(state, references=replace_item(state.references, camera, T_lidar_camera))
     return absorb_frames(state, camera, usable, T_lidar_camera)
@@ -83,26 +91,18 @@ def absorb_frames(
 
     Blocks of live frames are added to them; older ones are left out.
     """
-    scale = state.cameras[camera].scale
-    T = to_T_camera_lidar(T_lidar_camera)
     by_number = {int(part.frame[0]): part for part in blocks}
-    epochs, counts = [], {"absorbed": 0, "given": 0, "used": 0}
+    epochs: list[Epoch] = []
+    counts: Counter[str] = Counter()
     for epoch in state.epochs:
         frames = []
         for frame in epoch.frames:
             raw = by_number.get(frame.number)
-            used = None if raw is None else raw.without_outliers(T, scale)
-            if raw is None or used is None or len(used.frame) < MIN_MATCHES:
-                frames.append(frame)
-                continue
-            sums = quadratic(raw, used, scale, T_lidar_camera, state.references[camera])
-            frames.append(frame.add(camera, raw, used, sums))
-            for key, more in (
-                ("absorbed", 1),
-                ("given", len(raw.frame)),
-                ("used", len(used.frame)),
-            ):
-                counts[key] += more
+            absorbed = None if raw is None else _absorb(state, frame, camera, raw, T_lidar_camera)
+            frames.append(absorbed or frame)
+            if raw is not None and absorbed is not None:
+                used = np.count_nonzero(absorbed.inliers[camera])
+                counts.update(absorbed=1, given=len(raw.frame), used=int(used))
         epochs.append(
             replace(
                 epoch,
@@ -114,15 +114,25 @@ def absorb_frames(
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 
-def count_residuals(
-    camera_state: CameraState, block: CameraBlock, T_lidar_camera: gtsam.Pose3
-) -> CameraState:
+def _absorb(
+    state: State, frame: LiveFrame, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
+) -> LiveFrame | None:
+    """The frame with a camera's matches, None if too few are within the gate."""
+    scale = state.cameras[camera].scale
+    residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
+    inliers = residuals.inliers(scale)
+    if np.count_nonzero(inliers) < MIN_MATCHES:
+        return None
+    sums = quadratic(residuals, inliers, scale, T_lidar_camera, state.references[camera])
+    return frame.add(camera, raw, inliers, sums)
+
+
+def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:
     """The camera with a frame's residuals counted."""
-    T = to_T_camera_lidar(T_lidar_camera)
-    errors, valid = block.errors_px(T)
-    share = float(np.mean(valid & (errors <= camera_state.scale.gate_px)))
-    recent = np.vstack([camera_state.recent, [share, float(np.median(errors))]])[-HISTORY:]
-    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(block, T))
+    share = float(np.mean(residuals.inliers(camera_state.scale)))
+    newest = [share, median(residuals.errors_px)]
+    recent = np.vstack([camera_state.recent, newest])[-HISTORY:]
+    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 
 def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:

@@ -13,13 +13,14 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
     inflation,
+    median,
     no_groups,
     widening,
 )
@@ -29,76 +30,6 @@ Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector
 HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
-
-
-@dataclass(frozen=True, eq=False)
-class LiveFrame:
-    """One frame whose matches are still kept.
-
-    Attributes:
-        number: of the frame.
-        raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
-        used: those within the gate.
-        hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
-        gradient: (n, 6) at the cameras' references.
-    """
-
-    number: int
-    raw: dict[int, CameraBlock]
-    used: dict[int, CameraBlock]
-    hessian: Array
-    gradient: Array
-
-    def without(self, camera: int) -> LiveFrame:
-        """The frame without one camera's matches."""
-        hessian, gradient = self.hessian.copy(), self.gradient.copy()
-        hessian[camera], gradient[camera] = 0.0, 0.0
-        raw = {c: m for c, m in self.raw.items() if c != camera}
-        used = {c: m for c, m in self.used.items() if c != camera}
-        return LiveFrame(self.number, raw, used, hessian, gradient)
-
-    def add(
-        self, camera: int, raw: CameraBlock, used: CameraBlock, sums: tuple[Array, Array]
-    ) -> LiveFrame:
-        """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
-        hessian, gradient = self.hessian.copy(), self.gradient.copy()
-        hessian[camera], gradient[camera] = sums
-        return LiveFrame(
-            self.number, {**self.raw, camera: raw}, {**self.used, camera: used}, hessian, gradient
-        )
-
-    @staticmethod
-    def empty(number: int, cameras: int) -> LiveFrame:
-        """A frame without matches."""
-        return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
-
-
-@dataclass(frozen=True, eq=False)
-class Epoch:
-    """Frames that share one extrinsic per camera.
-
-    Attributes:
-        frames: in order.
-        T_lidar_camera: per camera, the estimate.
-    """
-
-    frames: tuple[LiveFrame, ...]
-    T_lidar_camera: tuple[gtsam.Pose3, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class OutlierFrame:
-    """A frame that disagrees with a camera's estimate but fits another T_lidar_camera.
-
-    Attributes:
-        number: of the frame.
-        raw: its matches.
-        T_lidar_camera: that fits them.
-    """
-
-    number: int
-    raw: CameraBlock
-    T_lidar_camera: gtsam.Pose3
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +72,7 @@ class CameraState:
     @property
     def inlier_share(self) -> float:
         """Median share of inliers of the last absorbed frames."""
-        return float(np.median(self.recent[:, 0]))
+        return median(self.recent[:, 0])
 
     def count(self, **more: int) -> CameraState:
         """The camera with some counts raised."""

@@ -31,19 +31,13 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
-from calibgraph.tracking.state import (
-    CameraState,
-    DriftWatch,
-    Epoch,
-    LiveFrame,
-    OutlierFrame,
-    State,
-)
+from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/2"
-"""Of the archive; 1 was a layout of its own without an archive."""
+FORMAT = "calibgraph-tracker-state/3"
+"""Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
 _EARLIER_MARK = b"calibgraph-tracker/1\n"

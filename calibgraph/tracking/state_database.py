@@ -15,26 +15,27 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import os
 import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
-from itertools import zip_longest
 from pathlib import Path
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
+from calibgraph.tracking.state_recovery import checksum, log_of, read
 
 DATABASE = "state.sqlite"
 LAYOUT = 2  # 1 was a folder of files snapshot-*.state and journal-*.log
 
 _APPLICATION = 0x43474254  # "CGBT", in the header of the database
 _HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
+_PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
+_LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as by default
 _EARLIER_FILES = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
+    PRAGMA page_size={_PAGE_BYTES};
     PRAGMA journal_mode=WAL;
     PRAGMA application_id={_APPLICATION};
     PRAGMA user_version={LAYOUT};
@@ -43,21 +44,6 @@ _TABLES = f"""
     CREATE TABLE status (number INTEGER NOT NULL, is_open INTEGER NOT NULL);
     INSERT INTO status VALUES (0, 0);
 """
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """What a database holds.
-
-    Attributes:
-        snapshot: the newest undamaged snapshot; None if there is none yet.
-        inputs: the inputs after it, in order; the last may be one that was not acknowledged.
-        damages: one line for each damaged snapshot, and for a log that is missing.
-    """
-
-    snapshot: bytes | None
-    inputs: tuple[bytes, ...]
-    damages: tuple[str, ...]
 
 
 class StateDatabase:
@@ -86,7 +72,7 @@ class StateDatabase:
             _require_layout(folder)
             if not self._path.exists():
                 _create(self._path)
-            self.recovered, self._number = _read(self._path)
+            self.recovered, self._number = read(self._path)
         except BaseException:
             self.close()
             raise
@@ -99,20 +85,26 @@ class StateDatabase:
         """
         number = self._number + 1
         with self._writing() as connection:
-            row = number, content, _digest(number, content)
+            row = number, content, checksum(number, content)
             connection.execute("INSERT INTO journal VALUES (?, ?, ?)", row)
             connection.execute("UPDATE status SET number = ?", (number,))
         self._number = number
 
-    def snapshot(self, state: bytes) -> None:
-        """Keep ``state``, which all inputs so far led to; it is durable when this returns.
+    @property
+    def number(self) -> int:
+        """Number of the last input."""
+        return self._number
+
+    def snapshot(self, state: bytes, number: int | None = None) -> None:
+        """Keep ``state``, which the inputs up to a number (the last) led to; durable on return.
 
         Snapshots and inputs older than the snapshot before this one are removed.
 
         Raises:
             OSError: if it cannot be written; the earlier snapshot and the inputs are safe.
         """
-        row = self._number, state, _digest(self._number, state)
+        number = self._number if number is None else number
+        row = number, state, checksum(number, state)
         with self._writing() as connection:
             connection.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", row)
             (kept,) = connection.execute(
@@ -180,7 +172,7 @@ def _require_layout(folder: Path) -> None:
             message = "is state of the earlier layout calibgraph-tracker/1; choose another folder"
             raise FileError(found, f"{message}, or continue with the calibgraph that wrote it")
     if not path.exists():
-        if _log_of(path).exists():
+        if log_of(path).exists():
             raise FileError(path, "is missing, and its log is there; restore it from a copy")
         return
     with path.open("rb") as file:
@@ -195,10 +187,6 @@ def _require_layout(folder: Path) -> None:
         raise FileError(path, f"{message}, or continue with the calibgraph that wrote it")
 
 
-def _log_of(path: Path) -> Path:
-    return path.with_name(f"{path.name}-wal")
-
-
 def _create(path: Path) -> None:
     """Put an empty database in place, whole or not at all."""
     for leftover in path.parent.glob(f".writing-*{path.suffix}*"):
@@ -211,10 +199,11 @@ def _create(path: Path) -> None:
     write_atomically(path, write)
 
 
-_OPEN_FOR_WRITING = """
+_OPEN_FOR_WRITING = f"""
     PRAGMA locking_mode=EXCLUSIVE;
     PRAGMA journal_mode=WAL;
     PRAGMA synchronous=FULL;
+    PRAGMA wal_autocheckpoint={_LOG_PAGES};
     UPDATE status SET is_open = 1;
     PRAGMA wal_checkpoint(PASSIVE);
 """
@@ -229,69 +218,6 @@ def _connect(path: Path) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
-
-
-def _read(path: Path) -> tuple[Recovered, int]:
-    """What the database holds, and the number of its last input; no file is changed.
-
-    Raises:
-        FileError: if it is damaged.
-    """
-    log = _log_of(path)
-    had_log = log.exists() and log.stat().st_size > 0
-    try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
-            (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
-            if state != "ok":
-                raise _damaged(path, state)
-            number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
-            recovered = _recover(database, path, number)
-    except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
-        raise _damaged(path, error) from error
-    finally:
-        _remove_index(path, had_log=had_log)
-    if is_open and not had_log:
-        line = f"{log}: is missing, updates may be lost; went on after update {number}"
-        recovered = replace(recovered, damages=(*recovered.damages, line))
-    return recovered, number
-
-
-def _remove_index(path: Path, *, had_log: bool) -> None:
-    """Remove what reading leaves beside a database: the index of the log, and an empty log."""
-    path.with_name(f"{path.name}-shm").unlink(missing_ok=True)
-    if not had_log:
-        _log_of(path).unlink(missing_ok=True)
-
-
-def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered:
-    """The newest undamaged snapshot, and all inputs after it up to the newest."""
-    damages: list[str] = []
-    start, snapshot = 0, None
-    query = "SELECT number, content, digest FROM snapshot ORDER BY number DESC"
-    for number, content, digest in database.execute(query):
-        if digest == _digest(number, content):
-            start, snapshot = number, content
-            break
-        damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
-    if damages and snapshot is None:
-        raise _damaged(path, "no snapshot has the right checksum")
-    query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
-    rows = database.execute(query, (start,)).fetchall()
-    for expected, row in zip_longest(range(start + 1, newest + 1), rows):
-        if row is None or row[0] != expected or row[2] != _digest(*row[:2]):
-            raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
-    return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
-
-
-def _digest(number: int, content: object) -> bytes:
-    if not isinstance(content, bytes):
-        return b""
-    return hashlib.sha256(str(number).encode() + b" " + content).digest()
-
-
-def _damaged(path: Path, why: object) -> FileError:
-    advice = "restore its folder from a copy, or choose another folder"
-    return FileError(path, f"is damaged ({why}); {advice}")
 
 
 def _cannot_write(path: Path, error: sqlite3.Error) -> OSError:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
+from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.posterior import Posterior, posterior
-from calibgraph.tracking.state import CameraState, OutlierFrame, State
+from calibgraph.tracking.posterior import Posterior, posteriors_before_epochs
+from calibgraph.tracking.state import CameraState, State
 
 Array = NDArray[np.float64]
 
@@ -44,6 +45,8 @@ def detect_step(state: State) -> DetectedStep | None:
     as many frames to show whether it moved too.
     """
     needed = state.config.tracking.step_frames
+    if not any(_has_enough(camera_state, needed) for camera_state in state.cameras):
+        return None
     clusters = {c: _cluster(camera_state) for c, camera_state in enumerate(state.cameras)}
     found_by = {
         c: near
@@ -64,6 +67,15 @@ def detect_step(state: State) -> DetectedStep | None:
     if waiting and longest < needed + _PATIENCE:
         return None
     return DetectedStep(since, frozenset(found_by), clusters)
+
+
+def _has_enough(camera_state: CameraState, needed: int) -> bool:
+    """Whether a cluster of outlier frames may be large enough: if all since its first agree."""
+    frames = camera_state.outlier_frames
+    return any(
+        count >= max(needed, _OUTVOTE * _count_agreeing(camera_state, frames[-count].number))
+        for count in range(needed, len(frames) + 1)
+    )
 
 
 def _cluster(camera_state: CameraState) -> tuple[OutlierFrame, ...]:
@@ -101,11 +113,11 @@ def detect_small_step(state: State) -> DetectedStep | None:
     best, detected = 0.0, None
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
-    for epoch in state.epochs[1:]:
-        if not epoch.frames:
+    afterwards = _sums_from_each_epoch(state)
+    for place, before in posteriors_before_epochs(state):
+        if not state.epochs[place].frames:
             continue
-        since = epoch.frames[0].number
-        before, after = posterior(state, since), _absorbed_since(state, since)
+        since, after = state.epochs[place].frames[0].number, afterwards[place]
         for camera, camera_state in enumerate(state.cameras):
             excess = _shift_excess(state, camera, before, after)
             if camera_state.started and excess > best:
@@ -113,14 +125,47 @@ def detect_small_step(state: State) -> DetectedStep | None:
     return detected
 
 
-def _shift_excess(state: State, camera: int, before: Posterior, after: Posterior) -> float:
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums of the absorbed frames since a time, about the references.
+
+    Attributes:
+        hessian: (n, 6, 6) per camera.
+        gradient: (n, 6).
+        frames: (n,).
+    """
+
+    hessian: Array
+    gradient: Array
+    frames: Array
+
+
+def _sums_from_each_epoch(state: State) -> list[_Sums]:
+    """Per live epoch the sums over its frames and all later ones."""
+    n = len(state.cameras)
+    sums = _Sums(np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n))
+    found = []
+    for epoch in reversed(state.epochs):
+        hessian, gradient, frames = sums.hessian, sums.gradient, sums.frames
+        for frame in epoch.frames:
+            hessian, gradient = hessian + frame.hessian, gradient + frame.gradient
+            frames = frames + [camera in frame.raw for camera in range(n)]
+        sums = _Sums(hessian, gradient, frames)
+        found.append(sums)
+    return found[::-1]
+
+
+def _shift_excess(state: State, camera: int, before: Posterior, after: _Sums) -> float:
     """Excess of the contradiction between a camera's frames before and after, over the limit.
 
     A score test: undetermined directions do not count.
     """
-    step, frames = before.step(camera), before.frames[camera]
+    frames = before.frames[camera]
     known_scatter = state.cameras[camera].groups[0].count >= _LEAST_EPOCHS
-    if step is None or frames < _BEFORE or not known_scatter or not after.frames[camera]:
+    if frames < _BEFORE or not known_scatter or not after.frames[camera]:
+        return 0.0
+    step = before.step(camera)
+    if step is None:
         return 0.0
     hessian = after.hessian[camera]
     rows = pose_rows(camera)
@@ -132,13 +177,3 @@ def _shift_excess(state: State, camera: int, before: Posterior, after: Posterior
     ) * state.inflation(camera)
     score = after.gradient[camera] + hessian @ step
     return squared_sigmas(score, covariance) / alarm_limit(frames) - 1.0
-
-
-def _absorbed_since(state: State, since: int) -> Posterior:
-    """The sums over the absorbed frames since a frame number, linearized at the estimate."""
-    n = len(state.cameras)
-    nothing = Posterior(
-        np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((6 * n, 6 * n)), np.zeros(n)
-    )
-    frames = [frame for frame in state.live_frames if frame.number >= since]
-    return nothing.add(frames, np.zeros((n, 6)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,15 +24,17 @@ from calibgraph.tracking.absorption import (
     set_aside,
     with_open_frame,
 )
-from calibgraph.tracking.assessment import assess, prior_hessian, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, prior_hessian, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import number_and_stamp
+from calibgraph.tracking.frame_order import number_and_stamp, with_findings_per_frame
+from calibgraph.tracking.halves import Halves
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import try_to_start
-from calibgraph.tracking.state import LiveFrame, State
+from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
     StateError,
     decode,
@@ -43,10 +46,7 @@ from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.update import Update, current_rig, make_update
 from calibgraph.tracking.window import Window
 
-Array = NDArray[np.float64]
-
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-_FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
 
 
 class IncrementalCalibrator:
@@ -66,13 +66,18 @@ class IncrementalCalibrator:
     _epoch_start: State
     _since_epoch_start: list[tuple[int, Correspondences]]
 
+    _rig_at: tuple[gtsam.Pose3, ...] | None = None
+
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
 
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return current_rig(self._state)
+        estimates = self._state.T_lidar_camera
+        if self._rig_at is not estimates:
+            self._rig_at, self._rig = estimates, current_rig(self._state)
+        return self._rig
 
     @property
     def initial_rig(self) -> Rig:
@@ -104,7 +109,7 @@ class IncrementalCalibrator:
             CorrespondenceError: if the table holds several frames, a camera that the rig does not
                 have, or a frame that does not come after the last one. Nothing has changed then.
         """
-        table = _with_findings_per_frame(table)
+        table = with_findings_per_frame(table)
         number, stamp = number_and_stamp(table, frame, self._state)
         blocks = self._blocks_by_camera(table)
         start, since = self._epoch_start, list(self._since_epoch_start)
@@ -144,10 +149,13 @@ class IncrementalCalibrator:
         events += seen + self._restart_after_step()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
-        sums = with_open_epoch(self._closed, self._state)
-        return make_update(
-            self._state, assess(self._state, sums, self._prior_hessian), tuple(events), used
-        )
+        return make_update(self._state, self.rig, self._assess(), tuple(events), used)
+
+    def _assess(self) -> Assessment:
+        """Assess the estimates: the sums over closed epochs are at hand."""
+        state = self._state
+        sums, halves = with_open_epoch(self._closed, state), self._closed_halves
+        return assess(state, sums, halves.add(state.epochs[-1].frames), self._prior_hessian)
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
@@ -197,6 +205,7 @@ class IncrementalCalibrator:
         self._prior_hessian = prior_hessian(self._state)
         self._copy_estimates()
         self._closed = closed_posterior(self._state)
+        self._closed_halves = Halves.of_closed_epochs(self._state)
 
     def _blocks_by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
         """The preprocessed matches of each camera that has enough."""
@@ -224,23 +233,31 @@ class IncrementalCalibrator:
         if not agreeing:
             return {}
         scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
-        places = self._window.add({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
-        gated = {
-            c: block.without_outliers(to_T_camera_lidar(self._window.T_lidar_camera(c)), scales[c])
-            for c, block in agreeing.items()
-        }
-        used = {c: block for c, block in gated.items() if len(block.frame) >= MIN_MATCHES}
-        self._window.replace(places, {c: block.with_scale(scales[c]) for c, block in used.items()})
+        self._window.fit({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
+        inliers = self._inliers(agreeing)
+        used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
+        self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
         self._copy_estimates()
         open_frame = self._state.epochs[-1].frames[-1]
-        for camera, inliers in used.items():
-            T_lidar_camera = self._state.T_lidar_camera[camera]
-            raw, reference = agreeing[camera], self._state.references[camera]
-            sums = quadratic(raw, inliers, scales[camera], T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, raw, inliers, sums)
-            self._state = count_absorbed(self._state, camera, raw, len(inliers.frame))
+        for camera, rows in inliers.items():
+            T_lidar_camera, scale = self._state.T_lidar_camera[camera], scales[camera]
+            residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
+            reference = self._state.references[camera]
+            sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
+            open_frame = open_frame.add(camera, agreeing[camera], rows, sums)
+            self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
         self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
         return used
+
+    def _inliers(self, blocks: dict[int, CameraBlock]) -> dict[int, NDArray[np.bool_]]:
+        """Per camera which matches are within the gate at the new estimate, if enough are."""
+        inliers = {}
+        for camera, block in blocks.items():
+            T_camera_lidar = to_T_camera_lidar(self._window.T_lidar_camera(camera))
+            rows = block.at(T_camera_lidar).inliers(self._state.cameras[camera].scale)
+            if np.count_nonzero(rows) >= MIN_MATCHES:
+                inliers[camera] = rows
+        return inliers
 
     def _copy_estimates(self) -> None:
         """Copy the estimates of the last epoch from iSAM2 to the state."""
@@ -280,9 +297,3 @@ class IncrementalCalibrator:
             events += more
         self._resume(self._state)
         return events
-
-
-def _with_findings_per_frame(table: Correspondences) -> Correspondences:
-    """The table with only those findings of its matcher that hold for a single frame."""
-    kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
-    return replace(table, metadata=kept)

@@ -48,6 +48,7 @@ class Update:
 
 def make_update(
     state: State,
+    rig: Rig,
     assessment: Assessment,
     events: tuple[Event, ...],
     used: Mapping[int, CameraBlock],
@@ -56,6 +57,7 @@ def make_update(
 
     Args:
         state: after the frame.
+        rig: with the estimates.
         assessment: of its estimates.
         events: detected with the frame.
         used: per camera, by its place in the rig, the absorbed matches.
@@ -64,7 +66,7 @@ def make_update(
     return Update(
         frame=state.frame or 0,
         stamp_ns=state.stamp_ns,
-        T_camera_lidar=current_rig(state).T_camera_lidar,
+        T_camera_lidar=rig.T_camera_lidar,
         covariance=covariance_by_camera(assessment, names),
         verdicts=assessment.verdicts,
         events=events,

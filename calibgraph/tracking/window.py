@@ -4,7 +4,7 @@ A camera with a random walk has a variable per epoch:
 
     summary - x(c, 0) - walk - x(c, 1) - walk - ... - x(c, last) - priors, relative poses
                 |                |                      |
-              block            block             one block per frame
+              block            block             block, block of the frames added
 
 A static camera has a single variable for all of its blocks.
 
@@ -14,7 +14,7 @@ independent of correspondences, are added once, at the last epoch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
@@ -24,6 +24,7 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
+from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
 
@@ -52,24 +53,38 @@ class Window:
                     values.insert(self._key(place, camera), T_lidar_camera)
         graph = join(self._summary_graph(state), self._walk_graph(state), pose_priors(state))
         for camera, camera_state in enumerate(state.cameras):
-            for key, seen in self._by_key(state, camera).items():
-                graph.add(block_factor(key, merge(seen).with_scale(camera_state.scale)))
+            for key, inliers in self._by_key(state, camera).items():
+                graph.add(block_factor(key, inliers.with_scale(camera_state.scale)))
         self._isam.update(graph, values)
+        self._added: dict[int, ProjectionBlock] = {}
+        self._places: dict[int, int] = {}
+        self._tried: tuple[int, ...] = ()
 
-    def add(self, blocks: Mapping[int, ProjectionBlock]) -> list[int]:
-        """Add a frame's blocks to the last epoch; returns their places, for :meth:`replace`."""
-        graph = gtsam.NonlinearFactorGraph()
-        for camera, block in blocks.items():
-            graph.add(block_factor(self._key_of_last(camera), block))
-        result = self._isam.update(graph, gtsam.Values())
-        return list(result.getNewFactorsIndices())
+    def fit(self, blocks: Mapping[int, ProjectionBlock]) -> None:
+        """The first pass of a frame: one step with its blocks."""
+        self._tried = tuple(blocks)
+        self._exchange({c: self._with_earlier(c, block) for c, block in blocks.items()})
 
-    def replace(self, places: Sequence[int], blocks: Mapping[int, ProjectionBlock]) -> None:
-        """Replace the blocks at some places."""
-        graph = gtsam.NonlinearFactorGraph()
+    def refit(self, blocks: Mapping[int, ProjectionBlock]) -> None:
+        """The second pass: one step with these blocks in the place of those of the first."""
+        self._added |= {c: self._with_earlier(c, block) for c, block in blocks.items()}
+        self._exchange({camera: self._added.get(camera) for camera in self._tried})
+
+    def _with_earlier(self, camera: int, block: ProjectionBlock) -> ProjectionBlock:
+        """A block under those of the frames that were added before."""
+        earlier = self._added.get(camera)
+        return block if earlier is None else ProjectionBlock.join([earlier, block])
+
+    def _exchange(self, blocks: Mapping[int, ProjectionBlock | None]) -> None:
+        """One step with other blocks of the added frames: one factor per camera holds them all."""
+        removed = [self._places.pop(camera) for camera in blocks if camera in self._places]
+        graph, added = gtsam.NonlinearFactorGraph(), []
         for camera, block in blocks.items():
-            graph.add(block_factor(self._key_of_last(camera), block))
-        self._isam.update(graph, gtsam.Values(), list(places))
+            if block is not None:
+                graph.add(block_factor(self._key_of_last(camera), block))
+                added.append(camera)
+        result = self._isam.update(graph, gtsam.Values(), removed)
+        self._places.update(zip(added, result.getNewFactorsIndices(), strict=True))
 
     def T_lidar_camera(self, camera: int) -> gtsam.Pose3:
         """The estimate of a camera in the last epoch."""
@@ -91,14 +106,19 @@ class Window:
     def _key_of_last(self, camera: int) -> int:
         return self._key(self._epochs - 1, camera)
 
-    def _by_key(self, state: State, camera: int) -> dict[int, list[CameraBlock]]:
-        """A camera's matches of all frames, by the key of their variable."""
-        by_key: dict[int, list[CameraBlock]] = {}
+    def _by_key(self, state: State, camera: int) -> dict[int, CameraBlock]:
+        """A camera's inliers of all frames, by the key of their variable."""
+        seen: dict[int, list[LiveFrame]] = {}
         for place, epoch in enumerate(state.epochs):
-            seen = [frame.used[camera] for frame in epoch.frames if camera in frame.used]
-            if seen:
-                by_key.setdefault(self._key(place, camera), []).extend(seen)
-        return by_key
+            for frame in epoch.frames:
+                if camera in frame.raw:
+                    seen.setdefault(self._key(place, camera), []).append(frame)
+        return {
+            key: merge([frame.raw[camera] for frame in frames]).select(
+                np.concatenate([frame.inliers[camera] for frame in frames])
+            )
+            for key, frames in seen.items()
+        }
 
     def _summary_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
         """The summaries of older epochs as factors on the first live one."""

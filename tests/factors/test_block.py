@@ -155,6 +155,37 @@ def test_selected_correspondences_are_those_of_the_arrays() -> None:
     np.testing.assert_array_equal(part.sums(TRUTH).hessian, made.sums(TRUTH).hessian)
 
 
+@pytest.mark.parametrize("plain", [False, True])
+def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
+    """To the last bit; a block without whitening counts as one with the identity."""
+    whole = world(LENSES["radtan"], 90)
+    parts = [whole.select(np.arange(k, k + 30)) for k in (0, 30, 60)]
+    if plain:
+        parts[1] = replace(parts[1], sqrt_information=None)
+        roots = whole.sqrt_information.copy()
+        roots[30:60] = [1.0, 0.0, 1.0]
+        whole = replace(whole, sqrt_information=roots)
+    joined = ProjectionBlock.join(parts)
+    for name in ("points_lidar_m", "pixels_px", "sqrt_information"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+    found, expected = joined.sums(TRUTH), whole.sums(TRUTH)
+    np.testing.assert_array_equal(found.hessian, expected.hessian)
+    assert found.cost == expected.cost
+
+
+@pytest.mark.parametrize("count", [0, 40, 5000])
+def test_sums_at_several_poses_are_the_sums_at_each(count: int) -> None:
+    block = world(LENSES["pinhole"], count).rescale(scale=3.0, sigma=0.7)
+    poses = [TRUTH.retract(np.full(6, step)) for step in (0.0, 1e-3, -0.02)]
+    found = block.sums_at(poses)
+    for k, pose in enumerate(poses):
+        expected = block.sums(pose)
+        for name in ("hessian", "gradient", "cost"):
+            value = getattr(expected, name)
+            scale = np.abs(value).max() or 1.0  # sums in another order: rounding alone
+            np.testing.assert_allclose(getattr(found, name)[k], value, rtol=0, atol=1e-13 * scale)
+
+
 def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
     """The sum of logarithms is taken as that of a product, of weights down to 1e-20 each here."""
     points = np.tile([0.0, 0.0, 1.0], (1001, 1))

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from calibgraph.errors import FileError
-from calibgraph.tracking.state_database import DATABASE, Recovered, StateDatabase
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from calibgraph.tracking.state_recovery import Recovered
 
 INPUT_BYTES = 3
 LOG = f"{DATABASE}-wal"

@@ -228,6 +228,23 @@ def test_a_tracker_that_throws_leaves_the_state_as_it_was(
         assert json_line(calibrator.update(world.tables[7])) == world.lines[7]
 
 
+@pytest.mark.parametrize("updates", [5, 6, 7, 11, 12])
+def test_a_kill_before_and_after_a_snapshot_is_written_costs_nothing(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, updates: int
+) -> None:
+    """It is encoded at every 5th update and written with the next one."""
+    monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 5)
+    calibrator = DurableCalibrator(tmp_path / "state", world.guess)
+    for table in world.tables[:updates]:
+        calibrator.update(table)
+    shutil.copytree(tmp_path / "state", tmp_path / "copy")  # as a kill leaves it
+    with DurableCalibrator(tmp_path / "copy", world.guess) as resumed:
+        assert resumed.repeated is not None and resumed.damages == ()
+        found = [resumed.repeated, *map(resumed.update, world.tables[updates:])]
+    assert [json_line(update) for update in found] == world.lines[updates - 1 :]
+    calibrator.close()
+
+
 @pytest.mark.parametrize("at", [0, 4, 9, 10, 13])
 def test_after_a_crash_the_last_line_comes_again(
     at: int, world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

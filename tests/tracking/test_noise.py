@@ -34,7 +34,7 @@ def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
     T = pair.T_camera_lidar["left"]
     spread = ResidualHistogram()
     for frame in range(40):
-        spread = spread.add(matches_of(pair, table.select(table.frame == frame), "left"), T)
+        spread = spread.add(matches_of(pair, table.select(table.frame == frame), "left").at(T))
     expected = matches_of(pair, table, "left").scale(T, Config())
     found = spread.scale(Config())
     assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from calibgraph.errors import FileError
-from calibgraph.tracking.state_database import DATABASE, Recovered, StateDatabase
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from calibgraph.tracking.state_recovery import Recovered
 from tests.tracking.state_data import (
     INPUT_BYTES,
     LOG,
@@ -269,7 +270,7 @@ def file_size_limit(limit_bytes: int) -> Iterator[None]:
 
 
 def test_a_write_that_fails_at_any_byte_loses_no_acknowledged_input(memory: Path) -> None:
-    for limit in range(20_000, 80_000, 997):
+    for limit in range(20_000, 2_000_000, 14_983):
         folder = memory / str(limit)
         done, failed = b"", False
         database = StateDatabase(folder)
@@ -291,7 +292,7 @@ def test_a_write_that_fails_at_any_byte_loses_no_acknowledged_input(memory: Path
             again.append(b"abc")
         assert recovered(folder).inputs[-1] == b"abc"
         if not failed:
-            assert limit > 40_000
+            assert limit > 300_000
             return
     pytest.fail("no limit was large enough")
 

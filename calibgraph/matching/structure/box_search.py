@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
 from calibgraph.matching.structure.cross_entropy import maximize
@@ -96,6 +95,8 @@ def search_box(
 
 def _sample(coarse: CorrelationMaps, box: Box, rng: np.random.Generator) -> list[Array]:
     """Samples of the box, each shifted to the right and down to its best z-score; best first."""
+    from scipy.stats import qmc  # takes half a second, which solve() does not need
+
     unit = qmc.Sobol(6, seed=rng).random(SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
     displacements[:, 1] = 0.0  # the rotation to the right, of which all values are tried

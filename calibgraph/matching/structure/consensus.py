@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.cross_entropy import maximize
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.shift_scores import ShiftScores
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def _maximize_once(
     )
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
     """Add bilinearly interpolated scores; shifts outside the grid count 0. unknowns: (k, n).
 

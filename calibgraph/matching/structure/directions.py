@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -54,7 +55,7 @@ def thin(directions: Array, cell_rad: float) -> Rows:
     return nearest[nearest >= 0]
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest):  # type: ignore[no-untyped-def]
     """The direction nearest to the centre of each cell; its squared distance is in cells."""
     least = np.empty(len(nearest))

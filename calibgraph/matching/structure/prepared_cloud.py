@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from calibgraph.matching.structure.directions import scan_angles
 from calibgraph.matching.structure.visibility import find_visible
@@ -46,6 +45,8 @@ class PreparedCloud:
         cloud: NDArray[np.float32], tables: WindowTables | None = None
     ) -> PreparedCloud:
         """Prepare a cloud, (n, 4) x y z [m] and intensity (NaN where there is none)."""
+        from scipy.stats import rankdata  # takes half a second, which solve() does not need
+
         points = cloud[:, :3].astype(np.float64)
         distance_m = np.linalg.norm(points, axis=1)
         far = distance_m > MIN_RANGE_M

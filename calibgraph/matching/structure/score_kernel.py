@@ -11,7 +11,8 @@ keeps single precision: its sum of squares is then not the difference of two lar
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from factors.compiled import compiled
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
 MIN_RESIDUAL_SHARE = 0.1  # of an image's variance, which no cloud explains
@@ -21,7 +22,7 @@ MIN_PATCH_SHARE = 0.35  # of a patch that is of use; below, rows of shifts are t
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
     """Add every window's score at all shifts to its group's grid.
 
@@ -90,7 +91,7 @@ def score_windows(image, places, counts, basis, group, origin, likelihood, grids
         _take_logarithms(factors, grids[group[-1]])
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: ignore[no-untyped-def]
     """Over a window's points, at each shift k: sums of basis[p] v, of v and of v^2.
 
@@ -140,7 +141,7 @@ def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: i
                 trend_v[k] += d0 * v0
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def _add_shares(sums, at, n, grid):  # type: ignore[no-untyped-def]
     """Add the share of explained variance at each shift of a row."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
@@ -151,7 +152,7 @@ def _add_shares(sums, at, n, grid):  # type: ignore[no-untyped-def]
         grid[k] += (depth[k] * depth[k] + intensity[k] * abs(intensity[k])) / variation
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def _multiply_factors(sums, at, n, factors):  # type: ignore[no-untyped-def]
     """Multiply by the residual share at each shift of a row, or divide if the share is negative."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
@@ -162,7 +163,7 @@ def _multiply_factors(sums, at, n, factors):  # type: ignore[no-untyped-def]
         factors[k] *= residual if share > 0 else np.float32(1) / residual
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True, nogil=True, error_model="numpy")
 def _take_logarithms(factors, grid):  # type: ignore[no-untyped-def]
     """Subtract the logarithms of the factors from a grid; the factors become 1."""
     for row in range(grid.shape[0]):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
+from factors.compiled import compiled
 from factors.lens import is_projectable, project_one
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def find_places(
     return places
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
     for w in range(rays_m.shape[0]):
         for p in range(rays_m.shape[1]):
@@ -80,7 +80,7 @@ def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: igno
             places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: ignore[no-untyped-def]
     count = 0
     for i in range(len(points)):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from factors.compiled import compiled
 
 INTENSITY_NOISE = 0.05  # of intensity ranks: below, a window counts as flat
 DEPTH_NOISE = 0.03  # of relative inverse range: below, a window counts as flat
@@ -13,7 +14,7 @@ SILHOUETTE_SHARE, SILHOUETTE_RATIO = 0.5, 1.25
 SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one line
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis, reliability):  # type: ignore[no-untyped-def]
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
@@ -53,7 +54,7 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
         reliability[w] = max(depth_weight, weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _find_silhouette(inverse):  # type: ignore[no-untyped-def]
     """The inverse range of the near side of a window's silhouette; 0 if it has none.
 
@@ -70,7 +71,7 @@ def _find_silhouette(inverse):  # type: ignore[no-untyped-def]
     return near if wide and near > SILHOUETTE_RATIO * far else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _fill_trend(directions, trend):  # type: ignore[no-untyped-def]
     """Fill an orthonormal basis of the linear functions of direction in a window.
 
@@ -101,7 +102,7 @@ def _fill_trend(directions, trend):  # type: ignore[no-untyped-def]
         trend[1, i] = (cos * u[i] + sin * v[i]) * of_major
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _normalize(values, trend, other, noise):  # type: ignore[no-untyped-def]
     """Centre and normalise values in place, orthogonal to the trend and to another column.
 

@@ -1,0 +1,91 @@
+"""The frames whose matches are kept: of the live epochs, and those that disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.solver.camera_block import CameraBlock
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """One frame whose matches are still kept.
+
+    Attributes:
+        number: of the frame.
+        raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
+        inliers: per camera, (m,) which of them are within the gate.
+        hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
+        gradient: (n, 6) at the cameras' references.
+    """
+
+    number: int
+    raw: dict[int, CameraBlock]
+    inliers: dict[int, NDArray[np.bool_]]
+    hessian: Array
+    gradient: Array
+
+    def without(self, camera: int) -> LiveFrame:
+        """The frame without one camera's matches."""
+        hessian, gradient = self.hessian.copy(), self.gradient.copy()
+        hessian[camera], gradient[camera] = 0.0, 0.0
+        raw = {c: m for c, m in self.raw.items() if c != camera}
+        inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
+        return LiveFrame(self.number, raw, inliers, hessian, gradient)
+
+    def add(
+        self,
+        camera: int,
+        raw: CameraBlock,
+        inliers: NDArray[np.bool_],
+        sums: tuple[Array, Array],
+    ) -> LiveFrame:
+        """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
+        hessian, gradient = self.hessian.copy(), self.gradient.copy()
+        hessian[camera], gradient[camera] = sums
+        return LiveFrame(
+            self.number,
+            {**self.raw, camera: raw},
+            {**self.inliers, camera: inliers},
+            hessian,
+            gradient,
+        )
+
+    @staticmethod
+    def empty(number: int, cameras: int) -> LiveFrame:
+        """A frame without matches."""
+        return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
+
+
+@dataclass(frozen=True, eq=False)
+class Epoch:
+    """Frames that share one extrinsic per camera.
+
+    Attributes:
+        frames: in order.
+        T_lidar_camera: per camera, the estimate.
+    """
+
+    frames: tuple[LiveFrame, ...]
+    T_lidar_camera: tuple[gtsam.Pose3, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierFrame:
+    """A frame that disagrees with a camera's estimate but fits another T_lidar_camera.
+
+    Attributes:
+        number: of the frame.
+        raw: its matches.
+        T_lidar_camera: that fits them.
+    """
+
+    number: int
+    raw: CameraBlock
+    T_lidar_camera: gtsam.Pose3

@@ -1,0 +1,96 @@
+"""Reading a tracker's state from its database, without changing any file."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+
+from calibgraph.errors import FileError
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What a database holds.
+
+    Attributes:
+        snapshot: the newest undamaged snapshot; None if there is none yet.
+        inputs: the inputs after it, in order; the last may be one that was not acknowledged.
+        damages: one line for each damaged snapshot, and for a log that is missing.
+    """
+
+    snapshot: bytes | None
+    inputs: tuple[bytes, ...]
+    damages: tuple[str, ...]
+
+
+def log_of(path: Path) -> Path:
+    """The write-ahead log of a database."""
+    return path.with_name(f"{path.name}-wal")
+
+
+def read(path: Path) -> tuple[Recovered, int]:
+    """What the database holds, and the number of its last input; no file is changed.
+
+    Raises:
+        FileError: if it is damaged.
+    """
+    log = log_of(path)
+    had_log = log.exists() and log.stat().st_size > 0
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
+            if state != "ok":
+                raise _damaged(path, state)
+            number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
+            recovered = _recover(database, path, number)
+    except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
+        raise _damaged(path, error) from error
+    finally:
+        _remove_index(path, had_log=had_log)
+    if is_open and not had_log:
+        line = f"{log}: is missing, updates may be lost; went on after update {number}"
+        recovered = replace(recovered, damages=(*recovered.damages, line))
+    return recovered, number
+
+
+def _remove_index(path: Path, *, had_log: bool) -> None:
+    """Remove what reading leaves beside a database: the index of the log, and an empty log."""
+    path.with_name(f"{path.name}-shm").unlink(missing_ok=True)
+    if not had_log:
+        log_of(path).unlink(missing_ok=True)
+
+
+def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered:
+    """The newest undamaged snapshot, and all inputs after it up to the newest."""
+    damages: list[str] = []
+    start, snapshot = 0, None
+    query = "SELECT number, content, digest FROM snapshot ORDER BY number DESC"
+    for number, content, digest in database.execute(query):
+        if digest == checksum(number, content):
+            start, snapshot = number, content
+            break
+        damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
+    if damages and snapshot is None:
+        raise _damaged(path, "no snapshot has the right checksum")
+    query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
+    rows = database.execute(query, (start,)).fetchall()
+    for expected, row in zip_longest(range(start + 1, newest + 1), rows):
+        if row is None or row[0] != expected or row[2] != checksum(*row[:2]):
+            raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
+    return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
+
+
+def checksum(number: int, content: object) -> bytes:
+    """Checksum of a row, none of one that is not bytes."""
+    if not isinstance(content, bytes):
+        return b""
+    return hashlib.sha256(str(number).encode() + b" " + content).digest()
+
+
+def _damaged(path: Path, why: object) -> FileError:
+    advice = "restore its folder from a copy, or choose another folder"
+    return FileError(path, f"is damaged ({why}); {advice}")
