@@ -11,6 +11,7 @@ keeps single precision: its sum of squares is then not the difference of two lar
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.compiled import compiled
 
@@ -22,41 +23,59 @@ MIN_PATCH_SHARE = 0.35  # of a patch that is of use; below, rows of shifts are t
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
-def score_windows(image, places, counts, basis, group, origin, likelihood, grids):  # type: ignore[no-untyped-def]
+def score_windows(
+    image: NDArray[np.float32],
+    places: NDArray[np.int32],
+    counts: NDArray[np.int32],
+    basis: NDArray[np.float32],
+    group: NDArray[np.int32],
+    origin: NDArray[np.int64],
+    likelihood: bool,
+    grids: NDArray[np.float32],
+) -> None:
     """Add every window's score at all shifts to its group's grid.
 
-    image: (h, w); places: (n, l, 2) nearest pixels (u, v) at shift 0; counts: (n,); basis:
-    (n, l, 4), of which the last two columns are zero where ``likelihood``; group: (n,), not
-    falling; origin: (2,) the first shift (u, v) of the grids; grids: (g, s, s).
     The score is d_D^2 + d_I |d_I|, with d the image's components along the columns of the basis,
     over the image's own variation: squared for depth, whose sign in an image is unknown, and signed
     for intensity. It is a share r of explained variance, or (likelihood) the -log(1 - r) of a
     Gaussian window. Shifts at which a window leaves the image count 0.
+
+    Args:
+        image: (h, w).
+        places: (n, l, 2) nearest pixels (u, v) at shift 0.
+        counts: (n,) how many of them are in use: the first ones.
+        basis: (n, l, 4), of which the last two columns are zero where ``likelihood``.
+        group: (n,), not falling.
+        origin: (2,) the first shift (u, v) of the grids.
+        likelihood: of the kind of score.
+        grids: (g, s, s).
     """
     height, width = image.shape
+    pixels = np.zeros((2, height * width + LANES), np.float32)  # whole image, patch
+    pixels[0, : height * width] = (image - image.mean()).ravel()
+    sums = tuple(np.empty(max(MAX_SUMS, width) + LANES, np.float32) for _ in range(6))
+    factors = np.ones(grids.shape[1:], np.float32)
+    _score_windows(
+        image.shape, (*pixels,), (places, counts, basis, group), origin, likelihood, sums, factors,
+        grids,
+    )  # fmt: skip
+
+
+@compiled(fastmath=True, nogil=True, error_model="numpy")
+def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, grids):  # type: ignore[no-untyped-def]
+    """See :func:`score_windows`; sums and factors: room for intermediate values."""
+    height, width = shape
+    whole, patch = pixels
+    places, counts, basis, group = windows
     rows, columns = grids.shape[1], grids.shape[2]
-    whole = np.zeros(height * width + LANES, np.float32)
-    whole[: height * width] = image.reshape(-1) - np.float32(image.mean())
-    patch = np.zeros(height * width + LANES, np.float32)
     start = np.empty(places.shape[1], np.int64)
-    sums = (
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # depth
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # intensity
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # total
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # power
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # trend, u
-        np.empty(max(MAX_SUMS, width) + LANES, np.float32),  # trend, v
-    )
-    factors = np.ones((rows, columns), np.float32)
     multiplied = 0
     for w in range(len(places)):
         n = counts[w]
         if multiplied == FACTORS or (multiplied > 0 and group[w] != group[w - 1]):
             _take_logarithms(factors, grids[group[w - 1]])
             multiplied = 0
-        left, right = places[w, :n, 0].min(), places[w, :n, 0].max()
-        top, bottom = places[w, :n, 1].min(), places[w, :n, 1].max()
+        left, right, top, bottom = _find_extent(places[w], n)
         first, above = max(origin[0], -left), max(origin[1], -top)
         size = min(origin[0] + columns, width - right) - first
         end = min(origin[1] + rows, height - bottom)
@@ -68,8 +87,8 @@ def score_windows(image, places, counts, basis, group, origin, likelihood, grids
             source, stride = patch, right - left + size
             at_once = max(1, MAX_SUMS // stride)
             for row in range(bottom - top + end - above):
-                values = whole[corner + row * width : corner + row * width + stride]
-                patch[row * stride : (row + 1) * stride] = values
+                for k in range(stride):
+                    patch[row * stride + k] = whole[corner + row * width + k]
             corner = 0
         for p in range(n):
             start[p] = corner + (places[w, p, 1] - top) * stride + places[w, p, 0] - left
@@ -91,6 +110,17 @@ def score_windows(image, places, counts, basis, group, origin, likelihood, grids
         _take_logarithms(factors, grids[group[-1]])
 
 
+@compiled(nogil=True)
+def _find_extent(places, n):  # type: ignore[no-untyped-def]
+    """The least and largest u, then v, of the first n places."""
+    left, top = places[0, 0], places[0, 1]
+    right, bottom = left, top
+    for p in range(1, n):
+        left, right = min(left, places[p, 0]), max(right, places[p, 0])
+        top, bottom = min(top, places[p, 1]), max(bottom, places[p, 1])
+    return left, right, top, bottom
+
+
 @compiled(fastmath=True, nogil=True, error_model="numpy")
 def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: ignore[no-untyped-def]
     """Over a window's points, at each shift k: sums of basis[p] v, of v and of v^2.
@@ -98,13 +128,16 @@ def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: i
     v = pixels[start[p] + k], k < length.
     """
     depth, intensity, total, power, trend_u, trend_v = sums
-    depth[:length] = 0
-    intensity[:length] = 0
-    total[:length] = 0
-    power[:length] = np.float32(n * GRAY_NOISE**2)
+    noise = np.float32(n * GRAY_NOISE**2)
+    for k in range(length):
+        depth[k] = 0
+        intensity[k] = 0
+        total[k] = 0
+        power[k] = noise
     if with_trend:
-        trend_u[:length] = 0
-        trend_v[:length] = 0
+        for k in range(length):
+            trend_u[k] = 0
+            trend_v[k] = 0
     for p in range(0, n - 4, 5):
         row0, row1, row2 = pixels[start[p] :], pixels[start[p + 1] :], pixels[start[p + 2] :]
         row3, row4 = pixels[start[p + 3] :], pixels[start[p + 4] :]
