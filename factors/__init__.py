@@ -4,8 +4,13 @@ Every factor acts on ``T_lidar_camera``, the pose of a camera in the LiDAR frame
 This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibgraph.
 """
 
-from factors.block import BlockSums, ProjectionBlock, block_factor, square_root
-from factors.conditioning import smallest_scaled_eigenvalue, unit_diagonal
+from factors.block import ProjectionBlock, block_factor, to_runs
+from factors.block_sums import BlockSums, square_root
+from factors.conditioning import (
+    smallest_scaled_eigenvalue,
+    smallest_scaled_eigenvalues,
+    unit_diagonal,
+)
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pose import (
@@ -32,6 +37,8 @@ __all__ = [
     "relative_prior_factor",
     "robust_noise",
     "smallest_scaled_eigenvalue",
+    "smallest_scaled_eigenvalues",
     "square_root",
+    "to_runs",
     "unit_diagonal",
 ]

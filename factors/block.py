@@ -21,10 +21,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.conditioning import unit_diagonal
+from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.kernel import (
     accumulate_alone,
     accumulate_shared,
+    costs_alone,
+    linearize_alone,
+    norms_alone,
     residuals_alone,
     residuals_shared,
 )
@@ -34,22 +37,7 @@ from factors.loss import loss_id
 Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
-_WORTH_SHARING = 300_000  # correspondences (1 ms): below, waking other threads costs more
-
-
-@dataclass(frozen=True)
-class BlockSums:
-    """H, b and c of a block of correspondences at one pose. Sums of blocks simply add.
-
-    Attributes:
-        hessian: (6, 6) or (f, 6, 6), H above, in GTSAM's tangent of ``T_lidar_camera``.
-        gradient: (6,) or (f, 6), b above.
-        cost: () or (f,), c above; GTSAM's error is half of it.
-    """
-
-    hessian: Array
-    gradient: Array
-    cost: Array
+_WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +69,7 @@ class ProjectionBlock:
     sigma: float = 1.0
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, contiguous by row
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
+    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all, see _CHUNK
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -99,6 +88,8 @@ class ProjectionBlock:
         columns, whitening = _read_only(columns), _read_only(whitening)
         object.__setattr__(self, "_columns", columns)
         object.__setattr__(self, "_whitening", whitening)
+        edges = np.append(np.arange(0, columns.shape[1], _CHUNK), columns.shape[1])
+        object.__setattr__(self, "_chunks", to_runs(edges))
         object.__setattr__(self, "points_lidar_m", columns[:3].T)
         object.__setattr__(self, "pixels_px", columns[3:].T)
         object.__setattr__(self, "sqrt_information", None if root is None else _read_only(root))
@@ -122,7 +113,7 @@ class ProjectionBlock:
         other._initialize(
             self._columns.take(rows, axis=1),
             self._whitening.take(rows, axis=1),
-            None if root is None else root[rows],
+            None if root is None else root.take(rows, axis=0),
         )
         return other
 
@@ -136,44 +127,106 @@ class ProjectionBlock:
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        return _unpacked(self._segment_sums([T_lidar_camera], self._chunk_edges())[0].sum(axis=0))
+        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
+        return unpack_sums(sums.sum(axis=0))
 
     def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
         """H, b and c of the whole block at each of some T_lidar_camera, stacked."""
-        return _unpacked(self._segment_sums(poses, self._chunk_edges()).sum(axis=1))
+        each = np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4)
+        runs = np.tile(self._chunks, (len(each), 1))
+        sums = self._run_sums(np.repeat(each, len(self._chunks), axis=0), runs, None)
+        return unpack_sums(sums.reshape(len(each), len(self._chunks), 28).sum(axis=1))
+
+    def costs_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p,) c of the whole block at each of (p, 4, 4) poses."""
+        costs: Array = costs_alone(
+            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma,
+        )  # fmt: skip
+        return costs / self.sigma**2
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
-        runs = np.asarray(edges, dtype=np.int64)
-        return _unpacked(self._segment_sums([T_lidar_camera], runs)[0])
+        runs = to_runs(np.asarray(edges, dtype=np.int64))
+        return unpack_sums(self._run_sums(_T_camera_lidar(T_lidar_camera)[None], runs, None))
 
-    def _chunk_edges(self) -> NDArray[np.int64]:
-        """Where runs of _CHUNK correspondences begin, and the end."""
-        count = -(-len(self) // _CHUNK)
-        return np.minimum(np.arange(count + 1) * _CHUNK, len(self))
+    def run_sums(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
+    ) -> BlockSums:
+        """H, b and c of each run of the correspondences at a pose of its own, stacked.
 
-    def _segment_sums(self, poses: Sequence[gtsam.Pose3], edges: NDArray[np.int64]) -> Array:
-        """(p, s, 28) sums of the kernel at each T_lidar_camera, over each run."""
-        run = accumulate_alone if len(self) < _WORTH_SHARING else accumulate_shared
-        T_camera_lidar = np.array([T.inverse().matrix() for T in poses])
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) its first correspondence, and the one behind its last.
+            scales: (r,) of the loss in each run, in place of ``scale``.
+        """
+        return unpack_sums(self._run_sums(T_camera_lidar, runs, scales))
+
+    def _run_sums(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None
+    ) -> Array:
+        evaluations = int((runs[:, 1] - runs[:, 0]).sum())
+        run = accumulate_alone if evaluations < _WORTH_SHARING else accumulate_shared
+        scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, T_camera_lidar, self._columns,
-            self._whitening, loss_id(self.loss), self.scale * self.sigma, edges,
+            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), scales * self.sigma, runs,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
+        return self.run_residuals(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
+
+    def run_residuals(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """As :meth:`residuals`, with a pose for each run; the runs hold every point once.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) as in :meth:`run_sums`.
+        """
         run = residuals_alone if len(self) < _WORTH_SHARING else residuals_shared
         residuals, projectable = run(
-            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns
-        )
+            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
+            runs,
+        )  # fmt: skip
         return residuals, projectable
+
+    def run_norms(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
+    ) -> Array:
+        """(2, n) norms of the unweighted [px] and of the whitened residuals, times a factor.
+
+        One row if there is no whitening; infinite where a point is not projectable.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) as in :meth:`run_residuals`; None: one run.
+            factor: by which both are multiplied.
+        """
+        norms: Array = norms_alone(
+            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
+            self._whitening, factor, self._chunks if runs is None else runs,
+        )  # fmt: skip
+        return norms
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        return square_root(self.sums(T_lidar_camera))
+        if len(self) >= _WORTH_SHARING:
+            return square_root(self.sums(T_lidar_camera))
+        error, jacobian = linearize_alone(
+            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma, self.sigma, self._chunks,
+        )  # fmt: skip
+        return error, jacobian.T
+
+
+def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
+    return np.stack([edges[:-1], edges[1:]], axis=1)
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
@@ -199,25 +252,6 @@ def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
         return residual
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key], error)
-
-
-def square_root(sums: BlockSums) -> tuple[Array, Array]:
-    """(7,) error and (7, 6) Jacobian with the given H, b and c; H may be rank deficient.
-
-    H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
-    lose no digits to each other; directions without information get a zero row.
-    """
-    scaled, units = unit_diagonal(sums.hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    informed = values > 1e-14 * max(float(values[-1]), 0.0)
-    roots = np.sqrt(np.where(informed, values, 0.0))
-    over = np.where(informed, 1.0 / np.where(informed, roots, 1.0), 0.0)
-    jacobian = np.zeros((7, 6), order="F")
-    jacobian[:6] = roots[:, None] * vectors.T * units
-    error = np.empty(7)
-    error[:6] = over * (vectors.T @ (sums.gradient / units))
-    error[6] = np.sqrt(max(float(sums.cost) - float(error[:6] @ error[:6]), 0.0))
-    return error, jacobian
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
@@ -261,14 +295,3 @@ def _whitening(root: Array | None, n: int) -> Array:
         return np.empty((0, n))
     isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
     return np.ascontiguousarray((root[:, :1] if isotropic else root).T)
-
-
-_UPPER = np.triu_indices(6)
-
-
-def _unpacked(sums: Array) -> BlockSums:
-    """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
-    hessian = np.empty((*sums.shape[:-1], 6, 6))
-    hessian[..., _UPPER[0], _UPPER[1]] = sums[..., :21]
-    hessian[..., _UPPER[1], _UPPER[0]] = sums[..., :21]
-    return BlockSums(hessian, sums[..., 21:27], sums[..., 27])

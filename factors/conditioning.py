@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.compiled import compiled
+
 Array = NDArray[np.float64]
 
 
@@ -30,6 +32,38 @@ def smallest_scaled_eigenvalue(hessian: Array) -> float:
     Args:
         hessian: (n, n), positive semidefinite.
     """
-    if not (np.diag(hessian) > 0).all():
-        return 0.0
-    return float(np.linalg.eigvalsh(unit_diagonal(hessian)[0])[0])
+    return float(smallest_scaled_eigenvalues(hessian[None])[0])
+
+
+def smallest_scaled_eigenvalues(hessians: Array) -> Array:
+    """(f,) :func:`smallest_scaled_eigenvalue` of each of (f, n, n) matrices."""
+    diagonals = np.einsum("fii->fi", hessians)
+    known = (diagonals > 0).all(axis=1)
+    units = np.sqrt(np.where(known[:, None], diagonals, 1.0))
+    values = np.linalg.eigvalsh(hessians / (units[:, :, None] * units[:, None, :]))
+    return np.where(known, values[:, 0], 0.0)
+
+
+@compiled(nogil=True, error_model="numpy")
+def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
+    """(7,) error and the transposed (6, 7) Jacobian, see ``block.square_root``."""
+    units, scaled = np.ones(6), np.empty((6, 6))
+    for i in range(6):
+        if hessian[i, i] > 0.0:
+            units[i] = np.sqrt(hessian[i, i])
+    for i in range(6):
+        for j in range(6):
+            scaled[i, j] = hessian[i, j] / (units[i] * units[j])
+    values, vectors = np.linalg.eigh(scaled)
+    jacobian, error = np.zeros((6, 7)), np.zeros(7)
+    rest = cost
+    for k in range(6):
+        if values[k] > 1e-14 * max(values[5], 0.0):
+            root, along = np.sqrt(values[k]), 0.0
+            for i in range(6):
+                jacobian[i, k] = root * vectors[i, k] * units[i]
+                along += vectors[i, k] * gradient[i] / units[i]
+            error[k] = along / root
+            rest -= error[k] * error[k]
+    error[6] = np.sqrt(max(rest, 0.0))
+    return error, jacobian

@@ -7,6 +7,7 @@ and derivatives, ``kernel_sums`` weighs and adds them up.
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
@@ -14,6 +15,7 @@ from numba import prange
 from numba.core.errors import NumbaWarning
 
 from factors.compiled import compiled
+from factors.conditioning import compiled_square_root
 from factors.kernel_projection import project, project_pinhole, project_radtan, project_rays
 from factors.kernel_sums import (
     apply_weights,
@@ -24,67 +26,169 @@ from factors.kernel_sums import (
     whiten,
 )
 from factors.lens import PINHOLE, RADTAN, is_projectable
-from factors.tile import MATRICES, ROWS, RU, RV, TILE, X, Y, Z
+from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
 
 
-def _accumulate(kind, lens, poses, columns, whitening, loss, scale, edges):  # type: ignore[no-untyped-def]
-    """(p, s, 28) sums at each pose over each run ``edges[i]:edges[i + 1]``: H (21), b (6), c (1).
+@compiled(error_model="numpy")
+def _accumulate(kind, lens, T, columns, whitening, loss, scale, first, end, sums):  # type: ignore[no-untyped-def]
+    """Add a run of correspondences to (28,) sums: 21 of H, 6 of b, 1 of c."""
+    tile = np.empty((ROWS, TILE))
+    for start in range(first, end, TILE):
+        n = min(TILE, end - start)
+        rays = kind == PINHOLE and whitening.shape[0] < MATRICES
+        if rays and project_rays(lens, T, columns, start, n, tile):
+            scale_residuals(whitening, start, n, tile)
+            sums[27] += weigh(loss, scale, n, tile)
+            apply_weights(whitening, start, n, tile)
+            sum_rays(lens, n, tile, sums)
+            continue
+        if kind == PINHOLE:
+            project_pinhole(lens, T, columns, start, n, tile)
+        elif kind != RADTAN or not project_radtan(lens, T, columns, start, n, tile):
+            project(kind, lens, T, columns, start, n, tile)
+        whiten(whitening, start, n, tile)
+        sums[27] += weigh(loss, scale, n, tile)
+        sum_tile(n, tile, sums)
 
-    ``poses`` (p, 4, 4) are T_camera_lidar; ``columns`` (5, n) are x y z u v; ``whitening`` is
-    (3, n): triangular matrices; (1, n): numbers; or (0, n): none.
+
+def _accumulate_runs(kind, lens, poses, columns, whitening, loss, scales, runs):  # type: ignore[no-untyped-def]
+    """(r, 28) sums over the runs ``runs[i, 0]:runs[i, 1]``: 21 of H, 6 of b, 1 of c.
+
+    ``poses`` (r, 4, 4) are T_camera_lidar and ``scales`` (r,) the loss', each of one run, or
+    (1, 4, 4) and (1,) of all; ``columns`` (5, n) are x y z u v; ``whitening`` is (3, n): triangular
+    matrices; (1, n): numbers; or (0, n): none.
     """
-    segments = len(edges) - 1
-    out = np.zeros((len(poses) * segments, 28))
-    for row in prange(len(poses) * segments):
-        T, segment = poses[row // segments], row % segments
-        tile = np.empty((ROWS, TILE))
-        for start in range(edges[segment], edges[segment + 1], TILE):
-            n = min(TILE, edges[segment + 1] - start)
-            rays = kind == PINHOLE and whitening.shape[0] < MATRICES
-            if rays and project_rays(lens, T, columns, start, n, tile):
-                scale_residuals(whitening, start, n, tile)
-                out[row, 27] += weigh(loss, scale, n, tile)
-                apply_weights(whitening, start, n, tile)
-                sum_rays(lens, n, tile, out, row)
-                continue
-            if kind == PINHOLE:
-                project_pinhole(lens, T, columns, start, n, tile)
-            elif kind != RADTAN or not project_radtan(lens, T, columns, start, n, tile):
-                project(kind, lens, T, columns, start, n, tile)
-            whiten(whitening, start, n, tile)
-            out[row, 27] += weigh(loss, scale, n, tile)
-            sum_tile(n, tile, out, row)
-    return out.reshape((len(poses), segments, 28))
-
-
-accumulate_alone = compiled(nogil=True, error_model="numpy")(_accumulate)
-accumulate_shared = compiled(parallel=True, error_model="numpy")(_accumulate)
-
-
-def _residuals(kind, lens, T, columns):  # type: ignore[no-untyped-def]
-    """(n, 2) residuals pi - u [px], and (n,) whether each point is projectable."""
-    n = columns.shape[1]
-    residuals = np.empty((n, 2))
-    valid = np.empty(n, dtype=np.bool_)
-    for number in prange((n + TILE - 1) // TILE):
-        tile = np.empty((ROWS, TILE))
-        start = number * TILE
-        count = min(TILE, n - start)
-        ahead = (kind == PINHOLE and project_rays(lens, T, columns, start, count, tile)) or (
-            kind == RADTAN and project_radtan(lens, T, columns, start, count, tile)
+    out = np.zeros((len(runs), 28))
+    for i in prange(len(runs)):
+        T, scale = (
+            poses[min(np.int64(i), len(poses) - 1)],
+            scales[min(np.int64(i), len(scales) - 1)],
         )
-        if not ahead:
-            project(kind, lens, T, columns, start, count, tile)
-        for i in range(count):
+        first, end = runs[i, 0], runs[i, 1]
+        _accumulate(kind, lens, T, columns, whitening, loss, scale, first, end, out[i])
+    return out
+
+
+accumulate_alone = compiled(nogil=True, error_model="numpy")(_accumulate_runs)
+accumulate_shared = compiled(nogil=True, parallel=True, error_model="numpy")(_accumulate_runs)
+
+
+@compiled(nogil=True, error_model="numpy")
+def linearize_alone(kind, lens, T, columns, whitening, loss, scale, sigma, runs):  # type: ignore[no-untyped-def]
+    """(7,) error and transposed (6, 7) Jacobian of the block factor, see ``block.square_root``.
+
+    Sums are added run by run, as of ``accumulate_alone``.
+    """
+    sums = np.zeros(28)
+    for i in range(len(runs)):
+        own = np.zeros(28)
+        first, end = runs[i, 0], runs[i, 1]
+        _accumulate(kind, lens, T, columns, whitening, loss, scale, first, end, own)
+        sums += own
+    sums /= sigma * sigma
+    hessian, k = np.empty((6, 6)), 0
+    for i in range(6):
+        for j in range(i, 6):
+            hessian[i, j] = hessian[j, i] = sums[k]
+            k += 1
+    return compiled_square_root(hessian, sums[21:27], sums[27])
+
+
+@compiled(nogil=True, error_model="numpy")
+def costs_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ignore[no-untyped-def]
+    """(p,) costs c of all correspondences at each of (p, 4, 4) T_camera_lidar."""
+    out, tile = np.zeros(len(poses)), np.empty((ROWS, TILE))
+    n = columns.shape[1]
+    for start in range(0, n, TILE):
+        count = min(TILE, n - start)
+        for i in range(len(poses)):
+            _project_any(kind, lens, poses[i], columns, start, count, tile)
+            whiten(whitening, start, count, tile)
+            out[i] += weigh(loss, scale, count, tile)
+    return out
+
+
+@compiled(error_model="numpy")
+def _project_any(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """Fill in the residuals of a tile; whether all points lie where the fast ways hold."""
+    ahead = (kind == PINHOLE and project_rays(lens, T, columns, start, n, tile)) or (
+        kind == RADTAN and project_radtan(lens, T, columns, start, n, tile)
+    )
+    if not ahead:
+        project(kind, lens, T, columns, start, n, tile)
+    return ahead
+
+
+@compiled(error_model="numpy")
+def _evaluate(kind, lens, T, columns, first, end, residuals, valid):  # type: ignore[no-untyped-def]
+    """Fill in the residuals of a run of correspondences, and whether each point is projectable."""
+    tile = np.empty((ROWS, TILE))
+    for start in range(first, end, TILE):
+        n = min(TILE, end - start)
+        ahead = _project_any(kind, lens, T, columns, start, n, tile)
+        for i in range(n):
             residuals[start + i, 0], residuals[start + i, 1] = tile[RU, i], tile[RV, i]
             valid[start + i] = ahead or is_projectable(
                 kind, lens, tile[X, i], tile[Y, i], tile[Z, i]
             )
+
+
+def _residuals(kind, lens, poses, columns, runs):  # type: ignore[no-untyped-def]
+    """(n, 2) residuals pi - u [px], and (n,) whether each point is projectable.
+
+    ``poses`` and ``runs`` as above; the runs hold every point once.
+    """
+    n = columns.shape[1]
+    residuals, valid = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
+    for i in prange(len(runs)):
+        T = poses[min(np.int64(i), len(poses) - 1)]
+        _evaluate(kind, lens, T, columns, runs[i, 0], runs[i, 1], residuals, valid)
     return residuals, valid
 
 
 residuals_alone = compiled(nogil=True, error_model="numpy")(_residuals)
-residuals_shared = compiled(parallel=True, error_model="numpy")(_residuals)
+residuals_shared = compiled(nogil=True, parallel=True, error_model="numpy")(_residuals)
+
+
+@compiled(fastmath=FAST, error_model="numpy")
+def _norms_of_tile(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
+    """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
+    ru, rv = tile[RU], tile[RV]
+    plain = norms[0][start:]
+    for i in range(n):
+        plain[i] = factor * math.sqrt(ru[i] * ru[i] + rv[i] * rv[i])
+    if whitening.shape[0] == 0:
+        return
+    whitened, first = norms[1][start:], whitening[0][start:]
+    if whitening.shape[0] < MATRICES:
+        for i in range(n):
+            whitened[i] = first[i] * plain[i]
+        return
+    across, second = whitening[1][start:], whitening[2][start:]
+    for i in range(n):
+        u, v = first[i] * ru[i] + across[i] * rv[i], second[i] * rv[i]
+        whitened[i] = factor * math.sqrt(u * u + v * v)
+
+
+@compiled(nogil=True, error_model="numpy")
+def norms_alone(kind, lens, poses, columns, whitening, factor, runs):  # type: ignore[no-untyped-def]
+    """(1, n) norms of the residuals [px] times a factor, and, with whitening, (2, n) those of both.
+
+    Infinite where a point is not projectable; ``poses`` and ``runs`` as above.
+    """
+    norms = np.empty((1 if whitening.shape[0] == 0 else 2, columns.shape[1]))
+    tile = np.empty((ROWS, TILE))
+    for i in range(len(runs)):
+        T = poses[min(i, len(poses) - 1)]
+        for start in range(runs[i, 0], runs[i, 1], TILE):
+            n = min(TILE, runs[i, 1] - start)
+            ahead = _project_any(kind, lens, T, columns, start, n, tile)
+            _norms_of_tile(whitening, start, n, tile, factor, norms)
+            if not ahead:
+                for k in range(n):
+                    if not is_projectable(kind, lens, tile[X, k], tile[Y, k], tile[Z, k]):
+                        norms[:, start + k] = math.inf
+    return norms

@@ -85,8 +85,8 @@ def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=FAST, error_model="numpy")
-def sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
-    """Add J^T psi J and J^T psi r of a tile to the 27 sums of a segment."""
+def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
+    """Add J^T psi J and J^T psi r of a tile to 27 sums."""
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
     h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
@@ -135,7 +135,7 @@ def sum_tile(n, tile, out, segment):  # type: ignore[no-untyped-def]
         h44, h45, h55, b0, b1, b2, b3, b4, b5,
     )  # fmt: skip
     for k in range(27):
-        out[segment, k] += sums[k]
+        out[k] += sums[k]
 
 
 @compiled(fastmath=FAST, error_model="numpy")
@@ -156,7 +156,7 @@ def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=FAST, error_model="numpy")
-def sum_rays(lens, n, tile, out, segment):  # type: ignore[no-untyped-def]
+def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
     """Add the 27 sums of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 
     The rows of the Jacobian are fx (ab, -A, b, -w, 0, aw) and fy (B, -ab, -a, 0, -w, bw) with
@@ -219,4 +219,4 @@ def sum_rays(lens, n, tile, out, segment):  # type: ignore[no-untyped-def]
         p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55, b0, b1, b2, b3, b4, b5,
     )  # fmt: skip
     for k in range(27):
-        out[segment, k] += sums[k]
+        out[k] += sums[k]

@@ -89,6 +89,12 @@ class Lens:
         pixels, valid = _project_many(self.kind, self.packed, points)
         return pixels, valid
 
+    def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
+        """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
+        points = np.ascontiguousarray(points_lidar_m, dtype=np.float64)
+        T = np.ascontiguousarray(T_camera_lidar)
+        return np.asarray(_are_projectable(self.kind, self.packed, T, points))
+
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
         points = np.ascontiguousarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
@@ -256,6 +262,18 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     if kind == FISHEYE:
         return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[_LIMIT]
     return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
+
+
+@compiled(nogil=True)
+def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
+    valid = np.empty(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        valid[i] = is_projectable(kind, lens, x, y, z)
+    return valid
 
 
 @compiled(nogil=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
@@ -41,13 +42,16 @@ PAIR_TANGENT_SENTENCE = (
 
 def _versions() -> dict[str, str]:
     """Versions of this package and of the libraries that results depend on."""
-    versions = {"python": platform.python_version()}
-    for package in ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed as a package"
-    return versions
+    packages = ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy")
+    return {"python": platform.python_version()} | {name: _version(name) for name in packages}
+
+
+@cache  # reading the metadata of a package takes a millisecond
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed as a package"
 
 
 @dataclass(frozen=True)

@@ -110,11 +110,13 @@ class Correspondences:
                 raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
             if numbers is not None and n and np.asarray(numbers).max() > _MAX_WHOLE:
                 raise CorrespondenceError(f"{name} holds a number beyond 64 bits")
-        names, index = np.unique(np.broadcast_to(np.asarray(camera), n), return_inverse=True)
+        one = isinstance(camera, str) and n > 0  # not sorted, as the names of many rows are
+        of_rows = np.asarray([camera] if one else np.broadcast_to(np.asarray(camera), n))
+        names, index = np.unique(of_rows, return_inverse=True)
         given = np.ones(n) if confidence is None else confidence
         return Correspondences(
             cameras=tuple(str(name) for name in names),
-            camera_index=index.astype(np.int32),
+            camera_index=np.zeros(n, np.int32) if one else index.astype(np.int32),
             frame=np.array(np.broadcast_to(np.asarray(frame, dtype=np.int64), n)),
             pixels_px=pixels,
             points_lidar_m=np.asarray(points_lidar_m, dtype=np.float64),
@@ -135,18 +137,20 @@ class Correspondences:
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The table with only some rows: a mask, an index array or a slice."""
         kept = copy.copy(self)  # not checked again: rows of a valid table are valid
+        if not isinstance(rows, slice) and rows.dtype == np.bool_:
+            rows = np.flatnonzero(rows)
         for name in _WIDTHS:
             column = getattr(self, name)
-            object.__setattr__(kept, name, None if column is None else column[rows])
+            if column is not None:
+                some = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
+                object.__setattr__(kept, name, some)
         return kept
 
     def of_camera(self, name: str) -> Correspondences:
         """The rows of one camera (none, if the camera is not in the table)."""
         if name not in self.cameras:
             return self.select(slice(0, 0))
-        rows = np.flatnonzero(self.camera_index == self.cameras.index(name))
-        adjacent = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
-        return self.select(slice(rows[0], rows[-1] + 1) if adjacent else rows)  # a view if possible
+        return self.select(rows_where(self.camera_index == self.cameras.index(name)))
 
     @property
     def findings(self) -> MatcherFindings:
@@ -223,6 +227,14 @@ _WIDTHS = {
     "information_px": 3, "stamp_ns": 1, "point_index": 1,
 }  # fmt: skip
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
+
+
+def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:
+    """The rows of a mask; a slice, which makes a view, where they follow each other."""
+    first, count = int(mask.argmax()) if len(mask) else 0, int(np.count_nonzero(mask))
+    if mask[first : first + count].all():
+        return slice(first, first + count)
+    return np.flatnonzero(mask)
 
 
 def as_confidence(values: ArrayLike) -> NDArray[np.float32]:

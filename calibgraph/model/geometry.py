@@ -13,6 +13,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.pose_kernel import exponential_times, logarithms
+
 Array = NDArray[np.float64]
 
 
@@ -93,3 +95,28 @@ def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
 def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     """(6, 6) Ad(T_lidar_camera^-1): a twist in the LiDAR frame to the same in the camera's."""
     return np.asarray(T_lidar_camera.inverse().AdjointMap(), dtype=np.float64)
+
+
+def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
+    """(f, 4, 4) T_camera_lidar of the variables moved by their tangents.
+
+    As GTSAM's ``retract``, of many at once: T_lidar_camera exp(step).
+
+    Args:
+        T_camera_lidar: (f, 4, 4).
+        steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
+    """
+    moved = np.empty((len(steps), 4, 4))
+    exponential_times(-steps, np.ascontiguousarray(T_camera_lidar), moved)
+    return moved
+
+
+def local_coordinates(T_camera_lidar: Array, others: Array) -> Array:
+    """(f, 6) tangents from one T_lidar_camera to others, as GTSAM's ``localCoordinates``.
+
+    Args:
+        T_camera_lidar: (4, 4).
+        others: (f, 4, 4) T_camera_lidar.
+    """
+    tangents: Array = logarithms(T_camera_lidar @ np.linalg.inv(others))
+    return tangents

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_twist import project_with_jacobian
+from calibgraph.solver.camera_twist import twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.normal_kernel import (
+    combine,
+    grouped_gradients,
+    reweighted_products,
+    weighted_products,
+)
+from calibgraph.solver.whitening import upper_root
+from factors import unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -40,6 +50,133 @@ class AugmentedFit:
     independent_shares: Array
 
 
+@dataclass(frozen=True, eq=False)
+class LinearRows:
+    """Errors of one camera's correspondences as linear functions of its pose and more unknowns.
+
+    Made once, it is fitted with one choice of unknowns after the other.
+
+    Attributes:
+        columns: (6 + k + 1, 2, n) whitened derivatives of the pixels by a twist of the pose and by
+            the unknowns; the last are the whitened errors, observed minus predicted.
+        frame: (n,) frame numbers; the rows of one frame may share errors.
+    """
+
+    columns: Array
+    frame: NDArray[np.int64]
+
+    @cached_property
+    def _frames(self) -> tuple[int, NDArray[np.intp]]:
+        """How many frames, and (n,) which of them each row is of."""
+        frames, index = np.unique(self.frame, return_inverse=True)
+        return len(frames), index
+
+    def fit(
+        self, unknowns: Sequence[int], *, loss_scale: float | None = None
+    ) -> AugmentedFit | None:
+        """Fit the pose and some of the unknowns robustly; see :func:`fit_augmented`.
+
+        Args:
+            unknowns: their numbers, from 0.
+            loss_scale: of the Cauchy loss.
+        """
+        if len(self.frame) < MIN_ROWS:
+            return None
+        which = np.array([*range(6), *(6 + k for k in unknowns), len(self.columns) - 1])
+        solved = self._solve_reweighted(which, loss_scale)
+        if solved is None:
+            return None
+        solution, normal, weights = solved
+        errors = combine(self.columns, which, np.append(solution, -1.0))
+        sigmas = self._cluster_sigmas(which[:-1], normal, errors, weights)
+        shares = 1 / np.sqrt(np.diag(np.linalg.inv(normal)) * np.diag(normal))
+        return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:])
+
+    def compensating_twists(self, unknowns: Sequence[int], weights: Array) -> Array:
+        """(6, k) twists by which the pose compensates best for a unit of each unknown.
+
+        Args:
+            unknowns: their numbers, from 0.
+            weights: (n,) of the rows.
+        """
+        which = np.array([*range(6), *(6 + k for k in unknowns)])
+        products = weighted_products(self.columns, which, weights)
+        scaled, units = unit_diagonal(products[:6, :6])
+        twists = np.linalg.solve(scaled, products[:6, 6:] / units[:, None])
+        return np.asarray(twists / units[:, None])
+
+    def _solve_reweighted(
+        self, which: NDArray[np.intp], loss_scale: float | None
+    ) -> tuple[Array, Array, Array] | None:
+        """Iteratively reweighted least squares with a Cauchy loss on the norm of each row.
+
+        Returns:
+            (k,) solution; (k, k) normal matrix; (n,) weights. None if the matrix is singular.
+        """
+        solution = np.zeros(len(which) - 1)
+        for _ in range(_MAX_ITERATIONS):
+            factors = np.append(solution, -1.0)
+            scale = loss_scale or self._median_scale(which, factors)
+            products, weights = reweighted_products(self.columns, which, factors, scale)
+            normal = products[:-1, :-1]
+            if _is_singular(normal):
+                return None
+            before, solution = solution, np.linalg.solve(normal, products[:-1, -1])
+            moved = combine(self.columns, which[:-1], solution - before)
+            if np.abs(moved).max() < _CONVERGED * scale:
+                break
+        return solution, normal, weights
+
+    def _median_scale(self, which: NDArray[np.intp], factors: Array) -> float:
+        """The loss scale by the median of the errors."""
+        u, v = combine(self.columns, which, factors)
+        return float(_LOSS_SCALE * 1.4826 * np.sqrt(np.median(u * u + v * v)) + 1e-12)
+
+    def _cluster_sigmas(
+        self, which: NDArray[np.intp], normal: Array, errors: Array, weights: Array
+    ) -> Array:
+        """Cluster-robust standard deviations of all unknowns, with frames as clusters.
+
+        Args:
+            which: (k,) columns.
+            normal: (k, k).
+            errors: (2, n).
+            weights: (n,).
+        """
+        count, index = self._frames
+        if count < 2:  # noqa: PLR2004
+            return np.full(len(normal), np.nan)
+        sums = grouped_gradients(self.columns, which, errors, weights, index, count)
+        scatter = with_pseudo_frames(sums.T @ sums, normal, np.full(len(normal), float(count)))
+        inverse = np.linalg.inv(normal)
+        return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))
+
+
+def linearize(
+    camera: Camera, table: Correspondences, differentiate: Callable[[Array], Array]
+) -> LinearRows:
+    """The rows of a fit of the pose together with further unknowns.
+
+    Args:
+        camera: lens, and the extrinsic about which is linearised.
+        table: the rows of this camera.
+        differentiate: from the (n, 2) predicted pixels to their (n, 2, k) derivatives by the
+            unknowns.
+    """
+    pixels, by_twist = twist_columns(camera, table.points_lidar_m)
+    jacobian_px = differentiate(pixels.T)
+    columns = np.concatenate(
+        [by_twist, jacobian_px.transpose(2, 1, 0), (table.pixels_px.T - pixels)[None]]
+    )
+    if table.information_px is not None:
+        s00, s01, s11 = upper_root(table.information_px).T
+        columns[:, 0] *= s00
+        if s01.any():
+            columns[:, 0] += s01 * columns[:, 1]
+        columns[:, 1] *= s11
+    return LinearRows(columns, table.frame)
+
+
 def fit_augmented(
     camera: Camera,
     table: Correspondences,
@@ -61,19 +198,8 @@ def fit_augmented(
     """
     if len(table) < MIN_ROWS:
         return None
-    pixels, by_twist = project_with_jacobian(camera, table.points_lidar_m)
-    whitening = _information_root(table)
-    rows = whitening.transpose(0, 2, 1) @ np.concatenate([by_twist, jacobian_px], axis=2)
-    targets = np.einsum("nij,ni->nj", whitening, table.pixels_px - pixels)
-    solved = _solve_reweighted(rows, targets, loss_scale)
-    if solved is None:
-        return None
-    solution, normal, weights = solved
-    errors = rows @ solution - targets
-    gradients = (weights[:, None, None] * rows * errors[:, :, None]).sum(axis=1)
-    sigmas = _cluster_sigmas(normal, gradients, table.frame)
-    shares = 1 / np.sqrt(np.diag(np.linalg.inv(normal)) * np.diag(normal))
-    return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:])
+    rows = linearize(camera, table, lambda _: jacobian_px)
+    return rows.fit(range(jacobian_px.shape[2]), loss_scale=loss_scale)
 
 
 def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Array) -> Array:
@@ -82,61 +208,11 @@ def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Arr
     By all rows alike, without a robust loss, with the camera at the solution. Arguments as of
     `fit_augmented`.
     """
-    whitening = _information_root(table)
-    by_twist, by_unknown = (
-        (whitening.transpose(0, 2, 1) @ each).reshape(2 * len(table), -1)
-        for each in (project_with_jacobian(camera, table.points_lidar_m)[1], jacobian_px)
-    )
-    return np.asarray(np.linalg.lstsq(by_twist, by_unknown)[0])
-
-
-def _solve_reweighted(
-    rows: Array, targets: Array, loss_scale: float | None
-) -> tuple[Array, Array, Array] | None:
-    """Iteratively reweighted least squares with a Cauchy loss on the norm of each row pair.
-
-    Returns:
-        (k,) solution; (k, k) normal matrix; (n,) weights. None if the matrix is singular.
-    """
-    flat, solution = rows.reshape(2 * len(rows), -1), np.zeros(rows.shape[2])
-    for _ in range(_MAX_ITERATIONS):
-        size = np.linalg.norm(rows @ solution - targets, axis=1)
-        scale = loss_scale or _LOSS_SCALE * 1.4826 * np.median(size) + 1e-12
-        weights = 1 / (1 + (size / scale) ** 2)
-        weighted = flat * np.repeat(weights, 2)[:, None]
-        normal = weighted.T @ flat
-        if _is_singular(normal):
-            return None
-        before, solution = solution, np.linalg.solve(normal, weighted.T @ targets.reshape(-1))
-        if np.abs(flat @ (solution - before)).max() < _CONVERGED * scale:
-            break
-    return solution, normal, weights
+    rows = linearize(camera, table, lambda _: jacobian_px)
+    return rows.compensating_twists(range(jacobian_px.shape[2]), np.ones(len(table)))
 
 
 def _is_singular(normal: Array) -> bool:
     """Whether an unknown's column is nearly a combination of the others, whatever its unit."""
     units = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
     return bool(np.linalg.eigvalsh(normal / np.outer(units, units))[0] < _MIN_EIGENVALUE)
-
-
-def _information_root(table: Correspondences) -> Array:
-    """(n, 2, 2) L with L L^T the information of each pixel."""
-    if table.information_px is None:
-        return np.tile(np.eye(2), (len(table), 1, 1))
-    matrices = table.information_px[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    values, vectors = np.linalg.eigh(matrices)
-    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    return root
-
-
-def _cluster_sigmas(normal: Array, gradients: Array, frame: NDArray[np.int64]) -> Array:
-    """Cluster-robust standard deviations of all unknowns, with frames as clusters."""
-    frames, index = np.unique(frame, return_inverse=True)
-    if len(frames) < 2:  # noqa: PLR2004
-        return np.full(len(normal), np.nan)
-    sums = np.zeros((len(frames), len(normal)))
-    np.add.at(sums, index, gradients)
-    count = np.full(len(normal), float(len(frames)))
-    scatter = with_pseudo_frames(sums.T @ sums, normal, count)
-    inverse = np.linalg.inv(normal)
-    return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))

@@ -21,6 +21,7 @@ from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
+    constrained_root,
     largest_eigenvalue,
     median_norm,
     sqrt_information,
@@ -55,8 +56,20 @@ class CameraBlock:
     @cached_property
     def frame_edges(self) -> NDArray[np.int64]:
         """(f + 1,) where the frames begin, and the end."""
+        if not len(self.frame):
+            return np.zeros(1, dtype=np.int64)
         new = np.flatnonzero(np.diff(self.frame)) + 1
         return np.concatenate([[0], new, [len(self.frame)]])
+
+    def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) which correspondences belong to frames of some numbers."""
+        edges = self.frame_edges
+        return np.repeat(np.isin(self.frame[edges[:-1]], numbers), np.diff(edges))
+
+    def select_evenly(self, most: int) -> CameraBlock:
+        """Every k-th correspondence, so that at most so many are left."""
+        step = -(-len(self.frame) // most)
+        return self if step <= 1 else self.select(np.arange(0, len(self.frame), step))
 
     def with_weights(self, weights: Array) -> CameraBlock:
         """The same correspondences, their information times (n,) weights."""
@@ -94,6 +107,31 @@ class CameraBlock:
         residuals, projectable = self.block.residuals(T_lidar_camera)
         return BlockResiduals(self, T_lidar_camera, residuals, projectable)
 
+    def all_sizes(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None
+    ) -> tuple[Array, Array]:
+        """Norms of the residuals over the median of a standard Gaussian's.
+
+        The median of Gaussian ones of one standard deviation per axis is that standard deviation.
+
+        Args:
+            T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
+            runs: (r, 2) of all correspondences, see ``ProjectionBlock.run_residuals``.
+
+        Returns:
+            (n,) unweighted errors [px]; (n,) whitened errors; infinite where a point is not
+            projectable.
+        """
+        medians = median_norm(self.information)
+        if self.information is None:
+            norms = self.block.run_norms(T_camera_lidar, runs, factor=1.0 / float(medians))
+            return norms[0], norms[-1]
+        runs = np.array([[0, len(self.frame)]]) if runs is None else runs
+        residuals, projectable = self.block.run_residuals(T_camera_lidar, runs)
+        sizes_px = constrained_error_px(residuals, self.information) / medians
+        sizes = whitened_norm(self.block.sqrt_information, residuals) / medians
+        return np.where(projectable, sizes_px, np.inf), np.where(projectable, sizes, np.inf)
+
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] along constrained directions; (n,) whether projectable."""
         at = self.at(T_camera_lidar)
@@ -113,17 +151,21 @@ class CameraBlock:
 
     def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
         """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
-        step = -(-len(self.frame) // _MAX_SAMPLE)
-        sample = self.select(np.arange(0, len(self.frame), step))
-        errors = [sample.errors_px(T)[0] / scale_px for T in candidates]
-        return int(np.argmin([np.mean(np.log1p(e**2)) for e in errors]))
+        if len(candidates) == 1:
+            return 0
+        sample = self.select_evenly(_MAX_SAMPLE)
+        root = None if sample.information is None else constrained_root(sample.information)
+        errors = replace(
+            sample.block, sqrt_information=root, loss="cauchy", scale=scale_px, sigma=1.0
+        )
+        return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
         """The configured scales, or those of the residuals' own spread at a T_camera_lidar."""
         if config.loss_scale_px is not None and config.gate_px is not None:
             unmeasured = math.nan if self._any_projectable(T_camera_lidar) else math.inf
             return ResidualScale(1.0, config.loss_scale_px, config.gate_px, unmeasured)
-        sizes_px, sizes = self.sizes(T_camera_lidar)
+        sizes_px, sizes = self.all_sizes(T_camera_lidar[None])
         spread_px = robust_spread(sizes_px)
         spread = spread_px if sizes is sizes_px else robust_spread(sizes)
         return scale_from(spread_px, max(spread, self.least_spread), config)
@@ -136,9 +178,15 @@ class CameraBlock:
     @cached_property
     def least_spread(self) -> float:
         """MIN_SIGMA_PX as a whitened residual."""
+        return float(self.least_spreads(np.array([[0, len(self.frame)]]))[0])
+
+    def least_spreads(self, runs: NDArray[np.int64]) -> Array:
+        """(r,) MIN_SIGMA_PX as a whitened residual, in each of (r, 2) runs."""
         root = self.block.sqrt_information
-        typical = 1.0 if root is None else float(np.median(np.hypot(root[:, 0], root[:, 2])))
-        return MIN_SIGMA_PX * typical
+        if root is None:
+            return np.full(len(runs), MIN_SIGMA_PX)
+        sizes = np.sqrt(root[:, 0] ** 2 + root[:, 2] ** 2)
+        return MIN_SIGMA_PX * np.array([np.median(sizes[slice(*run)]) for run in runs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +212,7 @@ class BlockResiduals:
 
     @cached_property
     def sizes(self) -> tuple[Array, Array]:
-        """Norms of the residuals of projectable points, over the median of a standard Gaussian's.
-
-        Returns:
-            (m,) unweighted errors [px]; (m,) whitened errors. The median of Gaussian ones of one
-            standard deviation per axis is that standard deviation.
-        """
+        """As :meth:`CameraBlock.all_sizes`, of the projectable points alone."""
         medians = median_norm(self.block.information)
         medians = medians[self.projectable] if medians.ndim else medians
         sizes_px = self.errors_px[self.projectable] / medians

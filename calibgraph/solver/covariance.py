@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.parallel import core_pool
 from calibgraph.solver.factor_graph import to_values
 from factors import ProjectionBlock, unit_diagonal
 
@@ -33,6 +34,7 @@ def cluster_robust_covariance(
     T_camera_lidar: Mapping[str, Array],
     *,
     gate_hessian: Mapping[str, Array] | None = None,
+    robust_hessians: Mapping[str, Array] | None = None,
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few) H^-1``.
 
@@ -47,6 +49,7 @@ def cluster_robust_covariance(
         pose_graph: the priors and relative poses.
         T_camera_lidar: the solution, all cameras.
         gate_hessian: per camera, see ``BlockResiduals.gate_hessian``.
+        robust_hessians: per camera, :func:`robust_hessian` there, where it is known already.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
@@ -58,7 +61,10 @@ def cluster_robust_covariance(
     if len(gradients) < MIN_FRAMES_FOR_ERROR_BAR:
         return None
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
-    _add_robust_hessians(hessian, blocks, T_camera_lidar, gate_hessian or {})
+    robust = robust_hessians or hessians_of_blocks(blocks, T_camera_lidar)
+    for name, of_camera in robust.items():
+        rows = pose_rows(cameras.index(name))
+        hessian[rows, rows] += of_camera + (gate_hessian or {}).get(name, 0.0)
     values, vectors = np.linalg.eigh(hessian)
     if values[0] <= _FREE * values[-1]:
         return None
@@ -69,18 +75,13 @@ def cluster_robust_covariance(
     return covariance
 
 
-def _add_robust_hessians(
-    hessian: Array,
-    blocks: Mapping[str, ProjectionBlock],
-    T_camera_lidar: Mapping[str, Array],
-    gate_hessian: Mapping[str, Array],
-) -> None:
-    """Add the correspondences' part to the joint Hessian of the priors, (6 N, 6 N)."""
-    cameras = list(T_camera_lidar)
-    for name, block in blocks.items():
-        rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
-        hessian[rows, rows] += gate_hessian.get(name, 0.0)
+def hessians_of_blocks(
+    blocks: Mapping[str, ProjectionBlock], T_camera_lidar: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Per camera with correspondences, its :func:`robust_hessian`, (6, 6)."""
+    poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in blocks]
+    with core_pool() as pool:
+        return dict(zip(blocks, pool.map(robust_hessian, blocks.values(), poses), strict=True))
 
 
 def _frame_gradients(

@@ -200,6 +200,8 @@ def optimize(
     graph: gtsam.NonlinearFactorGraph,
     cameras: Sequence[str],
     T_camera_lidar: Mapping[str, Array],
+    *,
+    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> Optimum:
     """Minimize a graph by Levenberg-Marquardt.
 
@@ -207,10 +209,11 @@ def optimize(
         graph: over the variables of the cameras.
         cameras: their names, in the order of the variables.
         T_camera_lidar: (4, 4) per camera, the start.
+        relative_tolerance: relative change of the error at which it stops.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(MAX_ITERATIONS)
-    parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
+    parameters.setRelativeErrorTol(relative_tolerance)
     parameters.setAbsoluteErrorTol(0.0)
     start = to_values(cameras, T_camera_lidar)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)

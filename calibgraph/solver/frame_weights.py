@@ -13,16 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import local_coordinates, retract_all
+from calibgraph.parallel import core_pool
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread
@@ -46,6 +45,7 @@ _MAX_CANDIDATES = 200  # frames of which the own extrinsic is tried as a start
 _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
+_PLACE_BITS = 32  # of a match's place among those of a camera
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
 
 
@@ -97,15 +97,17 @@ def weigh_all_frames(
     uses_correspondences = terms in ("full", "reprojection")
     if not (config.learnt_weights and config.stage1 == "pnp" and uses_correspondences):
         return WeighedFrames(blocks, dict(start), {})
-    weighed = {
-        name: weigh_frames(
-            block,
+
+    def weigh(name: str) -> WeighedCamera:
+        return weigh_frames(
+            blocks[name],
             table.of_camera(name).confidence.astype(np.float64),
             start[name],
             stage1[name].by_frame if name in stage1 else {},
         )
-        for name, block in blocks.items()
-    }
+
+    with core_pool() as pool:
+        weighed = dict(zip(blocks, pool.map(weigh, blocks), strict=True))
     return WeighedFrames(
         blocks={name: camera.block for name, camera in weighed.items()},
         T_camera_lidar={
@@ -134,8 +136,8 @@ def weigh_frames(
     if len(edges) - 1 < MIN_FRAMES_TO_WEIGH:
         return WeighedCamera(block, T_camera_lidar, 0)
     numbers = block.frame[edges[:-1]]
-    parts = [block.select(np.arange(*edge)) for edge in pairwise(edges)]
-    frames = fit_each_frame(parts, [by_frame.get(int(n), T_camera_lidar) for n in numbers])
+    starts = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
+    frames = fit_each_frame(block, starts)
     sigmas = confidence_sigmas(frames.sizes, confidence)
     start = _densest_start(block, frames, T_camera_lidar)
     T_consensus, weights = _find_consensus(frames, start)
@@ -145,7 +147,7 @@ def weigh_frames(
     return WeighedCamera(kept, T_consensus, int(np.count_nonzero(weights == 0)))
 
 
-def _find_consensus(frames: FrameFits, start: gtsam.Pose3) -> tuple[Array, Array]:
+def _find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """Where frames are densest, (4, 4) T_camera_lidar, and (f,) their weights, at most 1.
 
     Mean shift over the frames' own extrinsics, with a kernel that is zero beyond a reach. After the
@@ -153,31 +155,31 @@ def _find_consensus(frames: FrameFits, start: gtsam.Pose3) -> tuple[Array, Array
     others may be farther off, by the noise of its own extrinsic.
     """
     center = start
+    by_chance = _CHANCE * np.maximum(frames.noise - np.median(frames.noise), 0)
     for number in range(_STEPS):
         away, shift = _displacements(frames, center)
-        typical = np.median(frames.noise)
-        apart = np.maximum(shift - _CHANCE * np.maximum(frames.noise - typical, 0), 0)
+        apart = np.maximum(shift - by_chance, 0)
         if number <= _SEARCH_STEPS:
             reach = _reach(apart, frames.noise, widened=number == _SEARCH_STEPS)
         near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
         if not near.any():  # no two frames agree
-            return to_T_camera_lidar(start), np.ones(len(near))
+            return start, np.ones(len(near))
         scatter = max(float(near @ (shift - frames.noise) / near.sum()), 0.0)
         weights = near / (frames.spreads**2 + frames.counts * scatter / 6)
         gradient = np.einsum("f,fij,fj->i", weights, frames.hessians, away)
         step = np.linalg.solve(damped(np.einsum("f,fij->ij", weights, frames.hessians)), gradient)
-        center = center.retract(step)
+        center = retract_all(center[None], step[None])[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
-    return to_T_camera_lidar(center), weights / weights.max()
+    return center, weights / weights.max()
 
 
-def _displacements(frames: FrameFits, center: gtsam.Pose3) -> tuple[Array, Array]:
-    """(f, 6) tangents from a T_lidar_camera to the frames' own; (f,) mean squares in pixels.
+def _displacements(frames: FrameFits, center: Array) -> tuple[Array, Array]:
+    """(f, 6) tangents from a T_camera_lidar to the frames' own; (f,) mean squares in pixels.
 
     The latter are of whitened pixels.
     """
-    away = np.array([center.localCoordinates(own) for own in frames.T_lidar_camera])
+    away = local_coordinates(center, frames.T_camera_lidar)
     return away, np.einsum("fi,fij,fj->f", away, frames.hessians, away) / frames.counts
 
 
@@ -196,13 +198,12 @@ def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
     return _REACH * max(min(robust_spread(np.sqrt(shift)), _MAX_WIDENING * nearest), least)
 
 
-def _densest_start(block: CameraBlock, frames: FrameFits, T_camera_lidar: Array) -> gtsam.Pose3:
-    """The T_lidar_camera with the least loss over all frames: a frame's own, or the given one."""
-    step = -(-len(frames.T_lidar_camera) // _MAX_CANDIDATES)
-    candidates = [to_T_lidar_camera(T_camera_lidar), *frames.T_lidar_camera[::step]]
+def _densest_start(block: CameraBlock, frames: FrameFits, T_camera_lidar: Array) -> Array:
+    """The (4, 4) T_camera_lidar of least loss over all frames: a frame's own, or the given one."""
+    step = -(-len(frames.T_camera_lidar) // _MAX_CANDIDATES)
+    candidates: list[Array] = [T_camera_lidar, *frames.T_camera_lidar[::step]]
     scale_px = CAUCHY_SCALE_SIGMAS * float(np.median(frames.spreads_px))
-    best = block.best_candidate([to_T_camera_lidar(T) for T in candidates], scale_px)
-    return candidates[best]
+    return candidates[block.best_candidate(candidates, scale_px)]
 
 
 def _quantile_of_nearest(shift: Array, *, fewest: int) -> float:
@@ -221,7 +222,7 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
         confidence: (n,) of the same matches.
     """
     known = np.flatnonzero(np.isfinite(sizes))
-    order = known[np.argsort(confidence[known], kind="stable")]
+    order = known[_order_of(confidence[known])]
     if len(order) < 2 * _BIN_MATCHES or confidence[order[0]] == confidence[order[-1]]:
         return np.ones(len(sizes))
     groups = np.array_split(order, min(_CONFIDENCE_BINS, len(order) // _BIN_MATCHES))
@@ -231,3 +232,13 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     falling = isotonic_regression(np.log(spreads), weights=counts, increasing=False).x
     learnt = np.exp(np.interp(confidence, middles, falling))
     return np.asarray(learnt / np.median(learnt))
+
+
+def _order_of(confidence: Array) -> NDArray[np.int64]:
+    """(n,) stable ascending order of positive numbers, in single precision.
+
+    By whole numbers, the number's bits before its place, which sort in a quarter of the time.
+    """
+    bits = confidence.astype(np.float32).view(np.int32).astype(np.int64)
+    keys = np.sort((bits << _PLACE_BITS) | np.arange(len(bits)))
+    return np.asarray(keys & ((1 << _PLACE_BITS) - 1))

@@ -14,8 +14,13 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.factor_graph import Optimum, objective_graph, optimize
+from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.factor_graph import (
+    RELATIVE_TOLERANCE,
+    Optimum,
+    objective_graph,
+    optimize,
+)
 from calibgraph.solver.residual_scale import ResidualScale
 
 Array = NDArray[np.float64]
@@ -23,6 +28,7 @@ Transforms = dict[str, Array]
 """Per camera, (4, 4) T_camera_lidar."""
 Scales = dict[str, ResidualScale]
 
+_COARSE_TOLERANCE = 1e-3  # relative change of the error
 _MAX_RESCALINGS = 10  # mostly 3 are enough
 _CONVERGED = 0.01  # relative change of the spread: far below its own uncertainty
 _NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px, half an image, to 1 px
@@ -38,8 +44,9 @@ class Objective:
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: the mean of the priors.
         config: the weights lambda and mu, the loss and its scales.
         terms: which terms of Eq. 5 are used.
-        gate_hessian: after the gate, (6, 6) per camera, see ``BlockResiduals.gate_hessian``; before
-            it, empty.
+        gated: after the gate, per camera the residuals of all correspondences and the scale that
+            it was drawn at; before it, empty.
+        relative_tolerance: of Levenberg-Marquardt.
     """
 
     rig: Rig
@@ -47,7 +54,8 @@ class Objective:
     T_hat: Mapping[str, Array]
     config: Config
     terms: Terms
-    gate_hessian: Mapping[str, Array] = field(default_factory=dict)
+    gated: Mapping[str, tuple[BlockResiduals, ResidualScale]] = field(default_factory=dict)
+    relative_tolerance: float = RELATIVE_TOLERANCE
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -73,6 +81,23 @@ class Objective:
         """All terms but the reprojection term: priors and measured relative poses."""
         return self.graph({})
 
+    @cached_property
+    def gate_hessian(self) -> dict[str, Array]:
+        """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
+        return {name: at.gate_hessian(scale) for name, (at, scale) in self.gated.items()}
+
+    def coarse(self, matches: int) -> Objective:
+        """With at most so many correspondences of each camera, and less exact minima.
+
+        For a start: the spread of so many is known to some percent, and so is the minimum.
+        """
+        blocks = {name: block.select_evenly(matches) for name, block in self.blocks.items()}
+        return self.with_blocks(blocks).with_tolerance(_COARSE_TOLERANCE)
+
+    def with_tolerance(self, relative_tolerance: float) -> Objective:
+        """The same objective, with less exact minima."""
+        return replace(self, relative_tolerance=relative_tolerance)
+
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences."""
         return replace(self, blocks=dict(blocks))
@@ -86,7 +111,12 @@ class Objective:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
             return Optimum(start, math.nan, 0, True)
-        return optimize(self.graph(scales), self.cameras, start)
+        return optimize(
+            self.graph(scales),
+            self.cameras,
+            start,
+            relative_tolerance=self.relative_tolerance,
+        )
 
     def minimize_with_scale(self, start: Transforms) -> tuple[Transforms, Scales]:
         """Pass 1. With `auto` scales: minimize and re-measure the spread until it is constant.
@@ -167,5 +197,6 @@ class Objective:
                     "gate is too narrow",
                     camera=name,
                 )
-        gate_hessian = {name: at[name].gate_hessian(scales[name]) for name in at}
-        return replace(self.with_blocks(inliers), gate_hessian=gate_hessian)
+        return replace(
+            self.with_blocks(inliers), gated={name: (at[name], scales[name]) for name in at}
+        )

@@ -1,8 +1,9 @@
-"""One camera's extrinsic from its correspondences in one frame: robust PnP."""
+"""One camera's extrinsic from its correspondences in single frames: robust PnP."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -11,34 +12,70 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
-from calibgraph.solver.factor_graph import optimize, projection_graph
-from factors import ProjectionBlock, smallest_scaled_eigenvalue
+from calibgraph.solver.frame_poses import Runs, fit_frames
+from factors import ProjectionBlock, smallest_scaled_eigenvalues
 
 Array = NDArray[np.float64]
 
 _REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
 _MAX_SAMPLE = 4000  # matches; chosen, not measured
-_RANSAC_ITERATIONS = 2000  # samples of 4: with 80 % outliers, one is clean in 19 of 20 runs
+RANSAC_ITERATIONS = 2000
+"""Samples of 4 matches: with 80 % outliers, one is clean in 19 of 20 runs."""
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
-def frame_pose(camera: Camera, matches: Correspondences, config: Config) -> Array | None:
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Frames refined on their inliers.
+
+    Attributes:
+        T_camera_lidar: (f, 4, 4).
+        found: (f,) whether enough matches agree on it, and leave no direction of it free.
+        inliers: (f,) matches within the PnP threshold.
+    """
+
+    T_camera_lidar: Array
+    found: NDArray[np.bool_]
+    inliers: NDArray[np.int64]
+
+
+def frame_pose(
+    camera: Camera,
+    matches: Correspondences,
+    config: Config,
+    *,
+    iterations: int = RANSAC_ITERATIONS,
+) -> Array | None:
     """(4, 4) T_camera_lidar from one camera's matches in one frame.
 
     MAGSAC on the undistorted plane, then inliers re-selected and refined with the full lens model.
     Of many matches an even selection is used.
 
+    Args:
+        camera: its lens.
+        matches: of one frame.
+        config: ``pnp_threshold_px``, ``seed``.
+        iterations: samples of MAGSAC, at most.
+
     Returns:
         None if too few matches agree on an extrinsic, or if they leave a direction of it free.
     """
-    matches = matches.select(slice(None, None, -(-len(matches) // _MAX_SAMPLE) or None))
-    start = _ransac_pnp(camera, matches, config)
-    return None if start is None else _refine(camera, matches, start, config)
+    matches = select_evenly(matches, _MAX_SAMPLE)
+    start = ransac_pnp(camera, matches, config, iterations=iterations)
+    if start is None:
+        return None
+    block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
+    refined = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
+    return refined.T_camera_lidar[0] if refined.found[0] else None
+
+
+def select_evenly(matches: Correspondences, most: int) -> Correspondences:
+    """Every k-th match, so that at most so many are left."""
+    return matches.select(slice(None, None, -(-len(matches) // most) or None))
 
 
 def normalized(camera: Camera, pixels_px: Array) -> Array:
@@ -56,11 +93,17 @@ def normalized(camera: Camera, pixels_px: Array) -> Array:
     return np.asarray(plane, dtype=np.float64).reshape(-1, 2)
 
 
-def _ransac_pnp(camera: Camera, frame: Correspondences, config: Config) -> Array | None:
-    """(4, 4) T_camera_lidar of one frame by MAGSAC, None if there is no pose."""
-    if len(frame) < MIN_MATCHES:
+def ransac_pnp(
+    camera: Camera,
+    matches: Correspondences,
+    config: Config,
+    *,
+    iterations: int = RANSAC_ITERATIONS,
+) -> Array | None:
+    """(4, 4) T_camera_lidar by MAGSAC, None if there is no pose. Arguments as of `frame_pose`."""
+    if len(matches) < MIN_MATCHES:
         return None
-    plane = normalized(camera, frame.pixels_px)
+    plane = normalized(camera, matches.pixels_px)
     usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
     if np.count_nonzero(usable) < MIN_MATCHES:
         return None
@@ -68,14 +111,14 @@ def _ransac_pnp(camera: Camera, frame: Correspondences, config: Config) -> Array
     parameters.score = cv2.SCORE_METHOD_MAGSAC
     parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
     parameters.threshold = config.pnp_threshold_px
-    parameters.maxIterations = _RANSAC_ITERATIONS
+    parameters.maxIterations = iterations
     parameters.confidence = 0.999
     parameters.randomGeneratorState = config.seed
     focal = camera.intrinsics_px.fx
     ideal = np.diag([focal, focal, 1.0])
     try:
         found, _, rotation, translation, _ = cv2.solvePnPRansac(
-            frame.points_lidar_m[usable], plane[usable] * focal, ideal, None, params=parameters
+            matches.points_lidar_m[usable], plane[usable] * focal, ideal, None, params=parameters
         )
     except cv2.error:  # degenerate samples: all points in one place, or on one line
         return None
@@ -87,27 +130,29 @@ def _ransac_pnp(camera: Camera, frame: Correspondences, config: Config) -> Array
     return T
 
 
-def _refine(
-    camera: Camera, frame: Correspondences, T_camera_lidar: Array, config: Config
-) -> Array | None:
-    """Re-select inliers with the full lens model and refine on them, a few times."""
+def refine_frames(
+    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
+) -> Refined:
+    """Re-select each frame's inliers with the full lens model and refine on them, a few times.
+
+    Args:
+        block: of all frames, with all their matches, unweighted.
+        runs: (f, 2) those of each frame, one behind the other.
+        T_camera_lidar: (f, 4, 4) starts.
+        config: ``pnp_threshold_px``.
+    """
+    least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
+    found = np.ones(len(runs), dtype=np.bool_)
     for _ in range(_REFINEMENTS):
-        T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
-        every_match = ProjectionBlock(camera.lens, frame.points_lidar_m, frame.pixels_px)
-        residuals, projectable = every_match.residuals(T_lidar_camera)
-        inlier = projectable & (np.hypot(*residuals.T) < config.pnp_threshold_px)
-        if np.count_nonzero(inlier) < max(MIN_MATCHES, _MIN_INLIER_SHARE * len(frame)):
-            return None
-        block = ProjectionBlock(
-            camera.lens,
-            frame.points_lidar_m[inlier],
-            frame.pixels_px[inlier],
-            scale=config.pnp_threshold_px / 2,
-        )
-        graph = projection_graph(["camera"], {"camera": block})
-        optimum = optimize(graph, ["camera"], {"camera": T_camera_lidar})
-        T_camera_lidar = optimum.T_camera_lidar["camera"]
-        hessian = block.sums(to_T_lidar_camera(T_camera_lidar)).hessian
-        if smallest_scaled_eigenvalue(hessian) < _MIN_SCALED_EIGENVALUE:
-            return None
-    return T_camera_lidar
+        residuals, projectable = block.run_residuals(T_camera_lidar, runs)
+        squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
+        inlier = projectable & (squared < config.pnp_threshold_px**2)
+        places = np.concatenate([[0], np.cumsum(inlier)])[runs]
+        inliers = places[:, 1] - places[:, 0]
+        found &= inliers >= least
+        some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
+        places[~found] = 0
+        fit = fit_frames(some, places, T_camera_lidar)
+        T_camera_lidar = fit.T_camera_lidar
+        found &= smallest_scaled_eigenvalues(fit.hessians) >= _MIN_SCALED_EIGENVALUE
+    return Refined(T_camera_lidar, found, inliers)

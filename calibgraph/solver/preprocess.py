@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.correspondence_tables import parts_of_file
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.rig import Rig
-from calibgraph.solver.grid import best_in_cell
+from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
 
 Array = NDArray[np.float64]
 
@@ -67,14 +67,18 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     table = _merge(rig, kept, config)
     camera = _camera_numbers(rig, table)
     counts[3] = np.bincount(camera, minlength=len(rig.cameras))
-    rows = np.flatnonzero(_within_cap(table, camera, config))
-    counts[4] = np.bincount(camera[rows], minlength=len(rig.cameras))
-    order = rows[np.lexsort((table.frame[rows], camera[rows]))]
+    order = frame_order(camera, table.frame)
+    if order is not None:
+        table, camera = table.select(order), camera[order]
+    rows = _within_cap(table, camera, config)
+    if rows is not None:
+        table, camera = table.select(rows), camera[rows]
+    counts[4] = np.bincount(camera, minlength=len(rig.cameras))
     named = {
         name: dict(zip(FILTERS, column, strict=True))
         for name, column in zip(rig.cameras, counts.T.tolist(), strict=True)
     }
-    return Preprocessed(table.select(order), named)
+    return Preprocessed(table, named)
 
 
 def _filter(
@@ -83,12 +87,11 @@ def _filter(
     """The best rows of a part; (3, N) per camera, how many are given, projectable, confident."""
     camera = _camera_numbers(rig, table)
     projectable = _projectable(rig, table, camera)
-    rows = np.flatnonzero(projectable & (table.confidence >= config.confidence_min))
-    passed = [np.bincount(c, minlength=len(rig.cameras))
-              for c in (camera, camera[projectable], camera[rows])]  # fmt: skip
-    confident = table.select(rows)
-    best = confident.select(best_in_cell(rig, confident, camera[rows], config))
-    return best, np.array(passed)
+    confident = projectable & (table.confidence >= config.confidence_min)
+    furthest = projectable.view(np.int8) + confident.view(np.int8)  # the last filter passed
+    reached = np.bincount(3 * camera + furthest, minlength=3 * len(rig.cameras)).reshape(-1, 3)
+    passed = np.cumsum(reached[:, ::-1], axis=1)[:, ::-1].T
+    return table.select(best_in_cell(rig, table, camera, config, among=confident)), passed
 
 
 def _merge(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
@@ -109,26 +112,33 @@ def _camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
                 camera=name,
             )
     numbers = np.array([list(rig.cameras).index(name) for name in table.cameras], dtype=np.int64)
-    return numbers[table.camera_index] if len(table) else np.empty(0, np.int64)
+    return numbers.take(table.camera_index) if len(table) else np.empty(0, np.int64)
 
 
 def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(n,) depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
     keep = np.empty(len(table), dtype=np.bool_)
     for number, model in enumerate(rig.cameras.values()):
-        rows, T = np.flatnonzero(camera == number), model.T_camera_lidar
-        keep[rows] = model.lens.project(table.points_lidar_m[rows] @ T[:3, :3].T + T[:3, 3])[1]
+        rows = rows_where(camera == number)
+        keep[rows] = model.lens.are_projectable(table.points_lidar_m[rows], model.T_camera_lidar)
     return keep
 
 
 def _within_cap(
     table: Correspondences, camera: NDArray[np.int64], config: Config
-) -> NDArray[np.bool_]:
-    """(n,) which rows are the most confident ``matches_max`` of their camera and frame."""
-    order = np.lexsort((-table.confidence, table.frame, camera))
-    starts = np.ones(len(order), dtype=np.bool_)
-    starts[1:] = (np.diff(camera[order]) != 0) | (np.diff(table.frame[order]) != 0)
-    first = np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
-    keep = np.empty(len(order), dtype=np.bool_)
-    keep[order] = np.arange(len(order)) - first < config.matches_max
-    return keep
+) -> NDArray[np.int64] | None:
+    """The rows that are the most confident ``matches_max`` of their camera and frame; None: all.
+
+    Args:
+        table: sorted by camera and frame.
+        camera: (n,) of its rows.
+        config: ``matches_max``.
+    """
+    edges = frame_edges(camera, table.frame)
+    if not len(table) or np.diff(edges).max() <= config.matches_max:
+        return None
+    group = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+    order = np.lexsort((-table.confidence, group))
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - edges[group]
+    return np.flatnonzero(rank < config.matches_max)

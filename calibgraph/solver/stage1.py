@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
@@ -16,12 +14,18 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.pnp import frame_pose
+from calibgraph.parallel import core_pool
+from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
+from calibgraph.solver.grid import frame_edges
+from calibgraph.solver.pnp import frame_pose, ransac_pnp, refine_frames, select_evenly
+from calibgraph.solver.rotation_median import median_rotation
+from factors import ProjectionBlock, to_runs
 
 Array = NDArray[np.float64]
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
+_COMMON_SAMPLE = 1000  # matches of all frames, for a pose that single frames start from
 _ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
@@ -57,11 +61,22 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     if config.stage1 == "rig":
         named = [name for name in rig.cameras if name in table.cameras]
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
-    with ThreadPoolExecutor() as pool:
-        return {
-            name: _estimate_camera(camera, table.of_camera(name), config, pool)
-            for name, camera in rig.cameras.items()
-        }
+    cameras = rig.cameras.values()
+    rows = [table.of_camera(name) for name in rig.cameras]
+    with core_pool() as pool:
+        common = [*pool.map(partial(_from_common_pose, config=config), cameras, rows)]
+        searches = [
+            {
+                int(i): pool.submit(frame_pose, camera, frames.rows_of(int(i)), config)
+                for i in np.flatnonzero(~frames.found)
+            }
+            for camera, frames in zip(cameras, common, strict=True)
+        ]
+        searched = [{i: search.result() for i, search in each.items()} for each in searches]
+    return {
+        name: _aggregate_frames(frames.with_poses(poses), config)
+        for name, frames, poses in zip(rig.cameras, common, searched, strict=True)
+    }
 
 
 def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
@@ -73,22 +88,65 @@ def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
     }
 
 
-def _estimate_camera(
-    camera: Camera, rows: Correspondences, config: Config, pool: ThreadPoolExecutor
-) -> CameraStage1:
-    """PnP in every frame, then one extrinsic over the frames."""
-    numbers, starts = np.unique(rows.frame, return_index=True)
-    edges = np.append(starts, len(rows))
-    frames = [rows.select(slice(*edge)) for edge in pairwise(edges)]
-    found = pool.map(partial(frame_pose, camera, config=config), frames)
-    by_frame = {int(n): T for n, T in zip(numbers, found, strict=True) if T is not None}
-    T_camera_lidar = np.array([*by_frame.values()]).reshape(-1, 4, 4)
-    kept = T_camera_lidar[are_near_median(T_camera_lidar)]
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """The frames of one camera.
+
+    Attributes:
+        rows: its correspondences.
+        runs: (f, 2) those of each frame.
+        T_camera_lidar: (f, 4, 4).
+        found: (f,) which of these hold.
+    """
+
+    rows: Correspondences
+    runs: Runs
+    T_camera_lidar: Array
+    found: NDArray[np.bool_]
+
+    def rows_of(self, frame: int) -> Correspondences:
+        """The correspondences of the frame of that place."""
+        return self.rows.select(slice(*self.runs[frame]))
+
+    def with_poses(self, poses: Mapping[int, Array | None]) -> _Frames:
+        """With the poses of some frames, by their place; None where there is none."""
+        T_camera_lidar, found = self.T_camera_lidar.copy(), self.found.copy()
+        for frame, T in poses.items():
+            if T is not None:
+                T_camera_lidar[frame], found[frame] = T, True
+        return replace(self, T_camera_lidar=T_camera_lidar, found=found)
+
+
+def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> _Frames:
+    """The poses of all frames at once, from one that MAGSAC finds for all of them together.
+
+    Found are those that explain the majority of the frame's correspondences: no other pose can
+    explain more. Three of them do not count, which any pose explains.
+    """
+    edges = frame_edges(rows.camera_index, rows.frame) if len(rows) else np.zeros(1, np.int64)
+    runs = to_runs(edges)
+    none = np.zeros(len(runs), dtype=np.bool_)
+    start = ransac_pnp(camera, select_evenly(rows, _COMMON_SAMPLE), config)
+    if start is None:
+        return _Frames(rows, runs, np.tile(np.eye(4), (len(runs), 1, 1)), none)
+    block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
+    wide = block.rescale(scale=config.pnp_threshold_px / 2)
+    near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
+    refined = refine_frames(block, runs, near.T_camera_lidar, config)
+    majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
+    return _Frames(rows, runs, refined.T_camera_lidar, refined.found & majority)
+
+
+def _aggregate_frames(frames: _Frames, config: Config) -> CameraStage1:
+    """One extrinsic over the frames of a camera."""
+    poses = frames.T_camera_lidar[frames.found]
+    numbers = frames.rows.frame[frames.runs[frames.found, 0]]
+    kept = poses[are_near_median(poses)]
     return CameraStage1(
-        T_camera_lidar=aggregate(kept, config.aggregate) if by_frame else None,
-        by_frame=MappingProxyType(by_frame),
+        T_camera_lidar=aggregate(kept, config.aggregate) if len(kept) else None,
+        by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),
         per_frame=kept,
-        failed_frames=len(frames) - len(kept),
+        failed_frames=len(frames.runs) - len(kept),
     )
 
 
@@ -144,16 +202,8 @@ def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:
 
 def geodesic_median(rotations: Rotation) -> Rotation:
     """Rotation with the least sum of angles to the given ones (Weiszfeld on SO(3))."""
-    medoid = rotations[_medoid(rotations)]
-    median: Rotation = medoid
-    for _ in range(100):
-        tangents = (rotations * median.inv()).as_rotvec()
-        weights = 1.0 / np.maximum(np.linalg.norm(tangents, axis=1), 1e-12)
-        step = weights @ tangents / weights.sum()
-        median = Rotation.from_rotvec(step) * median
-        if np.linalg.norm(step) < 1e-12:  # noqa: PLR2004 - far below any rotation that matters
-            break
-    return median
+    quaternions = np.ascontiguousarray(rotations.as_quat())
+    return Rotation.from_quat(median_rotation(quaternions, quaternions[_medoid(rotations)]))
 
 
 def _medoid(rotations: Rotation) -> int:

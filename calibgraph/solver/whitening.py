@@ -33,13 +33,13 @@ def sqrt_information(table: Correspondences, config: Config) -> Array | None:
     if table.information_px is None:
         root = np.tile(IDENTITY, (len(table), 1))
     else:
-        root = _upper_root(table.information_px)
+        root = upper_root(table.information_px)
     if config.confidence_weights:  # the paper's w = sqrt(clip(c, 0.1, 1))
         root *= np.sqrt(np.clip(table.confidence, 0.1, 1.0))[:, None]
     return root
 
 
-def _upper_root(information: Array) -> Array:
+def upper_root(information: Array) -> Array:
     """Upper triangular S with S^T S = I, row-wise; rank one gives s11 = 0 (or s00 = s01 = 0)."""
     uu, uv, vv = information.T
     s00 = np.sqrt(uu)
@@ -62,6 +62,11 @@ def constrained_error_px(residuals: Array, information: Array | None) -> Array:
     return np.asarray(np.sqrt(np.maximum(squared, 0.0) / largest_eigenvalue(information)))
 
 
+def constrained_root(information: Array) -> Array:
+    """(n, 3) whitening matrices that make a residual's norm its constrained error."""
+    return upper_root(information / largest_eigenvalue(information)[:, None])
+
+
 def largest_eigenvalue(information: Array) -> Array:
     """(n,) of (n, 3) symmetric 2x2 matrices, given by their entries uu, uv, vv."""
     uu, uv, vv = information.T
@@ -82,4 +87,5 @@ def whitened_norm(root: Array | None, residuals: Array) -> Array:
     if root is None:
         return constrained_error_px(residuals, None)
     first = root[:, 0] * residuals[:, 0] + root[:, 1] * residuals[:, 1]
-    return np.asarray(np.hypot(first, root[:, 2] * residuals[:, 1]))
+    second = root[:, 2] * residuals[:, 1]
+    return np.asarray(np.sqrt(first * first + second * second))

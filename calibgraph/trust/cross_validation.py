@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,9 +12,10 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.verdict import Check
+from calibgraph.parallel import core_pool
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.objective import Transforms
-from calibgraph.solver.pnp import frame_pose
+from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -20,6 +24,11 @@ Array = NDArray[np.float64]
 
 RESTARTS, RESTART_DEG, RESTART_M = 3, 2.0, 0.2
 """How many displaced starts, and how far they are from the solution."""
+
+_RESTART_SAMPLE = 5000  # matches of a camera that first lead back from a displaced start
+_ROUGH = 1e-6  # relative change of the cost at which their first pass stops: the gate needs no more
+_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes what it finds
+_MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
 
 
 def held_out_checks(evidence: Evidence) -> Checks:
@@ -42,7 +51,7 @@ def _held_out_ratio(
         halves: (4, 4) T_camera_lidar from the even frames, and from the odd ones.
         even_frames: their numbers.
     """
-    even = np.isin(block.frame, even_frames)
+    even = block.in_frames(even_frames)
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])
     held_out = np.concatenate([errors[0][~even], errors[1][even]])
@@ -54,7 +63,8 @@ def restart_checks(evidence: Evidence) -> Checks:
     if not evidence.fitted_blocks:
         return {}
     solution = evidence.solution
-    ends = [_solve_from_displaced_start(solution, seed) for seed in range(RESTARTS)]
+    with core_pool() as pool:
+        ends = [*pool.map(partial(_solve_from_displaced_start, solution), range(RESTARTS))]
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
     name = f"solving again from starts {starts}: largest difference"
     checks = {}
@@ -74,13 +84,17 @@ def restart_checks(evidence: Evidence) -> Checks:
 
 
 def _solve_from_displaced_start(solution: Solution, seed: int) -> Transforms | None:
-    """The T_camera_lidar from a displaced start; None if it keeps too few matches."""
+    """The T_camera_lidar from a displaced start; None if it keeps too few matches.
+
+    First coarsely with a selection of the matches, then both passes with all of them from there.
+    """
     start = perturb(
         solution.solved_rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
     ).T_camera_lidar
     objective = solution.objective
     try:
-        rough, scales = objective.minimize_with_scale(start)
+        near, _ = objective.coarse(_RESTART_SAMPLE).minimize_with_scale(start)
+        rough, scales = objective.with_tolerance(_ROUGH).minimize_with_scale(near)
         return objective.without_outliers(rough, scales).minimize(rough, scales).T_camera_lidar
     except CorrespondenceError:
         return None
@@ -106,7 +120,10 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     left_out = block.select(~ours).as_table(camera=camera)
     T = None
     if len(left_out):
-        T = frame_pose(solution.rig.cameras[camera], left_out, solution.config)
+        iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
+        T = frame_pose(
+            solution.rig.cameras[camera], left_out, solution.config, iterations=iterations
+        )
     if T is None:
         return row.describe(0.0, "PASS", f"{row.name}: none")
     theirs = _within_gate(block, T, gate_px)
@@ -116,6 +133,19 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     share = 0.0 if same else only_theirs / max(only_ours, 1)
     advice = f"the other is {degrees:.2g} deg, {centimetres:.2g} cm away; which one is right?"
     return row.check(share, advice=advice)
+
+
+def _ransac_iterations(fewest: float, matches: int) -> int:
+    """Samples of 4 matches that find a competing solution if it is large enough for a warning.
+
+    Args:
+        fewest: matches of such a solution, if it shares none with the reported one; it may share
+            half of them.
+        matches: that were left out, among which they are.
+    """
+    share = min(fewest / 2 / matches, 0.99)
+    needed = math.log(_MISSED) / math.log1p(-(share**4)) if share > 0 else math.inf
+    return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))
 
 
 def _within_gate(block: CameraBlock, T_camera_lidar: Array, gate_px: float) -> NDArray[np.bool_]:

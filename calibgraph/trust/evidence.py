@@ -18,7 +18,11 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
+from calibgraph.solver.covariance import (
+    cluster_robust_covariance,
+    data_sigmas,
+    hessians_of_blocks,
+)
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.solution import Solution
@@ -88,7 +92,18 @@ class Evidence:
     def scatter(self) -> Array | None:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
         solution = self.solution
-        return scatter_covariance(solution.inliers, solution.T_camera_lidar, solution.scales)
+        return scatter_covariance(
+            solution.inliers, solution.T_camera_lidar, solution.scales, self.robust_hessians
+        )
+
+    @cached_property
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
+        solution = self.solution
+        if not solution.inliers.uses_correspondences:
+            return {}
+        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
+        return hessians_of_blocks(blocks, solution.T_camera_lidar)
 
     @cached_property
     def joint_covariance(self) -> Array | None:
@@ -117,7 +132,7 @@ class Evidence:
     @cached_property
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
-        return prior_shares(self.solution)
+        return prior_shares(self.solution, self.robust_hessians)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
@@ -133,7 +148,7 @@ class Evidence:
     def even_frames(self) -> NDArray[np.int64]:
         """Every other one of the frames that any camera has inliers in."""
         blocks = self.solution.inliers.blocks.values()
-        return np.unique(np.concatenate([block.frame for block in blocks]))[::2]
+        return np.unique(np.concatenate([b.frame[b.frame_edges[:-1]] for b in blocks]))[::2]
 
     @cached_property
     def halves(self) -> dict[str, tuple[Array, Array]]:
@@ -142,11 +157,9 @@ class Evidence:
         if not inliers.uses_correspondences:
             return {}
         solutions = []
+        even = {n: block.in_frames(self.even_frames) for n, block in inliers.blocks.items()}
         for odd in (False, True):
-            half = {
-                name: block.select(np.isin(block.frame, self.even_frames, invert=odd))
-                for name, block in inliers.blocks.items()
-            }
+            half = {n: block.select(even[n] != odd) for n, block in inliers.blocks.items()}
             if any(len(block.frame) < MIN_MATCHES for block in half.values()):
                 return {}
             optimum = inliers.with_blocks(half).minimize(
@@ -164,7 +177,9 @@ class Evidence:
         free = solution.inliers.data_only()
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
-        scatter = scatter_covariance(free, T_camera_lidar, solution.scales)
+        scatter = scatter_covariance(
+            free, T_camera_lidar, solution.scales, gate_hessian=solution.inliers.gate_hessian
+        )
         shared = shared_covariance(self.findings, len(free.cameras))
         return DataOnly(T_camera_lidar, None if scatter is None else scatter + shared)
 
@@ -206,7 +221,7 @@ class Evidence:
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
             used=0 if block is None else len(block.frame),
-            frames=0 if block is None else len(np.unique(block.frame)),
+            frames=0 if block is None else len(block.frame_edges) - 1,
             covariance=self.covariance_of(camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
@@ -238,7 +253,11 @@ class RunEvidence:
 
 
 def scatter_covariance(
-    inliers: Objective, T_camera_lidar: Transforms, scales: Scales
+    inliers: Objective,
+    T_camera_lidar: Transforms,
+    scales: Scales,
+    robust_hessians: Mapping[str, Array] | None = None,
+    gate_hessian: Mapping[str, Array] | None = None,
 ) -> Array | None:
     """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
     if not inliers.uses_correspondences:
@@ -248,7 +267,8 @@ def scatter_covariance(
         {name: block.frame for name, block in inliers.blocks.items()},
         inliers.pose_graph,
         T_camera_lidar,
-        gate_hessian=inliers.gate_hessian,
+        gate_hessian=inliers.gate_hessian if gate_hessian is None else gate_hessian,
+        robust_hessians=robust_hessians,
     )
 
 

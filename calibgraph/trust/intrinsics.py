@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, grade
-from calibgraph.solver.augmented_fit import AugmentedFit, compensating_twists, fit_augmented
+from calibgraph.parallel import core_pool
+from calibgraph.solver.augmented_fit import AugmentedFit, linearize
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
+from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -67,14 +67,15 @@ class FreedParameter:
 def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals, and how much depends on the focal length."""
     solution = evidence.solution
-    return {
-        name: check_intrinsics(
-            solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name]),
-            block,
-            solution.scales[name],
+
+    def of_camera(name: str) -> list[Check]:
+        camera = solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name])
+        return check_intrinsics(camera, evidence.fitted_blocks[name], solution.scales[name])
+
+    with core_pool() as pool:
+        return dict(
+            zip(evidence.fitted_blocks, pool.map(of_camera, evidence.fitted_blocks), strict=True)
         )
-        for name, block in evidence.fitted_blocks.items()
-    }
 
 
 def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -> list[Check]:
@@ -91,15 +92,20 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
     table = some.select(in_front).as_table(camera="camera")
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the
     # centre would explain everything.
-    fields = displacement_fields(camera, project_with_jacobian(camera, table.points_lidar_m)[0])
+    rows = linearize(
+        camera,
+        table,
+        lambda predicted: np.concatenate([*displacement_fields(camera, predicted).values()], 2),
+    )
+    unknowns = {"focal length": (0,), "principal point": (1, 2), "distortion": (3,)}
     checks = [
         _check_freed(_free(name, fit, camera))
-        for name, field in fields.items()
-        if (fit := fit_augmented(camera, table, field, loss_scale=scale.loss_scale))
+        for name, numbers in unknowns.items()
+        if (fit := rows.fit(numbers, loss_scale=scale.loss_scale))
     ]
-    inside = (errors_px <= scale.gate_px)[in_front]
-    focal_field = fields["focal length"][inside]
-    return [*checks, _check_sensitivity(camera, table.select(inside), focal_field)]
+    inside = (errors_px <= scale.gate_px)[in_front].astype(np.float64)
+    twists = rows.compensating_twists(unknowns["focal length"], inside)
+    return [*checks, _check_sensitivity(camera, twists[:, 0])]
 
 
 def displacement_fields(camera: Camera, pixels_px: Array) -> dict[str, Array]:
@@ -145,18 +151,15 @@ def _check_freed(freed: FreedParameter) -> Check:
     return translation.describe(centimetres, grade(warn, fail), text, name=name)
 
 
-def _check_sensitivity(camera: Camera, table: Correspondences, focal_px: Array) -> Check:
+def _check_sensitivity(camera: Camera, twist: Array) -> Check:
     """How far a focal length wrong by one percent, easily overlooked, moves the camera.
 
     Args:
         camera: at the solution.
-        table: its inliers.
-        focal_px: (n, 2, 1) displacement of their pixels per relative change of the focal length.
+        twist: (6,) by which its pose compensates for a unit relative change of the focal length.
     """
-    twist = 0.01 * compensating_twists(camera, table, focal_px)[:, 0]
-    _, centimetres = pose_difference(
-        apply_twist(camera, twist).T_camera_lidar, camera.T_camera_lidar
-    )
+    moved = apply_twist(camera, 0.01 * twist)
+    _, centimetres = pose_difference(moved.T_camera_lidar, camera.T_camera_lidar)
     return threshold("focal_sensitivity").check(centimetres)
 
 

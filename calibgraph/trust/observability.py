@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.covariance import pose_hessian, robust_hessian
+from calibgraph.solver.covariance import pose_hessian
 from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
@@ -107,21 +109,23 @@ def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float
     return float(near), float(far)
 
 
-def prior_shares(solution: Solution) -> dict[str, float]:
+def prior_shares(solution: Solution, robust_hessians: Mapping[str, Array]) -> dict[str, float]:
     """Per camera, which share of its result comes from priors and relative poses, not from matches.
 
     It is the mean over the camera's six components of the priors' influence, the diagonal of
     H^-1 H_prior: 0 if the matches decide alone, 1 if there are none.
+
+    Args:
+        solution: of the joint solve.
+        robust_hessians: (6, 6) per camera with matches, there.
     """
     T_camera_lidar = solution.T_camera_lidar
     cameras = list(T_camera_lidar)
     priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
     hessian = priors.copy()
-    for name, matches in solution.inliers.blocks.items():
-        if solution.objective.uses_correspondences:
-            rows = slice(6 * cameras.index(name), 6 * cameras.index(name) + 6)
-            block = matches.with_scale(solution.scales[name])
-            hessian[rows, rows] += robust_hessian(block, to_T_lidar_camera(T_camera_lidar[name]))
+    for name, of_camera in robust_hessians.items():
+        rows = pose_rows(cameras.index(name))
+        hessian[rows, rows] += of_camera
     influence = np.diag(np.linalg.pinv(hessian, hermitian=True) @ priors).reshape(-1, 6)
     return {
         name: float(np.clip(influence[place].mean(), 0.0, 1.0))

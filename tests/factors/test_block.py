@@ -17,7 +17,7 @@ from factors import (
     projection_factor,
     square_root,
 )
-from factors.block import BlockSums
+from factors.block_sums import BlockSums
 from tests.conftest import FORWARD, KANNALA, RADTAN5, RADTAN8
 
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}

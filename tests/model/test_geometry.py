@@ -14,11 +14,13 @@ from calibgraph.model.geometry import (
     angle_deg,
     camera_center,
     invert,
+    local_coordinates,
     point_in_lidar,
     pose_difference,
     pose_rows,
     relative_covariance,
     relative_transform,
+    retract_all,
     to_T_camera_lidar,
     to_T_lidar_camera,
     twist_between,
@@ -144,3 +146,22 @@ def test_only_the_geometry_inverts_transforms() -> None:
                 found.add(path.relative_to(package.parent).as_posix())
     assert "calibgraph/model/geometry.py" in found
     assert found == {"calibgraph/model/geometry.py", *INVERTING}
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 9e-3, 1.1e-2, 0.5, 1.8])
+def test_many_poses_move_as_gtsam_moves_each(size: float) -> None:
+    """On both sides of the angle from which closed formulas are used, and near half a turn."""
+    rng = np.random.default_rng(0)
+    T = np.array([gtsam.Pose3.Expmap(rng.standard_normal(6)).matrix() for _ in range(20)])
+    steps = size * rng.uniform(-1, 1, (20, 6))
+    moved = retract_all(T, steps)
+    for start, step, found in zip(T, steps, moved, strict=True):
+        variable = to_T_lidar_camera(start)
+        np.testing.assert_allclose(found, to_T_camera_lidar(variable.retract(step)), atol=1e-14)
+        back = local_coordinates(start, found[None])[0]
+        np.testing.assert_allclose(back, step, atol=1e-14)
+        np.testing.assert_allclose(
+            local_coordinates(T[0], found[None])[0],
+            to_T_lidar_camera(T[0]).localCoordinates(to_T_lidar_camera(found)),
+            atol=1e-12,
+        )

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph import Correspondences
-from calibgraph.solver.augmented_fit import compensating_twists, fit_augmented
+from calibgraph.solver.augmented_fit import compensating_twists, fit_augmented, linearize
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
 from tests.conftest import make_camera, points_in_front
 
@@ -47,3 +47,24 @@ def test_compensating_twist_is_the_pose_that_imitates_an_unknown() -> None:
     twist = rng.standard_normal(6)
     found = compensating_twists(camera, table, (jacobian @ twist)[:, :, None])
     np.testing.assert_allclose(found[:, 0], twist, rtol=1e-9)
+
+
+def test_rows_made_once_give_the_fit_of_every_choice_of_unknowns() -> None:
+    rng = np.random.default_rng(6)
+    camera, points = make_camera(), points_in_front(rng, 400)
+    columns = rng.standard_normal((400, 2, 3))
+    root = rng.uniform(0.5, 2, (400, 2))
+    table = Correspondences.from_arrays(
+        camera="front",
+        frame=rng.integers(0, 7, 400),
+        pixels_px=project_with_jacobian(camera, points)[0] + rng.standard_normal((400, 2)),
+        points_lidar_m=points,
+        information_px=np.column_stack([root[:, 0], 0.3 * np.ones(400), root[:, 1]]),
+    )
+    rows = linearize(camera, table, lambda _: columns)
+    for choice in ([0], [1, 2], [0, 1, 2]):
+        alone = fit_augmented(camera, table, columns[:, :, choice])
+        together = rows.fit(choice)
+        assert alone is not None and together is not None
+        np.testing.assert_array_equal(together.values, alone.values)
+        np.testing.assert_array_equal(together.sigmas, alone.sigmas)

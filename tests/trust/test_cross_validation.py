@@ -19,6 +19,19 @@ def test_a_competing_solution_of_the_matches_is_found(pair: Rig) -> None:
     assert check.status == "FAIL" and "the other is 3 deg" in check.text
 
 
+def test_a_competing_solution_just_large_enough_for_a_warning_is_found(pair: Rig) -> None:
+    """A quarter agrees on another extrinsic, among as many random outliers."""
+    errors = MatcherErrors(outlier_share=0.2)
+    wrong = calibgraph.perturb(pair, rotation_deg=5, translation_m=0.5, seed=2)
+    table = concatenate(
+        [simulated(pair, matches=300, errors=errors), simulated(wrong, matches=100, errors=errors)]
+    )
+    for seed in range(3):
+        solved = solve_joint(pair, table, calibgraph.Config(seed=seed))
+        for camera in pair.cameras:
+            assert check_competing_solution(solved, camera).value > 0.25
+
+
 def test_random_outliers_are_no_competing_solution(pair: Rig) -> None:
     errors = MatcherErrors(outlier_share=0.5)
     solved = solve_joint(pair, simulated(pair, errors=errors))

@@ -1,0 +1,50 @@
+"""The sums H, b and c of a block of correspondences, and the root that GTSAM is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.conditioning import compiled_square_root
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """H, b and c of a block of correspondences at one pose. Sums of blocks simply add.
+
+    Attributes:
+        hessian: (6, 6) or (f, 6, 6), H above, in GTSAM's tangent of ``T_lidar_camera``.
+        gradient: (6,) or (f, 6), b above.
+        cost: () or (f,), c above; GTSAM's error is half of it.
+    """
+
+    hessian: Array
+    gradient: Array
+    cost: Array
+
+
+def square_root(sums: BlockSums) -> tuple[Array, Array]:
+    """(7,) error and (7, 6) Jacobian with the given H, b and c; H may be rank deficient.
+
+    H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
+    lose no digits to each other; directions without information get a zero row.
+    """
+    error, jacobian = compiled_square_root(
+        np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient), float(sums.cost)
+    )
+    return error, jacobian.T
+
+
+_UPPER = np.triu_indices(6)
+
+
+def unpack_sums(sums: Array) -> BlockSums:
+    """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
+    hessian = np.empty((*sums.shape[:-1], 6, 6))
+    hessian[..., _UPPER[0], _UPPER[1]] = sums[..., :21]
+    hessian[..., _UPPER[1], _UPPER[0]] = sums[..., :21]
+    return BlockSums(hessian, sums[..., 21:27], sums[..., 27])

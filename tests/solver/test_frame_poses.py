@@ -1,0 +1,46 @@
+"""Poses of many frames at once are those of each frame by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph.solver.factor_graph import optimize, projection_graph
+from calibgraph.solver.frame_poses import fit_frames, solve_damped
+from factors import ProjectionBlock, to_runs
+
+
+def test_every_frame_ends_where_levenberg_marquardt_of_gtsam_does(mixed_rig: Rig) -> None:
+    errors = MatcherErrors(noise_px=1.0, outlier_share=0.2)
+    table = simulate_correspondences(mixed_rig, frames=5, matches=200, errors=errors)
+    guess = perturb(mixed_rig, rotation_deg=0.5, translation_m=0.05)
+    for name, camera in guess.cameras.items():
+        rows = table.of_camera(name)
+        block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
+        runs = to_runs(np.append(np.unique(rows.frame, return_index=True)[1], len(rows)))
+        fit = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (len(runs), 1, 1)))
+        assert fit.converged.all()
+        for run, T in zip(runs, fit.T_camera_lidar, strict=True):
+            alone = projection_graph(["one"], {"one": block.select(np.arange(*run))})
+            found = optimize(alone, ["one"], {"one": camera.T_camera_lidar}).T_camera_lidar["one"]
+            # Both stop where the cost changes by 1e-10 of itself: 1e-5 of a standard deviation,
+            # which is 1e-3 rad and 1e-2 m for 200 matches.
+            np.testing.assert_allclose(T, found, atol=1e-7)
+
+
+def test_a_frame_without_matches_stays_and_does_not_disturb_the_others(pair: Rig) -> None:
+    table = simulate_correspondences(pair, frames=2, matches=100).of_camera("left")
+    camera = pair.cameras["left"]
+    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px)
+    start = np.tile(camera.T_camera_lidar, (3, 1, 1))
+    edge = int(np.searchsorted(table.frame, 1))
+    with_empty = fit_frames(block, to_runs(np.array([0, edge, edge, len(table)])), start)
+    without = fit_frames(block, to_runs(np.array([0, edge, len(table)])), start[:2])
+    np.testing.assert_array_equal(with_empty.T_camera_lidar[1], camera.T_camera_lidar)
+    np.testing.assert_array_equal(with_empty.T_camera_lidar[[0, 2]], without.T_camera_lidar)
+
+
+def test_a_free_direction_gets_no_step() -> None:
+    hessian = np.diag([1.0, 2, 0, 4, 5, 6])
+    step = solve_damped(hessian[None], np.array([[1.0, 2, 0, 4, 5, 6]]), 0.0)[0]
+    np.testing.assert_allclose(step, [-1, -1, 0, -1, -1, -1])
