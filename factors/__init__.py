@@ -6,8 +6,17 @@ This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibg
 
 from factors.block import BlockSums, ProjectionBlock, block_factor, square_root
 from factors.conditioning import smallest_scaled_eigenvalue, unit_diagonal
+from factors.epipolar import EpipolarBlock, epipolar_residual
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
+from factors.pair import (
+    PairBlock,
+    epipolar_factor,
+    pair_block_factor,
+    pair_chain,
+    pair_projection_factor,
+    pair_sums,
+)
 from factors.pose import (
     camera_prior_factor,
     pose_sigmas,
@@ -15,23 +24,34 @@ from factors.pose import (
     relative_prior_factor,
 )
 from factors.projection import projection_factor, projection_residual
+from factors.rays import ray_spreads, unproject
 
 __all__ = [
     "LOSSES",
     "BlockSums",
+    "EpipolarBlock",
     "Lens",
     "LensModel",
     "LossName",
+    "PairBlock",
     "ProjectionBlock",
     "block_factor",
     "camera_prior_factor",
+    "epipolar_factor",
+    "epipolar_residual",
+    "pair_block_factor",
+    "pair_chain",
+    "pair_projection_factor",
+    "pair_sums",
     "pose_sigmas",
     "projection_factor",
     "projection_residual",
+    "ray_spreads",
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",
     "smallest_scaled_eigenvalue",
     "square_root",
     "unit_diagonal",
+    "unproject",
 ]

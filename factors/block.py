@@ -136,16 +136,16 @@ class ProjectionBlock:
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        return _unpacked(self._segment_sums([T_lidar_camera], self._chunk_edges())[0].sum(axis=0))
+        return unpack_sums(self._segment_sums([T_lidar_camera], self._chunk_edges())[0].sum(axis=0))
 
     def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
         """H, b and c of the whole block at each of some T_lidar_camera, stacked."""
-        return _unpacked(self._segment_sums(poses, self._chunk_edges()).sum(axis=1))
+        return unpack_sums(self._segment_sums(poses, self._chunk_edges()).sum(axis=1))
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
         runs = np.asarray(edges, dtype=np.int64)
-        return _unpacked(self._segment_sums([T_lidar_camera], runs)[0])
+        return unpack_sums(self._segment_sums([T_lidar_camera], runs)[0])
 
     def _chunk_edges(self) -> NDArray[np.int64]:
         """Where runs of _CHUNK correspondences begin, and the end."""
@@ -266,7 +266,7 @@ def _whitening(root: Array | None, n: int) -> Array:
 _UPPER = np.triu_indices(6)
 
 
-def _unpacked(sums: Array) -> BlockSums:
+def unpack_sums(sums: Array) -> BlockSums:
     """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
     hessian = np.empty((*sums.shape[:-1], 6, 6))
     hessian[..., _UPPER[0], _UPPER[1]] = sums[..., :21]
