@@ -16,6 +16,7 @@ from factors.pair import (
     pair_chain,
     pair_projection_factor,
     pair_sums,
+    surface_factor,
 )
 from factors.pose import (
     camera_prior_factor,
@@ -25,6 +26,7 @@ from factors.pose import (
 )
 from factors.projection import projection_factor, projection_residual
 from factors.rays import ray_spreads, unproject
+from factors.surface import SurfaceBlock, surface_residual
 
 __all__ = [
     "LOSSES",
@@ -35,6 +37,7 @@ __all__ = [
     "LossName",
     "PairBlock",
     "ProjectionBlock",
+    "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
     "epipolar_factor",
@@ -52,6 +55,8 @@ __all__ = [
     "robust_noise",
     "smallest_scaled_eigenvalue",
     "square_root",
+    "surface_factor",
+    "surface_residual",
     "unit_diagonal",
     "unproject",
 ]

@@ -202,21 +202,22 @@ def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
 
 
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
-    """(7,) error and (7, 6) Jacobian with the given H, b and c; H may be rank deficient.
+    """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
     H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
     lose no digits to each other; directions without information get a zero row.
     """
+    n = len(sums.hessian)
     scaled, units = unit_diagonal(sums.hessian)
     values, vectors = np.linalg.eigh(scaled)
     informed = values > 1e-14 * max(float(values[-1]), 0.0)
     roots = np.sqrt(np.where(informed, values, 0.0))
     over = np.where(informed, 1.0 / np.where(informed, roots, 1.0), 0.0)
-    jacobian = np.zeros((7, 6), order="F")
-    jacobian[:6] = roots[:, None] * vectors.T * units
-    error = np.empty(7)
-    error[:6] = over * (vectors.T @ (sums.gradient / units))
-    error[6] = np.sqrt(max(float(sums.cost) - float(error[:6] @ error[:6]), 0.0))
+    jacobian = np.zeros((n + 1, n), order="F")
+    jacobian[:n] = roots[:, None] * vectors.T * units
+    error = np.empty(n + 1)
+    error[:n] = over * (vectors.T @ (sums.gradient / units))
+    error[n] = np.sqrt(max(float(sums.cost) - float(error[:n] @ error[:n]), 0.0))
     return error, jacobian
 
 

@@ -10,41 +10,40 @@ sums H, b, c are those in the tangent of T_a_b. With X = T_lidar_camera,
 
 so the block's square root factor (7 rows), times [-Ad(T_a_b^-1), I], is lossless on both poses.
 A feature without depth gives an epipolar residual (``factors.epipolar``) by the same chain rule.
+Where the range follows the pose of A (``factors.surface``), both poses enter, and the block's
+square root has 13 rows.
 """
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block import BlockSums, square_root
-from factors.epipolar import epipolar_residual
+from factors.block import BlockSums, ProjectionBlock, square_root
+from factors.epipolar import EpipolarBlock, epipolar_residual
 from factors.lens import Lens
 from factors.loss import robust_noise
 from factors.projection import projection_residual
+from factors.surface import SurfaceBlock, surface_residual
 
 Array = NDArray[np.float64]
 
 
-class PairBlock(Protocol):
-    """What a block on the relative pose of two cameras computes."""
-
-    def sums(self, T_a_b: gtsam.Pose3, /) -> BlockSums:
-        """H, b and c in GTSAM's tangent of ``T_a_b``."""
-        ...
+PairBlock = ProjectionBlock | EpipolarBlock | SurfaceBlock
+"""Features of camera A, seen in camera B; a ``ProjectionBlock`` has points in A's frame, and the
+lens and pixels of B."""
 
 
 def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomFactor:
     """All features of a block as one factor on two poses, equal to its separate factors.
 
+    The error and Jacobian of the last poses are kept, as in ``factors.block.block_factor``.
+
     Args:
         key_a: the variable ``T_lidar_a``.
         key_b: the variable ``T_lidar_b``.
-        block: a ``ProjectionBlock`` with points in A's frame, B's lens and B's pixels; or an
-            ``EpipolarBlock``.
+        block: of features of camera A, seen in camera B.
     """
     last: tuple[bytes, tuple[Array, Array]] | None = None
 
@@ -52,21 +51,34 @@ def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomF
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
         nonlocal last
-        T_a_b, by_a, by_b = _relative(values, key_a, key_b)
-        pose, found = T_a_b.matrix().tobytes(), last
-        if found is None or found[0] != pose:
-            last = found = (pose, square_root(block.sums(T_a_b)))
+        poses = values.atPose3(key_a), values.atPose3(key_b)
+        place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
+        if found is None or found[0] != place:
+            last = found = (place, _error_and_jacobian(block, *poses))
         residual, jacobian = found[1]
         if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian @ by_a)
-            jacobians[1] = np.asfortranarray(jacobian @ by_b)
+            jacobians[0] = np.asfortranarray(jacobian[:, :6])
+            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
         return residual
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key_a, key_b], error)
+    rows = 13 if isinstance(block, SurfaceBlock) else 7
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [key_a, key_b], error)
+
+
+def _error_and_jacobian(
+    block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
+) -> tuple[Array, Array]:
+    """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
+    if isinstance(block, SurfaceBlock):
+        return square_root(block.sums(T_lidar_a, T_lidar_b))
+    error, jacobian = square_root(block.sums(T_lidar_a.between(T_lidar_b)))
+    return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
 
 
 def pair_sums(block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
     """H (12, 12), b (12,) and c of a block, in the tangents of both poses, first A's."""
+    if isinstance(block, SurfaceBlock):
+        return block.sums(T_lidar_a, T_lidar_b)
     sums = block.sums(T_lidar_a.between(T_lidar_b))
     chain = pair_chain(T_lidar_a, T_lidar_b)
     return BlockSums(chain.T @ sums.hessian @ chain, chain.T @ sums.gradient, sums.cost)
@@ -117,6 +129,47 @@ def pair_projection_factor(
 
     base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
     noise = robust_noise(base, loss=loss, scale=scale)
+    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+
+
+def surface_factor(
+    key_a: int,
+    key_b: int,
+    lens_b: Lens,
+    ray_a: ArrayLike,
+    plane_lidar_per_m: ArrayLike,
+    pixel_b_px: ArrayLike,
+    *,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One feature on a surface of the LiDAR. The reference of ``SurfaceBlock``.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        lens_b: of camera B.
+        ray_a: (3,) the feature's unit ray in A's frame.
+        plane_lidar_per_m: (3,) q, with q . p = 1 for points p of the surface in the LiDAR frame.
+        pixel_b_px: (2,) the feature in B.
+        loss: name of the robust loss.
+        scale: residual norm [px] at which the loss bends.
+    """
+    ray, plane, pixel = (
+        np.asarray(value, dtype=np.float64) for value in (ray_a, plane_lidar_per_m, pixel_b_px)
+    )
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        poses = values.atPose3(key_a), values.atPose3(key_b)
+        residual, jacobian = surface_residual(poses, lens_b, ray, plane, pixel)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(jacobian[:, :6])
+            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
+        return residual
+
+    noise = robust_noise(gtsam.noiseModel.Unit.Create(2), loss=loss, scale=scale)
     return gtsam.CustomFactor(noise, [key_a, key_b], error)
 
 

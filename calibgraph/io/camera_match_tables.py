@@ -13,11 +13,11 @@ from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
 from calibgraph.io.correspondence_tables import arrow_reads
 from calibgraph.model.camera_matches import (
-    CAMERA_MATCHES_FORMAT,
     COLUMNS,
+    FORMAT,
     NAMES,
     NUMBERS,
-    RANGES,
+    PLANES,
     CameraMatches,
 )
 
@@ -40,9 +40,9 @@ def load_camera_matches(path: Path | str) -> CameraMatches:
     ) > len(COLUMNS):
         what = f"column {missing[0]!r} is missing" if missing else "there are unknown columns"
         raise FileError(path, f"{what}; found {table.column_names}, expected {list(COLUMNS)}")
-    form = (table.schema.metadata or {}).get(b"format", CAMERA_MATCHES_FORMAT.encode())
-    if form.decode("utf-8", "replace") != CAMERA_MATCHES_FORMAT:
-        raise FileError(path, f"has the format {form!r}, expected {CAMERA_MATCHES_FORMAT!r}")
+    form = (table.schema.metadata or {}).get(b"format", FORMAT.encode())
+    if form.decode("utf-8", "replace") != FORMAT:
+        raise FileError(path, f"has the format {form!r}, expected {FORMAT!r}")
     try:
         return _from_arrow(table)
     except (CorrespondenceError, ValueError, TypeError, KeyError) as error:
@@ -56,7 +56,7 @@ def _read(path: Path) -> pa.Table:
     with arrow_reads(path):
         if path.suffix == ".csv":
             types = dict.fromkeys(NAMES, pa.string()) | {"frame": pa.int64()}
-            types |= dict.fromkeys((*NUMBERS, *RANGES), pa.float64())
+            types |= dict.fromkeys((*NUMBERS, *PLANES), pa.float64())
             return csv.read_csv(path, convert_options=csv.ConvertOptions(column_types=types))
         with parquet.ParquetFile(path) as file:
             return file.read()
@@ -70,7 +70,8 @@ def _from_arrow(table: pa.Table) -> CameraMatches:
             raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
     names = [table[name].to_pylist() for name in NAMES]
     given = json.loads(metadata.get(b"cameras", b"null"))
-    cameras = tuple(given or dict.fromkeys(str(name) for row in zip(*names, strict=True) for name in row))
+    in_order = [name for row in zip(*names, strict=True) for name in row]
+    cameras = tuple(given or dict.fromkeys(in_order))
     number = {name: index for index, name in enumerate(cameras)}
     index = np.array([[number[name] for name in side] for side in names], np.int32).T
 
@@ -82,7 +83,6 @@ def _from_arrow(table: pa.Table) -> CameraMatches:
         camera_index=index.reshape(-1, 2),
         frame=np.asarray(table["frame"].to_numpy(), np.int64),
         pixels_px=stack(NUMBERS).reshape(-1, 2, 2),
-        ranges_m=stack(RANGES[:2]),
-        range_sigmas_m=stack(RANGES[2:]),
+        planes_lidar_per_m=stack(PLANES).reshape(-1, 2, 3),
         metadata=json.loads(metadata.get(b"matcher", b"{}")),
     )

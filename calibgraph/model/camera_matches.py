@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CAMERA_MATCHES_FORMAT = "calibgraph-camera-matches/1"
+FORMAT = "calibgraph-camera-matches/1"
 NAMES = ("camera_a", "camera_b")
 NUMBERS = ("u_a_px", "v_a_px", "u_b_px", "v_b_px")
-RANGES = ("range_a_m", "range_b_m", "range_a_sigma_m", "range_b_sigma_m")
-COLUMNS = (*NAMES, "frame", *NUMBERS, *RANGES)
+PLANES = tuple(f"q{axis}_{side}_per_m" for side in "ab" for axis in "xyz")
+COLUMNS = (*NAMES, "frame", *NUMBERS, *PLANES)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CameraMatches:
     """Features that two cameras see at one instant, as columns of equal length.
 
-    Sides: 0 is camera A, 1 is camera B. A range is the distance of the feature from the camera's
-    centre along its ray, measured by the LiDAR under an estimate of that camera's extrinsic.
+    Sides: 0 is camera A, 1 is camera B. A plane q, with q . p = 1 for its points p in the LiDAR
+    frame, is fitted to the LiDAR's points that project next to the feature, under an estimate of
+    the camera's extrinsic. The feature is where its ray meets the plane.
 
     Attributes:
         cameras: the names that ``camera_index`` counts.
         camera_index: (n, 2) which of ``cameras`` are A and B; A comes before B.
         frame: (n,) frame number.
         pixels_px: (n, 2, 2) per side, the pixel (column, row) in the image as recorded.
-        ranges_m: (n, 2) per side; NaN where there is none.
-        range_sigmas_m: (n, 2) standard deviations of the ranges; NaN where there is none.
+        planes_lidar_per_m: (n, 2, 3) per side, q [1/m]; NaN where there is none.
         metadata: the settings of the matcher.
 
     Raises:
@@ -52,8 +52,7 @@ class CameraMatches:
     camera_index: NDArray[np.int32]
     frame: NDArray[np.int64]
     pixels_px: Array
-    ranges_m: Array
-    range_sigmas_m: Array
+    planes_lidar_per_m: Array
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -78,8 +77,7 @@ class CameraMatches:
             camera_index=np.empty((0, 2), np.int32),
             frame=np.empty(0, np.int64),
             pixels_px=np.empty((0, 2, 2)),
-            ranges_m=np.empty((0, 2)),
-            range_sigmas_m=np.empty((0, 2)),
+            planes_lidar_per_m=np.empty((0, 2, 3)),
             metadata=metadata or {},
         )
 
@@ -92,9 +90,7 @@ class CameraMatches:
 
     def pairs(self) -> list[tuple[str, str]]:
         """The pairs of cameras that have matches, A before B."""
-        return [
-            (self.cameras[a], self.cameras[b]) for a, b in np.unique(self.camera_index, axis=0)
-        ]
+        return [(self.cameras[a], self.cameras[b]) for a, b in np.unique(self.camera_index, axis=0)]
 
     def of_pair(self, a: str, b: str) -> CameraMatches:
         """The rows of one pair, A and B in the order of ``cameras``; none if it has none."""
@@ -110,16 +106,9 @@ class CameraMatches:
             object.__setattr__(kept, name, getattr(self, name)[rows])
         return kept
 
-    def with_ranges(self, ranges_m: Array, range_sigmas_m: Array) -> CameraMatches:
-        """The same features with other ranges, (n, 2) each."""
-        other = {name: getattr(self, name) for name in ("cameras", "camera_index", "frame")}
-        return CameraMatches(
-            **other,
-            pixels_px=self.pixels_px,
-            ranges_m=ranges_m,
-            range_sigmas_m=range_sigmas_m,
-            metadata=self.metadata,
-        )
+    def with_planes(self, planes_lidar_per_m: Array) -> CameraMatches:
+        """The same features with other planes, (n, 2, 3)."""
+        return replace(self, planes_lidar_per_m=planes_lidar_per_m)
 
     def save(self, path: Path | str) -> None:
         """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
@@ -140,13 +129,12 @@ class CameraMatches:
         }
         columns["frame"] = self.frame
         columns |= dict(zip(NUMBERS, self.pixels_px.reshape(-1, 4).T, strict=True))
-        ranges = np.concatenate([self.ranges_m, self.range_sigmas_m], axis=1)
         columns |= {
             name: pa.array(column, from_pandas=True)  # a NaN becomes an empty cell
-            for name, column in zip(RANGES, ranges.T, strict=True)
+            for name, column in zip(PLANES, self.planes_lidar_per_m.reshape(-1, 6).T, strict=True)
         }
         metadata = {
-            "format": CAMERA_MATCHES_FORMAT,
+            "format": FORMAT,
             "cameras": json.dumps(self.cameras),
             "matcher": json.dumps(self.metadata),
         }
@@ -159,22 +147,20 @@ class CameraMatches:
         pixels = self.pixels_px.reshape(-1, 4)
         small = (np.abs(pixels) < MAX_COORDINATE).all(axis=1)
         self._require(small, "pixel", pixels, f"be finite and below {MAX_COORDINATE:g}")
-        for name in ("ranges_m", "range_sigmas_m"):
-            values = getattr(self, name)
-            good = np.isnan(values) | ((values > 0) & (values < MAX_COORDINATE))
-            self._require(good.all(axis=1), name, values, "be positive, or NaN if unknown")
-        alike = (np.isnan(self.ranges_m) == np.isnan(self.range_sigmas_m)).all(axis=1)
-        self._require(alike, "range_sigmas_m", self.range_sigmas_m, "be there where ranges_m is")
+        planes = self.planes_lidar_per_m
+        there = np.isfinite(planes).all(axis=2) & np.any(planes != 0, axis=2)
+        good = np.all(there | np.isnan(planes).all(axis=2), axis=1)
+        self._require(good, "planes_lidar_per_m", planes, "be finite and not zero, or NaN")
 
-    def _require(self, good: NDArray[np.bool_], what: str, found: Any, rule: str) -> None:
+    def _require(self, good: Any, what: str, found: Any, rule: str) -> None:
         if not good.all():
             row = int(np.flatnonzero(~good)[0])
             raise CorrespondenceError(f"{what} must {rule}, found {found[row].tolist()}", row=row)
 
 
 _SHAPES: dict[str, tuple[int, ...]] = {
-    "camera_index": (2,), "frame": (), "pixels_px": (2, 2), "ranges_m": (2,),
-    "range_sigmas_m": (2,),
+    "camera_index": (2,), "frame": (), "pixels_px": (2, 2),
+    "planes_lidar_per_m": (2, 3),
 }  # fmt: skip
 assert set(_SHAPES) == {f.name for f in fields(CameraMatches)} - {"cameras", "metadata"}
 

@@ -1,11 +1,11 @@
-"""What two cameras both see, ready for the graph: blocks on their relative pose."""
+"""What two cameras both see, ready for the graph."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -13,43 +13,54 @@ from numpy.typing import NDArray
 
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, GATE_SIGMAS, robust_spread
+from calibgraph.solver.residual_scale import (
+    CAUCHY_SCALE_SIGMAS,
+    GATE_SIGMAS,
+    MIN_SIGMA_PX,
+    robust_spread,
+)
+from calibgraph.solver.whitening import MEDIAN_NORM
 from factors import (
+    BlockSums,
     EpipolarBlock,
+    PairBlock,
     ProjectionBlock,
+    SurfaceBlock,
     pair_block_factor,
-    ray_spreads,
+    pair_chain,
+    pair_sums,
     unproject,
 )
 
 Array = NDArray[np.float64]
+Kind = Literal["surface", "point"]
 
 MIN_PAIR_MATCHES = 12
 """Of fewer matches the residuals' spread, and with it their weight, is not known."""
 
-PIXEL_SIGMA_PX = 0.4
-"""Of a SIFT feature; only its ratio to the error of the range matters."""
-
-_MIN_SIGMA = 0.05  # least spread, as of ``MIN_SIGMA_PX``: noise-free data would have none
-_MEDIAN_NORM = {1: 0.67449, 2: 1.17741}  # of a standard Gaussian error
+_ENOUGH_SURFACES = 50
+"""Features on surfaces from which on a pair has no epipolar term. Their spread of 0.3 px then leaves
+an error below that of lenses, 0.05 px on KITTI; and that error, which is shared by all features,
+epipolar residuals turn into 0.1 to 0.2 deg about the axis across the baseline, with a spread of
+only 0.15 px."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairTerm:
-    """Features of a pair with one kind of residual, a function of T_b_a alone.
+    """Features of a pair with one kind of residual.
 
     Attributes:
-        a: the camera whose frame the points are in, or the first of the epipolar residual.
-        b: the camera whose pixels are predicted, or the second.
-        block: with points in A's frame, B's lens and pixels; or epipolar.
+        a: the camera whose features have ranges; of an epipolar residual, the first camera.
+        b: the camera in which they are predicted; the second.
+        block: the features.
         frame: (n,) sorted frame numbers.
     """
 
     a: str
     b: str
-    block: ProjectionBlock | EpipolarBlock
+    block: PairBlock
     frame: NDArray[np.int64]
 
     @cached_property
@@ -62,107 +73,124 @@ class PairTerm:
         """Some rows: a mask, or an index array in rising order."""
         return replace(self, block=self.block.select(rows), frame=self.frame[rows])
 
-    def with_sigma(self, sigma: float) -> PairTerm:
-        """With residuals divided by sigma; the loss bends where it is 95 % efficient."""
-        scaled = self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma)
-        return replace(self, block=scaled)
+    def with_sigma(self, sigma_px: float) -> PairTerm:
+        """With residuals divided by sigma, and the loss's scale in units of it."""
+        block = self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma_px)
+        return replace(self, block=block)
 
-    def errors(self, T_camera_lidar: Mapping[str, Array]) -> Array:
-        """(n,) whitened errors over the median of a standard Gaussian's; inf behind camera B."""
-        T_a_b = _pose_of_b_in_a(self, T_camera_lidar)
-        if isinstance(self.block, EpipolarBlock):
-            return np.abs(self.block.residuals(T_a_b)) / _MEDIAN_NORM[1]
-        residuals, projectable = self.block.residuals(T_a_b)
-        if self.block.sqrt_information is not None:
-            s00, s01, s11 = self.block.sqrt_information.T
-            x, y = residuals.T
-            residuals = np.column_stack([s00 * x + s01 * y, s11 * y])
-        return np.where(projectable, np.hypot(*residuals.T) / _MEDIAN_NORM[2], np.inf)
+    def errors_px(self, T_camera_lidar: Mapping[str, Array]) -> Array:
+        """(n,) lengths of the residuals; infinite where B cannot see the point."""
+        poses = self._poses(T_camera_lidar)
+        if isinstance(self.block, SurfaceBlock):
+            residuals, projectable = self.block.residuals(*poses)
+        elif isinstance(self.block, ProjectionBlock):
+            residuals, projectable = self.block.residuals(poses[0].between(poses[1]))
+        else:
+            return np.abs(self.block.residuals(poses[0].between(poses[1])))
+        return np.where(projectable, np.hypot(*residuals.T), np.inf)
 
-    def sigma(self, T_camera_lidar: Mapping[str, Array]) -> float:
-        """Robust spread of the whitened residuals."""
-        return max(robust_spread(self.errors(T_camera_lidar)), _MIN_SIGMA)
+    def sigma_px(self, T_camera_lidar: Mapping[str, Array]) -> float:
+        """Robust spread of the residuals, per axis."""
+        spread = robust_spread(self.errors_px(T_camera_lidar) / MEDIAN_NORM[self._axes - 1])
+        return max(spread, MIN_SIGMA_PX)
 
-    def without_outliers(self, T_camera_lidar: Mapping[str, Array], sigma: float) -> PairTerm:
-        """The features within the gate: 99 % of Gaussian errors."""
-        median = _MEDIAN_NORM[1 if isinstance(self.block, EpipolarBlock) else 2]
-        return self.select(self.errors(T_camera_lidar) * median < GATE_SIGMAS * sigma)
+    def without_outliers(self, T_camera_lidar: Mapping[str, Array], sigma_px: float) -> PairTerm:
+        """The features within the gate."""
+        return self.select(self.errors_px(T_camera_lidar) <= GATE_SIGMAS * sigma_px)
 
     def factor(self, key_a: int, key_b: int) -> gtsam.NonlinearFactor:
         """The features as one lossless factor on ``T_lidar_a`` and ``T_lidar_b``."""
         return pair_block_factor(key_a, key_b, self.block)
 
+    def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
+        """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
+        return pair_sums(self.block, *self._poses(T_camera_lidar))
 
-def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm, ...]:
-    """The terms of all pairs of a table: A's points in B, B's points in A, and epipolar.
+    def frame_gradients(self, T_camera_lidar: Mapping[str, Array]) -> Array:
+        """(f, 12) b of each frame."""
+        poses = self._poses(T_camera_lidar)
+        if isinstance(self.block, SurfaceBlock):
+            return self.block.frame_sums(*poses, self.frame_edges).gradient
+        relative = self.block.frame_sums(poses[0].between(poses[1]), self.frame_edges)
+        return np.asarray(relative.gradient @ pair_chain(*poses))
 
-    The epipolar residual is that of features without a range in either camera.
+    @property
+    def _axes(self) -> int:
+        return 1 if isinstance(self.block, EpipolarBlock) else 2
+
+    def _poses(self, T_camera_lidar: Mapping[str, Array]) -> tuple[gtsam.Pose3, gtsam.Pose3]:
+        return (
+            to_T_lidar_camera(T_camera_lidar[self.a]),
+            to_T_lidar_camera(T_camera_lidar[self.b]),
+        )
+
+
+def pair_terms(
+    rig: Rig, table: CameraMatches, config: Config, *, kind: Kind = "surface"
+) -> tuple[PairTerm, ...]:
+    """The terms of all pairs of a table: A's features in B, B's in A, and epipolar.
+
+    The epipolar residual is that of features without a surface in either camera, of pairs that have
+    few with one.
 
     Args:
-        rig: lenses; its extrinsics weigh the errors of the ranges.
-        table: with ranges.
+        rig: lenses and, with ``point``, the extrinsics under which points are fixed.
+        table: with surfaces.
         config: the loss.
+        kind: ``surface``: a feature's range follows from the pose of its camera; ``point``: its
+            place X_a is fixed in the frame of its camera.
     """
     terms = []
     for a, b in table.pairs():
         rows = table.of_pair(a, b)
         rows = rows.select(np.argsort(rows.frame, kind="stable"))
-        for side, (one, two) in enumerate(((a, b), (b, a))):
-            terms.append(_projection_term(rig, (one, two), side, rows, config))
-        terms.append(_epipolar_term(rig, (a, b), rows, config))
+        sides = [
+            _term_of_side(rig, names, side, rows, kind, config)
+            for side, names in enumerate(((a, b), (b, a)))
+        ]
+        terms += sides
+        if sum(len(term.frame) for term in sides) < _ENOUGH_SURFACES:
+            terms.append(_epipolar_term(rig, (a, b), rows, config))
     return tuple(term for term in terms if len(term.frame) >= MIN_PAIR_MATCHES)
 
 
-def _projection_term(
-    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, config: Config
+def pair_graph(terms: Iterable[PairTerm], keys: Mapping[str, int]) -> gtsam.NonlinearFactorGraph:
+    """One lossless block factor per term.
+
+    Args:
+        terms: with their sigmas.
+        keys: the variable ``T_lidar_camera`` of each camera.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    for term in terms:
+        graph.add(term.factor(keys[term.a], keys[term.b]))
+    return graph
+
+
+def _term_of_side(
+    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, kind: Kind, config: Config
 ) -> PairTerm:
-    """The term of the points of one side, predicted in the other camera."""
-    rows = rows.select(np.isfinite(rows.ranges_m[:, side]))
+    """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)
+    rows = rows.select(np.isfinite(rows.planes_lidar_per_m[:, side, 0]))
     rays = unproject(a.lens, rows.pixels_px[:, side])[0]
-    ranges, sigmas = rows.ranges_m[:, side, None], rows.range_sigmas_m[:, side, None]
-    T_b_a = relative_transform(b.T_camera_lidar, a.T_camera_lidar)
-    R = T_b_a[:3, :3]
-    by_point = b.lens.project_with_jacobian((rays * ranges) @ R.T + T_b_a[:3, 3])[1] @ R
-    by_pixel = by_point @ (ray_spreads(a.lens, rays) * ranges[:, :, None])
-    by_range = (by_point @ rays[:, :, None]) * sigmas[:, :, None]
-    pixel = by_pixel @ by_pixel.transpose(0, 2, 1) + np.eye(2)
-    covariance = PIXEL_SIGMA_PX**2 * pixel + by_range @ by_range.transpose(0, 2, 1)
-    block = ProjectionBlock(
-        b.lens, rays * ranges, rows.pixels_px[:, 1 - side], _whitening(covariance), config.loss
-    )
+    planes = rows.planes_lidar_per_m[:, side]
+    inverse = inverse_ranges(rays, planes, a.T_camera_lidar)
+    ahead = inverse > 0
+    rows, rays, pixels = rows.select(ahead), rays[ahead], rows.pixels_px[ahead, 1 - side]
+    block: PairBlock
+    if kind == "surface":
+        block = SurfaceBlock(b.lens, rays, planes[ahead], pixels, config.loss)
+    else:
+        points = rays / inverse[ahead, None]
+        block = ProjectionBlock(b.lens, points, pixels, loss=config.loss)
     return PairTerm(*names, block, rows.frame)
-
-
-def _whitening(covariance: Array) -> Array:
-    """(n, 3) upper triangular S with S^T S the inverse of (n, 2, 2) covariances."""
-    uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    over = 1.0 / (uu * vv - uv**2)
-    s00 = np.sqrt(vv * over)
-    return np.column_stack([s00, -uv * over / s00, 1.0 / np.sqrt(vv)])
 
 
 def _epipolar_term(
     rig: Rig, names: tuple[str, str], rows: CameraMatches, config: Config
 ) -> PairTerm:
-    rows = rows.select(np.isnan(rows.ranges_m).all(axis=1))
+    rows = rows.select(np.flatnonzero(np.isnan(rows.planes_lidar_per_m[:, :, 0]).all(axis=1)))
     a, b = (rig.cameras[name] for name in names)
     block = EpipolarBlock(a.lens, b.lens, rows.pixels_px[:, 0], rows.pixels_px[:, 1], config.loss)
     return PairTerm(*names, block, rows.frame)
-
-
-def _pose_of_b_in_a(term: PairTerm, T_camera_lidar: Mapping[str, Array]) -> gtsam.Pose3:
-    """T_a_b as a pose."""
-    T_b_a = relative_transform(T_camera_lidar[term.b], T_camera_lidar[term.a])
-    return to_T_lidar_camera(T_b_a)
-
-
-def pair_graph(
-    cameras: Sequence[str], terms: Sequence[PairTerm], keys: Mapping[str, int]
-) -> gtsam.NonlinearFactorGraph:
-    """One lossless block factor per term whose cameras are among the variables."""
-    graph = gtsam.NonlinearFactorGraph()
-    for term in terms:
-        if term.a in cameras and term.b in cameras:
-            graph.add(term.factor(keys[term.a], keys[term.b]))
-    return graph

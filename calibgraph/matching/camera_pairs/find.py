@@ -1,4 +1,4 @@
-"""Camera-camera matches of a dataset: features, epipolar geometry, ranges from the LiDAR."""
+"""Camera-camera matches of a dataset: features, epipolar geometry, surfaces of the LiDAR."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
-from calibgraph.matching.camera_pairs.ranges import ranges_along
+from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
+from calibgraph.model.geometry import planes_in_lidar
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from factors import unproject
@@ -42,7 +43,7 @@ def match_cameras(
         progress: called with the stage, its steps done, and their number.
 
     Returns:
-        Matches without ranges; see :func:`with_ranges`.
+        Matches without surfaces; see :func:`with_surfaces`.
 
     Raises:
         FileError: if an image cannot be read.
@@ -68,8 +69,8 @@ def match_cameras(
     return concatenate_camera_matches([CameraMatches.empty(tuple(rig.cameras), metadata), *tables])
 
 
-def with_ranges(table: CameraMatches, dataset: Dataset, rig: Rig) -> CameraMatches:
-    """The same matches with the LiDAR's ranges under the rig's extrinsics.
+def with_surfaces(table: CameraMatches, dataset: Dataset, rig: Rig) -> CameraMatches:
+    """The same matches with the LiDAR's surfaces next to them, under the rig's extrinsics.
 
     Args:
         table: of any pairs and frames.
@@ -79,21 +80,21 @@ def with_ranges(table: CameraMatches, dataset: Dataset, rig: Rig) -> CameraMatch
     Raises:
         FileError: if a cloud cannot be read.
     """
-    ranges, sigmas = (np.full((len(table), 2), np.nan) for _ in range(2))
+    planes = np.full((len(table), 2, 3), np.nan)
     for frame in dataset.frames:
-        at = table.frame == frame.index
-        if not at.any():
+        in_frame = (table.frame == frame.index)[:, None]
+        if not in_frame.any():
             continue
         cloud = frame.load_cloud()[:, :3].astype(np.float64)
         for index, name in enumerate(table.cameras):
-            rows, sides = np.nonzero(at[:, None] & (table.camera_index == index))
+            rows, sides = np.nonzero(in_frame & (table.camera_index == index))
             if len(rows):
                 camera = rig.cameras[name]
-                T = camera.T_camera_lidar
                 rays = unproject(camera.lens, table.pixels_px[rows, sides])[0]
-                fits = ranges_along(rays, cloud @ T[:3, :3].T + T[:3, 3])
-                ranges[rows, sides], sigmas[rows, sides] = fits.ranges_m, fits.sigmas_m
-    return table.with_ranges(ranges, sigmas)
+                T = camera.T_camera_lidar
+                in_camera = planes_at(rays, cloud @ T[:3, :3].T + T[:3, 3])
+                planes[rows, sides] = planes_in_lidar(in_camera, T)
+    return table.with_planes(planes)
 
 
 def _agreeing(
@@ -102,9 +103,10 @@ def _agreeing(
     """The matches of a pair that agree on an epipolar geometry, over all its frames."""
     cameras = tuple(rig.cameras)
     a, b = (rig.cameras[name] for name in pair)
-    rays = [np.concatenate([part[side].rays for part in parts]) for side in (1, 2)]
+    sides = [[part[1] for part in parts], [part[2] for part in parts]]
+    rays = [np.concatenate([features.rays for features in side]) for side in sides]
     fit = agree_on_epipolar_geometry(a, b, *rays, seed=seed)
-    pixels = [np.concatenate([part[side].pixels_px for part in parts]) for side in (1, 2)]
+    pixels = [np.concatenate([features.pixels_px for features in side]) for side in sides]
     frame = np.concatenate([np.full(len(one.rays), index) for index, one, _ in parts])
     n = int(np.count_nonzero(fit.inlier))
     numbers = np.array([cameras.index(name) for name in pair], np.int32)
@@ -113,6 +115,5 @@ def _agreeing(
         camera_index=np.tile(numbers, (n, 1)),
         frame=frame[fit.inlier].astype(np.int64),
         pixels_px=np.stack(pixels, axis=1)[fit.inlier],
-        ranges_m=np.full((n, 2), np.nan),
-        range_sigmas_m=np.full((n, 2), np.nan),
+        planes_lidar_per_m=np.full((n, 2, 3), np.nan),
     )

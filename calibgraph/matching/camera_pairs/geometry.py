@@ -69,7 +69,9 @@ def agree_on_epipolar_geometry(
     return EpipolarFit(np.asarray(residuals <= limit_px), false_alarms)
 
 
-def sampson_px(essential: Array, cameras: tuple[Camera, Camera], rays: tuple[Array, Array]) -> Array:
+def sampson_px(
+    essential: Array, cameras: tuple[Camera, Camera], rays: tuple[Array, Array]
+) -> Array:
     """(n,) Sampson's residuals on rays [px] of ``ray_b . E ray_a = 0``."""
     spread_a, spread_b = (ray_spreads(c.lens, r) for c, r in zip(cameras, rays, strict=True))
     normal_b, normal_a = rays[0] @ essential.T, rays[1] @ essential
@@ -122,7 +124,7 @@ def _essential_matrix(
     narrow = np.all([rays[:, 2] > math.cos(_MAX_ANGLE_RAD) for rays in turned], axis=0)
     if np.count_nonzero(narrow) <= _SAMPLE:
         return None
-    planes = [_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned]
+    a, b = (_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned)
     ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
     focal = min(camera.intrinsics_px.fx for camera in cameras)
     parameters = cv2.UsacParams()
@@ -133,7 +135,7 @@ def _essential_matrix(
     parameters.confidence = 0.999
     parameters.randomGeneratorState = seed
     try:
-        found, _ = cv2.findEssentialMat(*planes, ideal, ideal, None, None, parameters)
+        found, _ = cv2.findEssentialMat(a, b, ideal, ideal, None, None, parameters)
     except cv2.error:  # degenerate samples
         return None
     if found is None or found.shape != (3, 3):
