@@ -41,7 +41,7 @@ MIN_PAIR_MATCHES = 12
 """Of fewer matches the residuals' spread, and with it their weight, is not known."""
 
 _ENOUGH_SURFACES = 50
-"""Features on surfaces from which on a pair has no epipolar term. Their spread of 0.3 px then leaves
+"""Features on surfaces from which on a pair has no epipolar term: a spread of 0.3 px then leaves
 an error below that of lenses, 0.05 px on KITTI; and that error, which is shared by all features,
 epipolar residuals turn into 0.1 to 0.2 deg about the axis across the baseline, with a spread of
 only 0.15 px."""
