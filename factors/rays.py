@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 _ITERATIONS = 20  # of Newton; 3 to 6 are enough but near the limit of a lens
 _CONVERGED_PX = 1e-10
 _MISS_PX = 0.01
+_SINGULAR = 1e-9  # determinant over the square of the trace, at the limit of a lens
 
 
 def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
@@ -52,7 +53,7 @@ def _right_inverse(jacobians: Array) -> Array:
     """(n, 3, 2) J^T (J J^T)^-1 of (n, 2, 3) J."""
     gram = jacobians @ jacobians.transpose(0, 2, 1)
     a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
-    over = 1.0 / np.maximum(a * c - b * b, np.finfo(float).tiny)
+    over = 1.0 / np.maximum(a * c - b * b, _SINGULAR * (a + c) ** 2)
     inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) * over[:, None, None]
     return np.asarray(jacobians.transpose(0, 2, 1) @ inverse)
 
@@ -63,7 +64,7 @@ def _first_rays(lens: Lens, pixels: Array) -> Array:
     x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     radius = np.hypot(x, y)
     if lens.kind == FISHEYE:
-        angle = np.minimum(radius, lens.packed[-1])
+        angle = np.minimum(radius, 0.9 * lens.packed[-1])
         sideways = np.sin(angle) / np.maximum(radius, np.finfo(float).tiny)
         return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
     inside = np.minimum(1.0, lens.packed[-1] / np.maximum(radius, np.finfo(float).tiny))
