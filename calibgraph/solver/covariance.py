@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.factor_graph import to_values
 from factors import ProjectionBlock, unit_diagonal
 
@@ -33,6 +34,7 @@ def cluster_robust_covariance(
     T_camera_lidar: Mapping[str, Array],
     *,
     gate_hessian: Mapping[str, Array] | None = None,
+    pairs: Sequence[PairTerm] = (),
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few) H^-1``.
 
@@ -47,6 +49,7 @@ def cluster_robust_covariance(
         pose_graph: the priors and relative poses.
         T_camera_lidar: the solution, all cameras.
         gate_hessian: per camera, see ``BlockResiduals.gate_hessian``.
+        pairs: what cameras see in common, the inliers of the solution.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
@@ -54,11 +57,12 @@ def cluster_robust_covariance(
         MIN_FRAMES_FOR_ERROR_BAR frames, or where H is singular.
     """
     cameras = list(T_camera_lidar)
-    gradients = _frame_gradients(blocks, frames, T_camera_lidar)
+    gradients = _frame_gradients(blocks, frames, T_camera_lidar, pairs)
     if len(gradients) < MIN_FRAMES_FOR_ERROR_BAR:
         return None
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
     _add_robust_hessians(hessian, blocks, T_camera_lidar, gate_hessian or {})
+    _add_pair_hessians(hessian, pairs, T_camera_lidar)
     values, vectors = np.linalg.eigh(hessian)
     if values[0] <= _FREE * values[-1]:
         return None
@@ -83,14 +87,31 @@ def _add_robust_hessians(
         hessian[rows, rows] += gate_hessian.get(name, 0.0)
 
 
+def _add_pair_hessians(
+    hessian: Array, pairs: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
+) -> None:
+    """Add the part of camera pairs to the joint Hessian, (6 N, 6 N)."""
+    for pair in pairs:
+        rows = _rows_of_pair(list(T_camera_lidar), pair)
+        hessian[np.ix_(rows, rows)] += pair.sums(T_camera_lidar).hessian
+
+
+def _rows_of_pair(cameras: Sequence[str], pair: PairTerm) -> NDArray[np.intp]:
+    """(12,) rows of A's pose, then of B's."""
+    first = [6 * cameras.index(name) for name in (pair.a, pair.b)]
+    return np.add.outer(first, np.arange(6)).ravel()
+
+
 def _frame_gradients(
     blocks: Mapping[str, ProjectionBlock],
     frames: Mapping[str, NDArray[np.int64]],
     T_camera_lidar: Mapping[str, Array],
+    pairs: Sequence[PairTerm] = (),
 ) -> Array:
-    """(f, 6 N) gradient of each frame's correspondences, over all cameras."""
+    """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
     cameras = list(T_camera_lidar)
-    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values()]))
+    of_pairs = [pair.frame for pair in pairs]
+    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
     for name, block in blocks.items():
         own, starts = np.unique(frames[name], return_index=True)
@@ -98,6 +119,10 @@ def _frame_gradients(
         sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
         rows = np.searchsorted(numbers, own)
         gradients[rows, pose_rows(cameras.index(name))] = sums.gradient
+    for pair in pairs:
+        rows = np.searchsorted(numbers, np.unique(pair.frame))
+        columns = _rows_of_pair(cameras, pair)
+        gradients[np.ix_(rows, columns)] += pair.frame_gradients(T_camera_lidar)
     return gradients
 
 
@@ -125,6 +150,7 @@ def data_sigmas(
     blocks: Mapping[str, ProjectionBlock],
     pose_graph: gtsam.NonlinearFactorGraph,
     T_camera_lidar: Mapping[str, Array],
+    pairs: Sequence[PairTerm] = (),
 ) -> Array:
     """Standard deviations if every correspondence were independent.
 
@@ -134,6 +160,7 @@ def data_sigmas(
         blocks: per camera with correspondences.
         pose_graph: measured relative poses; no priors.
         T_camera_lidar: the solution, all cameras.
+        pairs: what cameras see in common.
 
     Returns:
         (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
@@ -145,6 +172,7 @@ def data_sigmas(
         rows = pose_rows(cameras.index(name))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
         hessian[rows, rows] += sums.hessian
+    _add_pair_hessians(hessian, pairs, T_camera_lidar)
     scaled, units = unit_diagonal(hessian)
     values, vectors = np.linalg.eigh(scaled)
     free = values < _FREE

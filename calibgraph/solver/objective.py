@@ -15,7 +15,14 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.factor_graph import Optimum, objective_graph, optimize
+from calibgraph.solver.camera_pairs import PairTerm, pair_graph
+from calibgraph.solver.factor_graph import (
+    Optimum,
+    join,
+    objective_graph,
+    optimize,
+    pose_key,
+)
 from calibgraph.solver.residual_scale import ResidualScale
 
 Array = NDArray[np.float64]
@@ -38,6 +45,7 @@ class Objective:
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: the mean of the priors.
         config: the weights lambda and mu, the loss and its scales.
         terms: which terms of Eq. 5 are used.
+        pairs: what cameras see in common, each term with its sigma.
         gate_hessian: after the gate, (6, 6) per camera, see ``BlockResiduals.gate_hessian``; before
             it, empty.
     """
@@ -47,6 +55,7 @@ class Objective:
     T_hat: Mapping[str, Array]
     config: Config
     terms: Terms
+    pairs: tuple[PairTerm, ...] = ()
     gate_hessian: Mapping[str, Array] = field(default_factory=dict)
 
     @property
@@ -63,10 +72,13 @@ class Objective:
         """Eq. 5 as a GTSAM graph that can be printed.
 
         Args:
-            scales: of the residuals; only cameras that have one get a reprojection term.
+            scales: of the residuals; only cameras that have one get a reprojection term, and
+                only pairs of them get terms of their own.
         """
         blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
-        return objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms)
+        graph = objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms)
+        pairs = [pair for pair in self.pairs if {pair.a, pair.b} <= scales.keys()]
+        return join(graph, pair_graph(pairs, {n: pose_key(self.cameras, n) for n in self.cameras}))
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -74,13 +86,18 @@ class Objective:
         return self.graph({})
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
-        """The same objective with other (fewer) correspondences."""
-        return replace(self, blocks=dict(blocks))
+        """The same objective with other (fewer) correspondences, and the pairs of their frames."""
+        frames = np.unique(
+            np.concatenate([np.empty(0, np.int64), *(b.frame for b in blocks.values())])
+        )
+        pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
+        return replace(self, blocks=dict(blocks), pairs=pairs)
 
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
-        return replace(self, rig=rig, T_hat={})
+        pairs = tuple(pair for pair in self.pairs if {pair.a, pair.b} <= self.blocks.keys())
+        return replace(self, rig=rig, T_hat={}, pairs=pairs)
 
     def minimize(self, start: Transforms, scales: Scales) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""

@@ -127,7 +127,7 @@ class Evidence:
             return None
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
         known = relative_pose_graph(solution.inliers.cameras, solution.rig.relative_poses)
-        return data_sigmas(blocks, known, solution.T_camera_lidar)
+        return data_sigmas(blocks, known, solution.T_camera_lidar, solution.inliers.pairs)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:
@@ -249,6 +249,7 @@ def scatter_covariance(
         inliers.pose_graph,
         T_camera_lidar,
         gate_hessian=inliers.gate_hessian,
+        pairs=inliers.pairs,
     )
 
 
