@@ -119,6 +119,8 @@ def _essential_matrix(
     rays_a: Array, rays_b: Array, cameras: tuple[Camera, Camera], seed: int
 ) -> Array | None:
     """(3, 3) E of ``ray_b . E ray_a = 0``; None if there is none."""
+    if len(rays_a) <= _SAMPLE:
+        return None
     turns = [_turn_to_axis(rays) for rays in (rays_a, rays_b)]
     turned = [rays @ turn.T for rays, turn in zip((rays_a, rays_b), turns, strict=True)]
     narrow = np.all([rays[:, 2] > math.cos(_MAX_ANGLE_RAD) for rays in turned], axis=0)
