@@ -1,0 +1,121 @@
+"""Whether two cameras' relative pose from their images agrees with that of the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import (
+    pose_difference,
+    pose_rows,
+    relative_covariance,
+    relative_transform,
+    to_T_lidar_camera,
+    twist_between,
+)
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms
+from calibgraph.solver.factor_graph import optimize, pose_key
+from factors import EpipolarBlock, pose_sigmas
+
+Array = NDArray[np.float64]
+
+PAIR_SIGMA_RAD, PAIR_SIGMA_M = np.radians(0.02), 0.004
+"""Standard deviation per axis of a relative pose from the images of one scene: the scatter between
+the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which all frames share."""
+
+_FITS = 6  # with the residuals' spread measured anew
+_HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # the first camera, if its covariance is unknown
+
+
+@dataclass(frozen=True)
+class PairAgreement:
+    """The relative pose of two cameras from images against that of a calibration.
+
+    Attributes:
+        a: the one camera.
+        b: the other.
+        degrees: between the two T_b_a.
+        centimetres: between their camera centres.
+        sigmas: the largest difference along an axis of b, in standard deviations; NaN where the
+            calibration has no covariance.
+        residual_px: robust spread of the residuals at the calibration.
+        least_px: the same where the images place the cameras.
+        matches: features on surfaces that were used.
+    """
+
+    a: str
+    b: str
+    degrees: float
+    centimetres: float
+    sigmas: float
+    residual_px: float
+    least_px: float
+    matches: int
+
+
+def pair_agreements(
+    rig: Rig, matches: CameraMatches, covariance: Array | None, config: Config
+) -> tuple[PairAgreement, ...]:
+    """Per pair of cameras with enough features on surfaces, in the table's order.
+
+    Args:
+        rig: at the calibration, which has not used the matches.
+        matches: with the surfaces at the calibration.
+        covariance: (6 N, 6 N) of the calibration, in the rig's order; None if unknown.
+        config: the loss.
+    """
+    found = []
+    for a, b in matches.pairs():
+        terms = [
+            term
+            for term in pair_terms(rig, matches.of_pair(a, b), config)
+            if not isinstance(term.block, EpipolarBlock)
+        ]
+        if terms:
+            found.append(_agreement(rig, (a, b), terms, covariance))
+    return tuple(found)
+
+
+def _agreement(
+    rig: Rig, names: tuple[str, str], terms: list[PairTerm], covariance: Array | None
+) -> PairAgreement:
+    """Fit the pair with A near its place and B free, and compare."""
+    a, b = names
+    joint, before = covariance, rig.T_camera_lidar
+    first, second = (tuple(rig.cameras).index(name) for name in names)
+    held = None if joint is None else joint[pose_rows(first), pose_rows(first)]
+    after = _fit(terms, names, before, held)
+    poses = [relative_transform(T[b], T[a]) for T in (after, before)]
+    degrees, centimetres = pose_difference(*poses)
+    sigmas = float("nan")
+    if joint is not None:
+        own = relative_covariance(joint, first, second, poses[1])
+        floor = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
+        sigmas = float(np.max(np.abs(twist_between(*poses)) / np.sqrt(np.diag(own) + floor**2)))
+    residual, least = (max(term.sigma_px(T) for term in terms) for T in (before, after))
+    count = sum(len(term.frame) for term in terms)
+    return PairAgreement(a, b, degrees, centimetres, sigmas, residual, least, count)
+
+
+def _fit(
+    terms: list[PairTerm], names: tuple[str, str], start: Mapping[str, Array], held: Array | None
+) -> dict[str, Array]:
+    """T_camera_lidar of both cameras by the terms alone; A held by its (6, 6) covariance."""
+    keys = {name: pose_key(names, name) for name in names}
+    mean = to_T_lidar_camera(start[names[0]])
+    sigmas = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M)
+    # xi of T_camera_lidar = exp(xi) estimate is that of T_lidar_camera = estimate exp(-xi).
+    noise = gtsam.noiseModel.Gaussian.Covariance(np.diag(sigmas**2) if held is None else held)
+    T = {name: start[name] for name in names}
+    for _ in range(_FITS):
+        graph = pair_graph([term.with_sigma(term.sigma_px(T)) for term in terms], keys)
+        graph.add(gtsam.PriorFactorPose3(keys[names[0]], mean, noise))
+        T = optimize(graph, names, T).T_camera_lidar
+    return T
