@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,12 +14,11 @@ from calibgraph.model.geometry import (
     pose_rows,
     relative_covariance,
     relative_transform,
-    to_T_lidar_camera,
     twist_between,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms
-from calibgraph.solver.factor_graph import optimize, pose_key
+from calibgraph.solver.camera_pairs import PairTerm, pair_terms
+from calibgraph.solver.pair_refinement import fit_pair
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
@@ -30,7 +27,6 @@ PAIR_SIGMA_RAD, PAIR_SIGMA_M = np.radians(0.02), 0.004
 """Standard deviation per axis of a relative pose from the images of one scene: the scatter between
 the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which all frames share."""
 
-_FITS = 6  # with the residuals' spread measured anew
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # the first camera, if its covariance is unknown
 
 
@@ -90,8 +86,9 @@ def _agreement(
     a, b = names
     joint, before = covariance, rig.T_camera_lidar
     first, second = (tuple(rig.cameras).index(name) for name in names)
-    held = None if joint is None else joint[pose_rows(first), pose_rows(first)]
-    after = _fit(terms, names, before, held)
+    sigmas_a = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M)
+    held = np.diag(sigmas_a**2) if joint is None else joint[pose_rows(first), pose_rows(first)]
+    after = fit_pair(names, terms, before, held)
     poses = [relative_transform(T[b], T[a]) for T in (after, before)]
     degrees, centimetres = pose_difference(*poses)
     sigmas = float("nan")
@@ -102,20 +99,3 @@ def _agreement(
     residual, least = (max(term.sigma_px(T) for term in terms) for T in (before, after))
     count = sum(len(term.frame) for term in terms)
     return PairAgreement(a, b, degrees, centimetres, sigmas, residual, least, count)
-
-
-def _fit(
-    terms: list[PairTerm], names: tuple[str, str], start: Mapping[str, Array], held: Array | None
-) -> dict[str, Array]:
-    """T_camera_lidar of both cameras by the terms alone; A held by its (6, 6) covariance."""
-    keys = {name: pose_key(names, name) for name in names}
-    mean = to_T_lidar_camera(start[names[0]])
-    sigmas = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M)
-    # xi of T_camera_lidar = exp(xi) estimate is that of T_lidar_camera = estimate exp(-xi).
-    noise = gtsam.noiseModel.Gaussian.Covariance(np.diag(sigmas**2) if held is None else held)
-    T = {name: start[name] for name in names}
-    for _ in range(_FITS):
-        graph = pair_graph([term.with_sigma(term.sigma_px(T)) for term in terms], keys)
-        graph.add(gtsam.PriorFactorPose3(keys[names[0]], mean, noise))
-        T = optimize(graph, names, T).T_camera_lidar
-    return T
