@@ -4,8 +4,8 @@
 
 The first camera of every pair that overlaps is displaced from the reference, and held there by the
 size of its displacement alone; the other starts as far off. `point`: features have a fixed place
-in their camera's frame, and the first camera is held exactly. `surface`: ranges follow from its pose,
-and surfaces are taken again from every estimate.
+in their camera's frame, and the first camera is held exactly. `surface`: ranges follow from its
+pose, and surfaces are taken again from every estimate.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ Kind = Literal["surface", "point"]
 MIN_PAIR_MATCHES = 12
 """Of fewer matches the residuals' spread, and with it their weight, is not known."""
 
-_ENOUGH_SURFACES = 50
+ENOUGH_SURFACES = 50
 """Features on surfaces from which on a pair has no epipolar term: a spread of 0.3 px then leaves
 an error below that of lenses, 0.05 px on KITTI; and that error, which is shared by all features,
 epipolar residuals turn into 0.1 to 0.2 deg about the axis across the baseline, with a spread of
@@ -149,7 +149,7 @@ def pair_terms(
             for side, names in enumerate(((a, b), (b, a)))
         ]
         terms += sides
-        if sum(len(term.frame) for term in sides) < _ENOUGH_SURFACES:
+        if sum(len(term.frame) for term in sides) < ENOUGH_SURFACES:
             terms.append(_epipolar_term(rig, (a, b), rows, config))
     return tuple(term for term in terms if len(term.frame) >= MIN_PAIR_MATCHES)
 

@@ -19,13 +19,10 @@ from calibgraph.model.geometry import (
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_pairs import PairTerm, pair_terms
 from calibgraph.solver.pair_refinement import fit_pair
+from calibgraph.trust.shared_error import PAIR_SIGMA_M, PAIR_SIGMA_RAD
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
-
-PAIR_SIGMA_RAD, PAIR_SIGMA_M = np.radians(0.02), 0.004
-"""Standard deviation per axis of a relative pose from the images of one scene: the scatter between
-the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which all frames share."""
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # the first camera, if its covariance is unknown
 
