@@ -14,11 +14,13 @@ from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
 from calibgraph.solver.objective import Objective, Scales
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
-_RESCALINGS = 4  # sigmas then change by under 1 % on KITTI
-_PAIR_RESCALINGS = 6  # from farther off
+_NARROWINGS = 4  # steps from the spread at the estimate to the least one
+_PAIR_RESCALINGS = 6
+_HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
 
 
 def refine_with_pairs(
@@ -29,7 +31,7 @@ def refine_with_pairs(
     *,
     kind: Kind = "surface",
 ) -> tuple[Objective, Optimum]:
-    """Minimize again with the terms of camera pairs: fit, measure their sigmas, gate, fit.
+    """Minimize again with the terms of camera pairs, their sigmas narrowed step by step; gate; fit.
 
     Args:
         inliers: the objective after the gate of the correspondences.
@@ -46,14 +48,31 @@ def refine_with_pairs(
     terms = pair_terms(rig, matches, inliers.config, kind=kind)
     if not terms or not inliers.uses_correspondences:
         return inliers, optimum
-    T = optimum.T_camera_lidar
-    for _ in range(_RESCALINGS):
-        sigmas = [term.sigma_px(T) for term in terms]
-        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas, strict=True))
+    T, least = optimum.T_camera_lidar, _least_sigmas(terms, optimum.T_camera_lidar)
+    for step in range(_NARROWINGS):
+        now = np.array([term.sigma_px(T) for term in terms])
+        sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / _NARROWINGS)
+        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
         T = replace(inliers, pairs=scaled).minimize(T, scales).T_camera_lidar
-    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas, strict=True))
+    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
     joined = replace(inliers, pairs=kept)
     return joined, joined.minimize(T, scales)
+
+
+def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Array:
+    """(n,) spread of each term's residuals where its pair's terms alone place the cameras.
+
+    At an estimate that is wrong, residuals are large, and so would be the spread by which they are
+    weighed: the pair could not correct it.
+    """
+    covariance = np.diag(pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2)
+    found: dict[frozenset[str], dict[str, Array]] = {}
+    for term in terms:
+        pair = frozenset((term.a, term.b))
+        if pair not in found:
+            own = [other for other in terms if {other.a, other.b} == pair]
+            found[pair] = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
+    return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
 
 
 def fit_pair(
