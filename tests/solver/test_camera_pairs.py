@@ -12,7 +12,13 @@ import calibgraph
 from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import pose_difference, relative_transform, to_T_lidar_camera
+from calibgraph.model.geometry import (
+    pose_difference,
+    relative_covariance,
+    relative_transform,
+    to_T_lidar_camera,
+    twist_between,
+)
 from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
 from calibgraph.solver.factor_graph import optimize, pose_key
@@ -220,6 +226,29 @@ def test_frame_gradients_add_up_and_frames_are_clusters(rig: Rig) -> None:
     ]  # fmt: skip
     a, b = list(rig.cameras)[:2]
     T_b_a = relative_transform(T[b], T[a])
-    relative = [calibgraph.model.geometry.relative_covariance(c, 0, 1, T_b_a) for c in covariances]
+    relative = [relative_covariance(c, 0, 1, T_b_a) for c in covariances]
     sigmas = [np.sqrt(np.diag(c)) for c in relative]
     assert (sigmas[1] < sigmas[0]).all()
+
+
+def test_a_calibration_takes_them_and_its_pair_is_better_known(rig: Rig) -> None:
+    errors = MatcherErrors(field_px=1.0, outlier_share=0.1)
+    table = simulate_correspondences(rig, frames=FRAMES, errors=errors, seed=0)
+    shared = {"systematic_rotation_rad": 0.002, "systematic_translation_m": 0.02}
+    table = replace(table, metadata={**table.metadata, **shared})
+    results = [
+        calibgraph.solve(rig, table, camera_matches=matches)
+        for matches in (None, simulated_pairs(rig))
+    ]
+    a, b = list(rig.cameras)[:2]
+    sigmas = []
+    for result in results:
+        T_b_a = relative_transform(result.T_camera_lidar[b], result.T_camera_lidar[a])
+        covariance = relative_covariance(result.joint_covariance, 0, 1, T_b_a)
+        sigmas.append(np.sqrt(np.diag(covariance)))
+    assert "camera_pairs" in results[1].timings_s and "camera_pairs" not in results[0].timings_s
+    assert (sigmas[1] < 0.5 * sigmas[0]).all()
+    twist = twist_between(
+        *(relative_transform(T[b], T[a]) for T in (results[1].T_camera_lidar, rig.T_camera_lidar))
+    )
+    assert (np.abs(twist) < 4 * sigmas[1]).all()
