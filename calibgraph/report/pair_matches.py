@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 RESIDUAL_LIMIT_PX = 3.0
 """Residual from which lines are red."""
 
-_MAX_LINES = 120  # more hide the images
+_MAX_LINES = 60  # more hide the images
 _MAX_SIDE_PX = 1600
 _WIDE = 1.8  # aspect ratio from which images stand above each other
 _UNKNOWN = (160, 160, 160)
