@@ -20,10 +20,10 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from factors.block import BlockSums
+from factors.compiled import compiled
 from factors.lens import Lens, is_projectable, project_one
 from factors.loss import loss_and_weight, loss_id
 
@@ -169,12 +169,12 @@ def _pose(pose: gtsam.Pose3) -> tuple[Array, Array]:
     return np.ascontiguousarray(pose.rotation().matrix()), np.asarray(pose.translation())
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _predict(R_a, c_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-def]
     """Fill in y and g = R_a^T q; return w and k."""
     for i in range(3):
@@ -188,7 +188,7 @@ def _predict(R_a, c_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-d
     return w, k
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian):  # type: ignore[no-untyped-def]
     """(2, 12) derivatives of the pixel by both poses."""
     turn0 = (ray[1] * g[2] - ray[2] * g[1]) / k
@@ -213,7 +213,7 @@ def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian):  # type: ig
         j[9], j[10], j[11] = -w * d0, -w * d1, -w * d2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
     kind, lens, R_a, c_a, R_b, c_b, rays, planes, pixels, loss, scale, edges
 ):
@@ -240,7 +240,7 @@ def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
     kind, lens, R_a, c_a, R_b, c_b, rays, planes, pixels
 ):

@@ -76,9 +76,12 @@ class Objective:
                 only pairs of them get terms of their own.
         """
         blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
-        graph = objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms)
+        keys = {name: pose_key(self.cameras, name) for name in self.cameras}
         pairs = [pair for pair in self.pairs if {pair.a, pair.b} <= scales.keys()]
-        return join(graph, pair_graph(pairs, {n: pose_key(self.cameras, n) for n in self.cameras}))
+        return join(
+            objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms),
+            pair_graph(pairs, keys),
+        )
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -87,9 +90,9 @@ class Objective:
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences, and the pairs of their frames."""
-        frames = np.unique(
-            np.concatenate([np.empty(0, np.int64), *(b.frame for b in blocks.values())])
-        )
+        if not self.pairs:
+            return replace(self, blocks=dict(blocks))
+        frames = np.concatenate([np.unique(block.frame) for block in blocks.values()])
         pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
         return replace(self, blocks=dict(blocks), pairs=pairs)
 
