@@ -17,6 +17,7 @@ from pathlib import Path
 from calibgraph.files import sha256
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -83,6 +84,8 @@ def solve(
     table: Correspondences | Path | str,
     config: Config | None = None,
     terms: Terms = "full",
+    *,
+    camera_matches: CameraMatches | None = None,
 ) -> Calibration:
     """Calibrate all cameras of a rig jointly from correspondences.
 
@@ -94,6 +97,7 @@ def solve(
         terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
             ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are
             measurements and take part in all but ``stage1``.
+        camera_matches: what cameras see in common, with the LiDAR's surfaces.
 
     Returns:
         The calibration, with its verdict and the preprocessed correspondences.
@@ -104,7 +108,7 @@ def solve(
             and no relative pose that ties it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
-    solution = solve_joint(rig, table, config, terms)
+    solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     evidence, watch = Evidence(solution, guess=solution.rig), Stopwatch()
     with watch("checks"):
         checks = assess(evidence)

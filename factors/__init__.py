@@ -11,8 +11,18 @@ from factors.conditioning import (
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
+from factors.epipolar import EpipolarBlock, epipolar_residual
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
+from factors.pair import (
+    PairBlock,
+    epipolar_factor,
+    pair_block_factor,
+    pair_chain,
+    pair_projection_factor,
+    pair_sums,
+    surface_factor,
+)
 from factors.pose import (
     camera_prior_factor,
     pose_sigmas,
@@ -20,25 +30,40 @@ from factors.pose import (
     relative_prior_factor,
 )
 from factors.projection import projection_factor, projection_residual
+from factors.rays import ray_spreads, unproject
+from factors.surface import SurfaceBlock, surface_residual
 
 __all__ = [
     "LOSSES",
     "BlockSums",
+    "EpipolarBlock",
     "Lens",
     "LensModel",
     "LossName",
+    "PairBlock",
     "ProjectionBlock",
+    "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
+    "epipolar_factor",
+    "epipolar_residual",
+    "pair_block_factor",
+    "pair_chain",
+    "pair_projection_factor",
+    "pair_sums",
     "pose_sigmas",
     "projection_factor",
     "projection_residual",
+    "ray_spreads",
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",
     "smallest_scaled_eigenvalue",
     "smallest_scaled_eigenvalues",
     "square_root",
+    "surface_factor",
+    "surface_residual",
     "to_runs",
     "unit_diagonal",
+    "unproject",
 ]

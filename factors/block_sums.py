@@ -28,7 +28,7 @@ class BlockSums:
 
 
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
-    """(7,) error and (7, 6) Jacobian with the given H, b and c; H may be rank deficient.
+    """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
     H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
     lose no digits to each other; directions without information get a zero row.

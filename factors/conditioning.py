@@ -46,24 +46,25 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
 
 @compiled(nogil=True, error_model="numpy")
 def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
-    """(7,) error and the transposed (6, 7) Jacobian, see ``block.square_root``."""
-    units, scaled = np.ones(6), np.empty((6, 6))
-    for i in range(6):
+    """(n + 1,) error and the transposed (n, n + 1) Jacobian, see ``block_sums.square_root``."""
+    n = len(gradient)
+    units, scaled = np.ones(n), np.empty((n, n))
+    for i in range(n):
         if hessian[i, i] > 0.0:
             units[i] = np.sqrt(hessian[i, i])
-    for i in range(6):
-        for j in range(6):
+    for i in range(n):
+        for j in range(n):
             scaled[i, j] = hessian[i, j] / (units[i] * units[j])
     values, vectors = np.linalg.eigh(scaled)
-    jacobian, error = np.zeros((6, 7)), np.zeros(7)
+    jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
     rest = cost
-    for k in range(6):
-        if values[k] > 1e-14 * max(values[5], 0.0):
+    for k in range(n):
+        if values[k] > 1e-14 * max(values[n - 1], 0.0):
             root, along = np.sqrt(values[k]), 0.0
-            for i in range(6):
+            for i in range(n):
                 jacobian[i, k] = root * vectors[i, k] * units[i]
                 along += vectors[i, k] * gradient[i] / units[i]
             error[k] = along / root
             rest -= error[k] * error[k]
-    error[6] = np.sqrt(max(rest, 0.0))
+    error[n] = np.sqrt(max(rest, 0.0))
     return error, jacobian

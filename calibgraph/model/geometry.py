@@ -52,6 +52,26 @@ def point_in_lidar(T_camera_lidar: Array, point_camera_m: Array) -> Array:
     return point_lidar_m
 
 
+def planes_in_lidar(planes_camera_per_m: Array, T_camera_lidar: Array) -> Array:
+    """(n, 3) planes q . p = 1 of the LiDAR frame, from g . X = 1 of the camera frame [1/m]."""
+    R, t = T_camera_lidar[:3, :3], T_camera_lidar[:3, 3]
+    planes: Array = (planes_camera_per_m @ R) / (1.0 - planes_camera_per_m @ t)[:, None]
+    return planes
+
+
+def inverse_ranges(rays: Array, planes_lidar_per_m: Array, T_camera_lidar: Array) -> Array:
+    """(n,) inverse ranges [1/m] at which rays of the camera frame meet planes of the LiDAR's.
+
+    Args:
+        rays: (n, 3) unit vectors in the camera frame.
+        planes_lidar_per_m: (n, 3) q, with q . p = 1 for points p of the plane.
+        T_camera_lidar: (4, 4).
+    """
+    across = np.einsum("ni,ni->n", planes_lidar_per_m, rays @ T_camera_lidar[:3, :3])
+    inverse: Array = across / (1.0 - planes_lidar_per_m @ camera_center(T_camera_lidar))
+    return inverse
+
+
 def angle_deg(R: Array) -> float:
     """Angle of a (3, 3) rotation, degrees; accurate for small angles too."""
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])

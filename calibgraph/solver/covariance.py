@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.parallel import core_pool
+from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.factor_graph import to_values
 from factors import ProjectionBlock, unit_diagonal
 
@@ -35,6 +36,7 @@ def cluster_robust_covariance(
     *,
     gate_hessian: Mapping[str, Array] | None = None,
     robust_hessians: Mapping[str, Array] | None = None,
+    pairs: Sequence[PairTerm] = (),
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few) H^-1``.
 
@@ -50,6 +52,7 @@ def cluster_robust_covariance(
         T_camera_lidar: the solution, all cameras.
         gate_hessian: per camera, see ``BlockResiduals.gate_hessian``.
         robust_hessians: per camera, :func:`robust_hessian` there, where it is known already.
+        pairs: what cameras see in common, the inliers of the solution.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
@@ -57,7 +60,7 @@ def cluster_robust_covariance(
         MIN_FRAMES_FOR_ERROR_BAR frames, or where H is singular.
     """
     cameras = list(T_camera_lidar)
-    gradients = _frame_gradients(blocks, frames, T_camera_lidar)
+    gradients = _frame_gradients(blocks, frames, T_camera_lidar, pairs)
     if len(gradients) < MIN_FRAMES_FOR_ERROR_BAR:
         return None
     hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
@@ -65,6 +68,7 @@ def cluster_robust_covariance(
     for name, of_camera in robust.items():
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += of_camera + (gate_hessian or {}).get(name, 0.0)
+    _add_pair_hessians(hessian, pairs, T_camera_lidar)
     values, vectors = np.linalg.eigh(hessian)
     if values[0] <= _FREE * values[-1]:
         return None
@@ -84,14 +88,31 @@ def hessians_of_blocks(
         return dict(zip(blocks, pool.map(robust_hessian, blocks.values(), poses), strict=True))
 
 
+def _add_pair_hessians(
+    hessian: Array, pairs: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
+) -> None:
+    """Add the part of camera pairs to the joint Hessian, (6 N, 6 N)."""
+    for pair in pairs:
+        rows = _rows_of_pair(list(T_camera_lidar), pair)
+        hessian[np.ix_(rows, rows)] += pair.sums(T_camera_lidar).hessian
+
+
+def _rows_of_pair(cameras: Sequence[str], pair: PairTerm) -> NDArray[np.intp]:
+    """(12,) rows of A's pose, then of B's."""
+    first = [6 * cameras.index(name) for name in (pair.a, pair.b)]
+    return np.add.outer(first, np.arange(6)).ravel()
+
+
 def _frame_gradients(
     blocks: Mapping[str, ProjectionBlock],
     frames: Mapping[str, NDArray[np.int64]],
     T_camera_lidar: Mapping[str, Array],
+    pairs: Sequence[PairTerm] = (),
 ) -> Array:
-    """(f, 6 N) gradient of each frame's correspondences, over all cameras."""
+    """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
     cameras = list(T_camera_lidar)
-    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values()]))
+    of_pairs = [pair.frame for pair in pairs]
+    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
     for name, block in blocks.items():
         own, starts = np.unique(frames[name], return_index=True)
@@ -99,6 +120,10 @@ def _frame_gradients(
         sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
         rows = np.searchsorted(numbers, own)
         gradients[rows, pose_rows(cameras.index(name))] = sums.gradient
+    for pair in pairs:
+        rows = np.searchsorted(numbers, np.unique(pair.frame))
+        columns = _rows_of_pair(cameras, pair)
+        gradients[np.ix_(rows, columns)] += pair.frame_gradients(T_camera_lidar)
     return gradients
 
 
@@ -126,6 +151,7 @@ def data_sigmas(
     blocks: Mapping[str, ProjectionBlock],
     pose_graph: gtsam.NonlinearFactorGraph,
     T_camera_lidar: Mapping[str, Array],
+    pairs: Sequence[PairTerm] = (),
 ) -> Array:
     """Standard deviations if every correspondence were independent.
 
@@ -135,6 +161,7 @@ def data_sigmas(
         blocks: per camera with correspondences.
         pose_graph: measured relative poses; no priors.
         T_camera_lidar: the solution, all cameras.
+        pairs: what cameras see in common.
 
     Returns:
         (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
@@ -146,6 +173,7 @@ def data_sigmas(
         rows = pose_rows(cameras.index(name))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
         hessian[rows, rows] += sums.hessian
+    _add_pair_hessians(hessian, pairs, T_camera_lidar)
     scaled, units = unit_diagonal(hessian)
     values, vectors = np.linalg.eigh(scaled)
     free = values < _FREE

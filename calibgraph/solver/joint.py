@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -14,6 +15,7 @@ from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import Objective
+from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
@@ -28,6 +30,7 @@ def solve_joint(
     terms: Terms = "full",
     *,
     pairwise: Stage1 | None = None,
+    camera_matches: CameraMatches | None = None,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -40,6 +43,7 @@ def solve_joint(
         config: settings; the preset ``auto`` if None.
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
+        camera_matches: what cameras see in common, with surfaces; from the correspondences' frames.
 
     Raises:
         FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
@@ -67,6 +71,10 @@ def solve_joint(
     with watch("pass2"):
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
+
+    if camera_matches is not None:                                         # ours: camera pairs
+        with watch("camera_pairs"):
+            inliers, optimum = refine_with_pairs(inliers, optimum, scales, camera_matches)
 
     counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
     return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)

@@ -15,11 +15,14 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm, pair_graph
 from calibgraph.solver.factor_graph import (
     RELATIVE_TOLERANCE,
     Optimum,
+    join,
     objective_graph,
     optimize,
+    pose_key,
 )
 from calibgraph.solver.residual_scale import ResidualScale
 
@@ -47,6 +50,7 @@ class Objective:
         gated: after the gate, per camera the residuals of all correspondences and the scale that
             it was drawn at; before it, empty.
         relative_tolerance: of Levenberg-Marquardt.
+        pairs: what cameras see in common, each term with its sigma.
     """
 
     rig: Rig
@@ -56,6 +60,7 @@ class Objective:
     terms: Terms
     gated: Mapping[str, tuple[BlockResiduals, ResidualScale]] = field(default_factory=dict)
     relative_tolerance: float = RELATIVE_TOLERANCE
+    pairs: tuple[PairTerm, ...] = ()
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -71,10 +76,16 @@ class Objective:
         """Eq. 5 as a GTSAM graph that can be printed.
 
         Args:
-            scales: of the residuals; only cameras that have one get a reprojection term.
+            scales: of the residuals; only cameras that have one get a reprojection term, and
+                only pairs of them get terms of their own.
         """
         blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
-        return objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms)
+        keys = {name: pose_key(self.cameras, name) for name in self.cameras}
+        pairs = [pair for pair in self.pairs if {pair.a, pair.b} <= scales.keys()]
+        return join(
+            objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms),
+            pair_graph(pairs, keys),
+        )
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -99,13 +110,18 @@ class Objective:
         return replace(self, relative_tolerance=relative_tolerance)
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
-        """The same objective with other (fewer) correspondences."""
-        return replace(self, blocks=dict(blocks))
+        """The same objective with other (fewer) correspondences, and the pairs of their frames."""
+        if not self.pairs:
+            return replace(self, blocks=dict(blocks))
+        frames = np.concatenate([np.unique(block.frame) for block in blocks.values()])
+        pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
+        return replace(self, blocks=dict(blocks), pairs=pairs)
 
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
-        return replace(self, rig=rig, T_hat={})
+        pairs = tuple(pair for pair in self.pairs if {pair.a, pair.b} <= self.blocks.keys())
+        return replace(self, rig=rig, T_hat={}, pairs=pairs)
 
     def minimize(self, start: Transforms, scales: Scales) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""

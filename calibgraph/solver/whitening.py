@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 IDENTITY = np.array([1.0, 0.0, 1.0])
 """The entries (0,0), (0,1), (1,1) of the 2x2 identity."""
 
-_MEDIAN_NORM = np.array([0.67449, 1.17741])  # of a standard Gaussian error in 1 and 2 dimensions
+MEDIAN_NORM = np.array([0.67449, 1.17741])  # of a standard Gaussian error in 1 and 2 dimensions
 
 
 def sqrt_information(table: Correspondences, config: Config) -> Array | None:
@@ -76,10 +76,10 @@ def largest_eigenvalue(information: Array) -> Array:
 def median_norm(information: Array | None) -> Array:
     """() or (n,) medians of a standard Gaussian error, of as many axes as are constrained."""
     if information is None:
-        return np.asarray(_MEDIAN_NORM[1])
+        return np.asarray(MEDIAN_NORM[1])
     uu, uv, vv = information.T
     rank_one = uu * vv - uv**2 <= 1e-3 * (uu + vv) ** 2
-    return np.asarray(_MEDIAN_NORM[np.where(rank_one, 0, 1)])
+    return np.asarray(MEDIAN_NORM[np.where(rank_one, 0, 1)])
 
 
 def whitened_norm(root: Array | None, residuals: Array) -> Array:

@@ -29,8 +29,8 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
 from calibgraph.trust.observability import prior_shares
+from calibgraph.trust.shared_error import shared_covariance
 from calibgraph.trust.thresholds import limit
-from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -110,7 +110,9 @@ class Evidence:
         """(6 N, 6 N) by the scatter, plus the error that all the matcher's frames share."""
         if self.scatter is None:
             return None
-        return self.scatter + shared_covariance(self.findings, len(self.cameras))
+        solution = self.solution
+        pairs = solution.inliers.pairs
+        return self.scatter + shared_covariance(self.findings, solution.T_camera_lidar, pairs)
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
@@ -142,7 +144,7 @@ class Evidence:
             return None
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
         known = relative_pose_graph(solution.inliers.cameras, solution.rig.relative_poses)
-        return data_sigmas(blocks, known, solution.T_camera_lidar)
+        return data_sigmas(blocks, known, solution.T_camera_lidar, solution.inliers.pairs)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:
@@ -180,7 +182,7 @@ class Evidence:
         scatter = scatter_covariance(
             free, T_camera_lidar, solution.scales, gate_hessian=solution.inliers.gate_hessian
         )
-        shared = shared_covariance(self.findings, len(free.cameras))
+        shared = shared_covariance(self.findings, T_camera_lidar, free.pairs)
         return DataOnly(T_camera_lidar, None if scatter is None else scatter + shared)
 
     @cached_property
@@ -269,14 +271,8 @@ def scatter_covariance(
         T_camera_lidar,
         gate_hessian=inliers.gate_hessian if gate_hessian is None else gate_hessian,
         robust_hessians=robust_hessians,
+        pairs=inliers.pairs,
     )
-
-
-def shared_covariance(findings: MatcherFindings, cameras: int) -> Array:
-    """(6 N, 6 N) covariance of the error that all frames of a matcher share."""
-    rotation_rad, translation_m = findings.systematic_sigmas
-    sigmas = pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m)
-    return np.diag(np.tile(sigmas**2, cameras))
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:

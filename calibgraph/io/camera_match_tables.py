@@ -1,0 +1,88 @@
+"""Tables of camera-camera matches from disk: Parquet, or CSV with the same columns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import require_file
+from calibgraph.io.correspondence_tables import arrow_reads
+from calibgraph.model.camera_matches import (
+    COLUMNS,
+    FORMAT,
+    NAMES,
+    NUMBERS,
+    PLANES,
+    CameraMatches,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Array = NDArray[np.float64]
+
+
+def load_camera_matches(path: Path | str) -> CameraMatches:
+    """Read a table from Parquet, or from CSV with the same columns.
+
+    Raises:
+        FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
+    """
+    path = require_file(Path(path))
+    table = _read(path)
+    if (missing := [name for name in COLUMNS if name not in table.column_names]) or len(
+        table.column_names
+    ) > len(COLUMNS):
+        what = f"column {missing[0]!r} is missing" if missing else "there are unknown columns"
+        raise FileError(path, f"{what}; found {table.column_names}, expected {list(COLUMNS)}")
+    form = (table.schema.metadata or {}).get(b"format", FORMAT.encode())
+    if form.decode("utf-8", "replace") != FORMAT:
+        raise FileError(path, f"has the format {form!r}, expected {FORMAT!r}")
+    try:
+        return _from_arrow(table)
+    except (CorrespondenceError, ValueError, TypeError, KeyError) as error:
+        raise FileError(path, f"holds a wrong value: {error}") from error
+
+
+def _read(path: Path) -> pa.Table:
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    with arrow_reads(path):
+        if path.suffix == ".csv":
+            types = dict.fromkeys(NAMES, pa.string()) | {"frame": pa.int64()}
+            types |= dict.fromkeys((*NUMBERS, *PLANES), pa.float64())
+            return csv.read_csv(path, convert_options=csv.ConvertOptions(column_types=types))
+        with parquet.ParquetFile(path) as file:
+            return file.read()
+
+
+def _from_arrow(table: pa.Table) -> CameraMatches:
+    metadata = table.schema.metadata or {}
+    for name in (*NAMES, "frame", *NUMBERS):
+        if table[name].null_count:
+            row = table[name].is_null().to_pylist().index(True)
+            raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+    names = [table[name].to_pylist() for name in NAMES]
+    given = json.loads(metadata.get(b"cameras", b"null"))
+    in_order = [name for row in zip(*names, strict=True) for name in row]
+    cameras = tuple(given or dict.fromkeys(in_order))
+    number = {name: index for index, name in enumerate(cameras)}
+    index = np.array([[number[name] for name in side] for side in names], np.int32).T
+
+    def stack(columns: tuple[str, ...]) -> Array:
+        return np.stack([np.asarray(table[name].to_numpy(), np.float64) for name in columns], 1)
+
+    return CameraMatches(
+        cameras=cameras,
+        camera_index=index.reshape(-1, 2),
+        frame=np.asarray(table["frame"].to_numpy(), np.int64),
+        pixels_px=stack(NUMBERS).reshape(-1, 2, 2),
+        planes_lidar_per_m=stack(PLANES).reshape(-1, 2, 3),
+        metadata=json.loads(metadata.get(b"matcher", b"{}")),
+    )

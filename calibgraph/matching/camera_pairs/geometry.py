@@ -1,0 +1,156 @@
+"""Robust epipolar geometry on rays, and whether it could have come about by chance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from calibgraph.model.rig import Camera
+from factors import ray_spreads
+
+Array = NDArray[np.float64]
+
+MAX_LOG10_FALSE_ALARMS = -3.0
+"""One pair of cameras in a thousand that see nothing in common may be taken for overlapping."""
+
+_THRESHOLD_PX = 1.0  # of MAGSAC, a scale that it need not know exactly
+_ITERATIONS = 5000
+_SAMPLE, _MODELS = 5, 10  # matches that determine an essential matrix, and at most how many of them
+_MAX_ANGLE_RAD = math.radians(60.0)  # off the mean ray: a plane magnifies the errors of wider rays
+_FOCAL_PX = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarFit:
+    """The matches that agree on an epipolar geometry.
+
+    Attributes:
+        inlier: (n,) which do.
+        log10_false_alarms: expected number of as good agreements among matches made at random; see
+            :func:`log10_false_alarms`.
+    """
+
+    inlier: NDArray[np.bool_]
+    log10_false_alarms: float
+
+
+def agree_on_epipolar_geometry(
+    a: Camera, b: Camera, rays_a: Array, rays_b: Array, *, seed: int
+) -> EpipolarFit:
+    """Find the matches of two cameras that agree on an essential matrix.
+
+    OpenCV estimates it on planes across the mean rays, and all matches are tested on their rays.
+    The cameras' extrinsics are not used. Up to which residual matches are taken follows from the
+    number of false alarms, which is least there (Moisan and Stival, 2004).
+
+    Args:
+        a: lens and image size of the one camera.
+        b: of the other.
+        rays_a: (n, 3) unit rays of the matches in the one.
+        rays_b: (n, 3) of the same in the other.
+        seed: of the choice of samples.
+
+    Returns:
+        No inliers where as many matches agree by chance.
+    """
+    none = EpipolarFit(np.zeros(len(rays_a), np.bool_), 0.0)
+    essential = _essential_matrix(rays_a, rays_b, (a, b), seed)
+    if essential is None:
+        return none
+    residuals = np.abs(sampson_px(essential, (a, b), (rays_a, rays_b)))
+    false_alarms, limit_px = log10_false_alarms(residuals, (a, b))
+    if false_alarms > MAX_LOG10_FALSE_ALARMS:
+        return none
+    return EpipolarFit(np.asarray(residuals <= limit_px), false_alarms)
+
+
+def sampson_px(
+    essential: Array, cameras: tuple[Camera, Camera], rays: tuple[Array, Array]
+) -> Array:
+    """(n,) Sampson's residuals on rays [px] of ``ray_b . E ray_a = 0``."""
+    spread_a, spread_b = (ray_spreads(c.lens, r) for c, r in zip(cameras, rays, strict=True))
+    normal_b, normal_a = rays[0] @ essential.T, rays[1] @ essential
+    value = np.einsum("ni,ni->n", rays[1], normal_b)
+    sides = [
+        np.einsum("nij,ni->nj", spread, normal)
+        for spread, normal in ((spread_a, normal_a), (spread_b, normal_b))
+    ]
+    square = sum((side**2).sum(axis=1) for side in sides)
+    return np.asarray(value / np.sqrt(np.maximum(square, np.finfo(float).tiny)))
+
+
+def log10_false_alarms(residuals_px: Array, cameras: tuple[Camera, Camera]) -> tuple[float, float]:
+    """Expected number (log10) of agreements as good as the best, if all matches were random.
+
+    A random match is within r px of its epipolar lines with a probability of at most
+    2 sqrt(2) r D / A, of an image with diagonal D and area A.
+
+    Args:
+        residuals_px: (n,) absolute Sampson residuals.
+        cameras: their image sizes.
+
+    Returns:
+        The least number over all limits of the residual, and that limit [px].
+    """
+    n = len(residuals_px)
+    if n <= _SAMPLE:
+        return 0.0, 0.0
+    ordered = np.sort(residuals_px)[_SAMPLE:]
+    k = np.arange(_SAMPLE + 1, n + 1, dtype=np.float64)
+    band = max(2 * math.sqrt(2) * math.hypot(c.width_px, c.height_px) / (c.width_px * c.height_px)
+               for c in cameras)  # fmt: skip
+    chance = np.clip(band * ordered, 1e-12, 1.0)
+    choices = _log_binomial(np.full_like(k, n), k) + _log_binomial(k, np.full_like(k, _SAMPLE))
+    alarms = math.log(_MODELS * (n - _SAMPLE)) + choices + (k - _SAMPLE) * np.log(chance)
+    best = int(np.argmin(alarms))
+    return float(alarms[best]) / math.log(10), float(ordered[best])
+
+
+def _log_binomial(n: Array, k: Array) -> Array:
+    return np.asarray(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def _essential_matrix(
+    rays_a: Array, rays_b: Array, cameras: tuple[Camera, Camera], seed: int
+) -> Array | None:
+    """(3, 3) E of ``ray_b . E ray_a = 0``; None if there is none."""
+    if len(rays_a) <= _SAMPLE:
+        return None
+    turns = [_turn_to_axis(rays) for rays in (rays_a, rays_b)]
+    turned = [rays @ turn.T for rays, turn in zip((rays_a, rays_b), turns, strict=True)]
+    narrow = np.all([rays[:, 2] > math.cos(_MAX_ANGLE_RAD) for rays in turned], axis=0)
+    if np.count_nonzero(narrow) <= _SAMPLE:
+        return None
+    a, b = (_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned)
+    ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
+    focal = min(camera.intrinsics_px.fx for camera in cameras)
+    parameters = cv2.UsacParams()
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.threshold = _THRESHOLD_PX * _FOCAL_PX / focal
+    parameters.maxIterations = _ITERATIONS
+    parameters.confidence = 0.999
+    parameters.randomGeneratorState = seed
+    try:
+        found, _ = cv2.findEssentialMat(a, b, ideal, ideal, None, None, parameters)
+    except cv2.error:  # degenerate samples
+        return None
+    if found is None or found.shape != (3, 3):
+        return None
+    return np.asarray(turns[1].T @ found @ turns[0])
+
+
+def _turn_to_axis(rays: Array) -> Array:
+    """(3, 3) the shortest rotation that takes the mean ray to the z axis."""
+    mean = rays.mean(axis=0)
+    x, y, z = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)
+    vector = np.array([y, -x, 0.0])  # mean x axis
+    sine = float(np.linalg.norm(vector))
+    if sine < 1e-12:  # noqa: PLR2004
+        return np.diag([1.0, np.sign(z) or 1.0, np.sign(z) or 1.0])
+    return np.asarray(cv2.Rodrigues(vector / sine * math.atan2(sine, z))[0])

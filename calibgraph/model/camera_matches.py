@@ -1,0 +1,178 @@
+"""The table of camera-camera matches: features that two cameras see at one instant."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError
+from calibgraph.files import write_atomically
+from calibgraph.model.correspondences import MAX_COORDINATE
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Array = NDArray[np.float64]
+
+FORMAT = "calibgraph-camera-matches/1"
+NAMES = ("camera_a", "camera_b")
+NUMBERS = ("u_a_px", "v_a_px", "u_b_px", "v_b_px")
+PLANES = tuple(f"q{axis}_{side}_per_m" for side in "ab" for axis in "xyz")
+COLUMNS = (*NAMES, "frame", *NUMBERS, *PLANES)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CameraMatches:
+    """Features that two cameras see at one instant, as columns of equal length.
+
+    Sides: 0 is camera A, 1 is camera B. A plane q, with q . p = 1 for its points p in the LiDAR
+    frame, is fitted to the LiDAR's points that project next to the feature, under an estimate of
+    the camera's extrinsic. The feature is where its ray meets the plane.
+
+    Attributes:
+        cameras: the names that ``camera_index`` counts.
+        camera_index: (n, 2) which of ``cameras`` are A and B; A comes before B.
+        frame: (n,) frame number.
+        pixels_px: (n, 2, 2) per side, the pixel (column, row) in the image as recorded.
+        planes_lidar_per_m: (n, 2, 3) per side, q [1/m]; NaN where there is none.
+        metadata: the settings of the matcher.
+
+    Raises:
+        CorrespondenceError: on wrong shapes or values, naming the first bad row.
+    """
+
+    cameras: tuple[str, ...]
+    camera_index: NDArray[np.int32]
+    frame: NDArray[np.int64]
+    pixels_px: Array
+    planes_lidar_per_m: Array
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.frame)
+        for name, shape in _SHAPES.items():
+            found = getattr(self, name).shape
+            if found != (n, *shape):
+                raise CorrespondenceError(
+                    f"{name} has shape {found}, expected {(n, *shape)} like the column frame"
+                )
+        for name in _SHAPES:
+            view = getattr(self, name).view()
+            view.flags.writeable = False
+            object.__setattr__(self, name, view)
+        self._check_values()
+
+    @staticmethod
+    def empty(cameras: Sequence[str], metadata: dict[str, Any] | None = None) -> CameraMatches:
+        """A table without rows."""
+        return CameraMatches(
+            cameras=tuple(cameras),
+            camera_index=np.empty((0, 2), np.int32),
+            frame=np.empty(0, np.int64),
+            pixels_px=np.empty((0, 2, 2)),
+            planes_lidar_per_m=np.empty((0, 2, 3)),
+            metadata=metadata or {},
+        )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{a}-{b}: {len(self.of_pair(a, b))}" for a, b in self.pairs())
+        return f"CameraMatches({counts}; {len(np.unique(self.frame))} frames)"
+
+    def pairs(self) -> list[tuple[str, str]]:
+        """The pairs of cameras that have matches, A before B."""
+        return [(self.cameras[a], self.cameras[b]) for a, b in np.unique(self.camera_index, axis=0)]
+
+    def of_pair(self, a: str, b: str) -> CameraMatches:
+        """The rows of one pair, A and B in the order of ``cameras``; none if it has none."""
+        if a not in self.cameras or b not in self.cameras:
+            return self.select(slice(0, 0))
+        wanted = [self.cameras.index(a), self.cameras.index(b)]
+        return self.select(np.flatnonzero((self.camera_index == wanted).all(axis=1)))
+
+    def select(self, rows: NDArray[Any] | slice) -> CameraMatches:
+        """The table with only some rows: a mask, an index array or a slice."""
+        kept = copy.copy(self)  # not checked again: rows of a valid table are valid
+        for name in _SHAPES:
+            object.__setattr__(kept, name, getattr(self, name)[rows])
+        return kept
+
+    def with_planes(self, planes_lidar_per_m: Array) -> CameraMatches:
+        """The same features with other planes, (n, 2, 3)."""
+        return replace(self, planes_lidar_per_m=planes_lidar_per_m)
+
+    def save(self, path: Path | str) -> None:
+        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
+        from pyarrow import csv, parquet
+
+        path, arrow = Path(path), self.to_arrow()
+        write = csv.write_csv if path.suffix == ".csv" else parquet.write_table
+        write_atomically(path, lambda part: write(arrow, part))
+
+    def to_arrow(self) -> pa.Table:
+        """The table in the file format's columns, its metadata in the schema."""
+        import pyarrow as pa
+
+        names = np.array([*self.cameras, ""], dtype=object)
+        columns: dict[str, Any] = {
+            name: pa.array(names[self.camera_index[:, side]], pa.string())
+            for side, name in enumerate(NAMES)
+        }
+        columns["frame"] = self.frame
+        columns |= dict(zip(NUMBERS, self.pixels_px.reshape(-1, 4).T, strict=True))
+        columns |= {
+            name: pa.array(column, from_pandas=True)  # a NaN becomes an empty cell
+            for name, column in zip(PLANES, self.planes_lidar_per_m.reshape(-1, 6).T, strict=True)
+        }
+        metadata = {
+            "format": FORMAT,
+            "cameras": json.dumps(self.cameras),
+            "matcher": json.dumps(self.metadata),
+        }
+        return pa.table(columns).replace_schema_metadata(metadata)
+
+    def _check_values(self) -> None:
+        index, count = self.camera_index, len(self.cameras)
+        ordered = (index[:, 0] < index[:, 1]) & (index >= 0).all(axis=1) & (index < count).all(1)
+        self._require(ordered, "camera_index", index, f"count the {count} cameras, A before B")
+        pixels = self.pixels_px.reshape(-1, 4)
+        small = (np.abs(pixels) < MAX_COORDINATE).all(axis=1)
+        self._require(small, "pixel", pixels, f"be finite and below {MAX_COORDINATE:g}")
+        planes = self.planes_lidar_per_m
+        there = np.isfinite(planes).all(axis=2) & np.any(planes != 0, axis=2)
+        good = np.all(there | np.isnan(planes).all(axis=2), axis=1)
+        self._require(good, "planes_lidar_per_m", planes, "be finite and not zero, or NaN")
+
+    def _require(self, good: Any, what: str, found: Any, rule: str) -> None:
+        if not good.all():
+            row = int(np.flatnonzero(~good)[0])
+            raise CorrespondenceError(f"{what} must {rule}, found {found[row].tolist()}", row=row)
+
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "camera_index": (2,), "frame": (), "pixels_px": (2, 2),
+    "planes_lidar_per_m": (2, 3),
+}  # fmt: skip
+assert set(_SHAPES) == {f.name for f in fields(CameraMatches)} - {"cameras", "metadata"}
+
+
+def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches:
+    """Put tables of the same cameras under each other; the metadata is that of the first.
+
+    Raises:
+        ValueError: if there are none, or their cameras differ.
+    """
+    given = list(tables)
+    if len({table.cameras for table in given}) != 1:
+        raise ValueError("expected tables of the same cameras")
+    columns = {name: np.concatenate([getattr(t, name) for t in given]) for name in _SHAPES}
+    return CameraMatches(cameras=given[0].cameras, metadata=given[0].metadata, **columns)

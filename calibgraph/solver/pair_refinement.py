@@ -1,0 +1,104 @@
+"""What cameras see in common: the last step of the joint solve, and a fit of one pair alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms
+from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
+from calibgraph.solver.objective import Objective, Scales
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+
+_NARROWINGS = 4  # steps from the spread at the estimate to the least one
+_PAIR_RESCALINGS = 6
+_HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
+
+
+def refine_with_pairs(
+    inliers: Objective,
+    optimum: Optimum,
+    scales: Scales,
+    matches: CameraMatches,
+    *,
+    kind: Kind = "surface",
+) -> tuple[Objective, Optimum]:
+    """Minimize again with the terms of camera pairs, their sigmas narrowed step by step; gate; fit.
+
+    Args:
+        inliers: the objective after the gate of the correspondences.
+        optimum: its minimum.
+        scales: of the correspondences' residuals.
+        matches: with surfaces, taken near the optimum.
+        kind: see ``pair_terms``.
+
+    Returns:
+        The objective with the pairs' inliers, and its minimum; both unchanged where no pair of
+        cameras has enough in common, or the correspondences are not used.
+    """
+    rig = inliers.rig.moved_to(optimum.T_camera_lidar)
+    terms = pair_terms(rig, matches, inliers.config, kind=kind)
+    if not terms or not inliers.uses_correspondences:
+        return inliers, optimum
+    T, least = optimum.T_camera_lidar, _least_sigmas(terms, optimum.T_camera_lidar)
+    for step in range(_NARROWINGS):
+        now = np.array([term.sigma_px(T) for term in terms])
+        sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / _NARROWINGS)
+        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
+        T = replace(inliers, pairs=scaled).minimize(T, scales).T_camera_lidar
+    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
+    joined = replace(inliers, pairs=kept)
+    return joined, joined.minimize(T, scales)
+
+
+def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Array:
+    """(n,) spread of each term's residuals where its pair's terms alone place the cameras.
+
+    At an estimate that is wrong, residuals are large, and so would be the spread by which they are
+    weighed: the pair could not correct it.
+    """
+    covariance = np.diag(pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2)
+    found: dict[frozenset[str], dict[str, Array]] = {}
+    for term in terms:
+        pair = frozenset((term.a, term.b))
+        if pair not in found:
+            own = [other for other in terms if {other.a, other.b} == pair]
+            found[pair] = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
+    return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
+
+
+def fit_pair(
+    names: tuple[str, str],
+    terms: Sequence[PairTerm],
+    start: Mapping[str, Array],
+    covariance_a: Array,
+) -> dict[str, Array]:
+    """Both cameras of a pair by what they see in common, the first held near its start.
+
+    Args:
+        names: A and B.
+        terms: of this pair.
+        start: (4, 4) T_camera_lidar of both.
+        covariance_a: (6, 6) of the start of A, of xi in T_camera_lidar = exp(xi) start.
+
+    Returns:
+        (4, 4) T_camera_lidar of both.
+    """
+    keys = {name: pose_key(names, name) for name in names}
+    # T_camera_lidar = exp(xi) start is T_lidar_camera = start exp(-xi): the same covariance.
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance_a)
+    held = gtsam.PriorFactorPose3(keys[names[0]], to_T_lidar_camera(start[names[0]]), noise)
+    T = {name: start[name] for name in names}
+    for _ in range(_PAIR_RESCALINGS):
+        graph = pair_graph([term.with_sigma(term.sigma_px(T)) for term in terms], keys)
+        graph.add(held)
+        T = optimize(graph, names, T).T_camera_lidar
+    return T

@@ -1,0 +1,216 @@
+"""Factors of what two cameras both see, on ``T_lidar_a`` and ``T_lidar_b``.
+
+A feature at u_a whose place X_a in A's frame is known (its depth comes from the LiDAR) is predicted
+in B at pi_b(T_b T_a^-1 X_a), with T = T_camera_lidar. Only the relative pose enters:
+T_a_b = T_a T_b^-1 is "the pose of camera B in the frame of the points", so a block of such features
+is a :class:`ProjectionBlock` with points in A's frame, at T_a_b instead of T_lidar_camera; and its
+sums H, b, c are those in the tangent of T_a_b. With X = T_lidar_camera,
+
+    T_a_b = X_a^-1 X_b,    X exp(xi) gives    T_a_b exp(delta),   delta = xi_b - Ad(T_a_b^-1) xi_a,
+
+so the block's square root factor (7 rows), times [-Ad(T_a_b^-1), I], is lossless on both poses.
+A feature without depth gives an epipolar residual (``factors.epipolar``) by the same chain rule.
+Where the range follows the pose of A (``factors.surface``), both poses enter, and the block's
+square root has 13 rows.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.block import ProjectionBlock
+from factors.block_sums import BlockSums, square_root
+from factors.epipolar import EpipolarBlock, epipolar_residual
+from factors.lens import Lens
+from factors.loss import robust_noise
+from factors.projection import projection_residual
+from factors.surface import SurfaceBlock, surface_residual
+
+Array = NDArray[np.float64]
+
+
+PairBlock = ProjectionBlock | EpipolarBlock | SurfaceBlock
+"""Features of camera A, seen in camera B; a ``ProjectionBlock`` has points in A's frame, and the
+lens and pixels of B."""
+
+
+def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomFactor:
+    """All features of a block as one factor on two poses, equal to its separate factors.
+
+    The error and Jacobian of the last poses are kept, as in ``factors.block.block_factor``.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        block: of features of camera A, seen in camera B.
+    """
+    last: tuple[bytes, tuple[Array, Array]] | None = None
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        nonlocal last
+        poses = values.atPose3(key_a), values.atPose3(key_b)
+        place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
+        if found is None or found[0] != place:
+            last = found = (place, _error_and_jacobian(block, *poses))
+        residual, jacobian = found[1]
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(jacobian[:, :6])
+            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
+        return residual
+
+    rows = 13 if isinstance(block, SurfaceBlock) else 7
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [key_a, key_b], error)
+
+
+def _error_and_jacobian(
+    block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
+) -> tuple[Array, Array]:
+    """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
+    if isinstance(block, SurfaceBlock):
+        return square_root(block.sums(T_lidar_a, T_lidar_b))
+    error, jacobian = square_root(block.sums(T_lidar_a.between(T_lidar_b)))
+    return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
+
+
+def pair_sums(block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
+    """H (12, 12), b (12,) and c of a block, in the tangents of both poses, first A's."""
+    if isinstance(block, SurfaceBlock):
+        return block.sums(T_lidar_a, T_lidar_b)
+    sums = block.sums(T_lidar_a.between(T_lidar_b))
+    chain = pair_chain(T_lidar_a, T_lidar_b)
+    return BlockSums(chain.T @ sums.hessian @ chain, chain.T @ sums.gradient, sums.cost)
+
+
+def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
+    """(6, 12) derivative of the tangent of ``T_a_b`` by those of both poses."""
+    T_b_a = T_lidar_b.between(T_lidar_a)
+    return np.hstack([-T_b_a.AdjointMap(), np.eye(6)])
+
+
+def pair_projection_factor(
+    key_a: int,
+    key_b: int,
+    lens_b: Lens,
+    point_a_m: ArrayLike,
+    pixel_b_px: ArrayLike,
+    *,
+    sqrt_information: ArrayLike | None = None,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One feature with depth: residual ``pi_b(T_b T_a^-1 X_a) - u_b``. The reference of the block.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        lens_b: of camera B.
+        point_a_m: (3,) X_a in A's frame.
+        pixel_b_px: (2,) u_b.
+        sqrt_information: (2, 2) upper triangular whitening matrix [1/px]; identity if None.
+        loss: name of the robust loss.
+        scale: whitened residual norm at which the loss bends.
+    """
+    point = np.asarray(point_a_m, dtype=np.float64)
+    pixel = np.asarray(pixel_b_px, dtype=np.float64)
+    whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        T_a_b, by_a, by_b = _relative(values, key_a, key_b)
+        residual, jacobian = projection_residual(lens_b, T_a_b, point, pixel)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(jacobian @ by_a)
+            jacobians[1] = np.asfortranarray(jacobian @ by_b)
+        return residual
+
+    base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
+    noise = robust_noise(base, loss=loss, scale=scale)
+    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+
+
+def surface_factor(
+    key_a: int,
+    key_b: int,
+    lens_b: Lens,
+    ray_a: ArrayLike,
+    plane_lidar_per_m: ArrayLike,
+    pixel_b_px: ArrayLike,
+    *,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One feature on a surface of the LiDAR. The reference of ``SurfaceBlock``.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        lens_b: of camera B.
+        ray_a: (3,) the feature's unit ray in A's frame.
+        plane_lidar_per_m: (3,) q, with q . p = 1 for points p of the surface in the LiDAR frame.
+        pixel_b_px: (2,) the feature in B.
+        loss: name of the robust loss.
+        scale: residual norm [px] at which the loss bends.
+    """
+    ray, plane, pixel = (
+        np.asarray(value, dtype=np.float64) for value in (ray_a, plane_lidar_per_m, pixel_b_px)
+    )
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        poses = values.atPose3(key_a), values.atPose3(key_b)
+        residual, jacobian = surface_residual(poses, lens_b, ray, plane, pixel)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(jacobian[:, :6])
+            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
+        return residual
+
+    noise = robust_noise(gtsam.noiseModel.Unit.Create(2), loss=loss, scale=scale)
+    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+
+
+def epipolar_factor(
+    key_a: int,
+    key_b: int,
+    lenses: tuple[Lens, Lens],
+    pixels_px: tuple[ArrayLike, ArrayLike],
+    *,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One feature without depth: Sampson's residual [px]. The reference of ``EpipolarBlock``.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        lenses: of A and of B.
+        pixels_px: (2,) the feature in A and in B.
+        loss: name of the robust loss.
+        scale: residual [px] at which the loss bends.
+    """
+    pixel_a, pixel_b = (np.asarray(pixel, dtype=np.float64) for pixel in pixels_px)
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        T_a_b, by_a, by_b = _relative(values, key_a, key_b)
+        residual, jacobian = epipolar_residual(T_a_b, lenses, (pixel_a, pixel_b))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray((jacobian @ by_a)[None])
+            jacobians[1] = np.asfortranarray((jacobian @ by_b)[None])
+        return np.array([residual])
+
+    noise = robust_noise(gtsam.noiseModel.Unit.Create(1), loss=loss, scale=scale)
+    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+
+
+def _relative(values: gtsam.Values, key_a: int, key_b: int) -> tuple[gtsam.Pose3, Array, Array]:
+    """T_a_b, and the (6, 6) derivatives of its tangent by those of both variables."""
+    by_a, by_b = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
+    T_a_b = values.atPose3(key_a).between(values.atPose3(key_b), by_a, by_b)
+    return T_a_b, by_a, by_b

@@ -1,0 +1,254 @@
+"""Factors of a pair of cameras: blocks equal separate factors, derivatives and literal formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    LOSSES,
+    EpipolarBlock,
+    Lens,
+    PairBlock,
+    ProjectionBlock,
+    SurfaceBlock,
+    epipolar_factor,
+    pair_block_factor,
+    pair_projection_factor,
+    pair_sums,
+    surface_factor,
+    unproject,
+)
+from tests.conftest import FORWARD, KANNALA, RADTAN5
+
+A, B = 3, 8
+K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
+LENSES = {
+    "pinhole": (Lens.pinhole(**K), Lens.pinhole(**K, distortion=RADTAN5)),
+    "fisheye": (Lens.fisheye(**K, distortion=KANNALA), Lens.fisheye(**K, distortion=KANNALA)),
+    "mixed": (Lens.pinhole(**K, distortion=RADTAN5), Lens.fisheye(**K, distortion=KANNALA)),
+}
+
+T_LIDAR_A = gtsam.Pose3(gtsam.Rot3(FORWARD.T), np.array([0.3, 0.1, -0.1]))
+T_LIDAR_B = T_LIDAR_A.compose(
+    gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.15, 0.01), np.array([0.5, 0.02, -0.05]))
+)
+
+
+class Features:
+    """Features of a street of planes, with 0.5 px noise and a fifth of outliers."""
+
+    def __init__(self, lenses: tuple[Lens, Lens], count: int, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.lenses = lens_a, lens_b = lenses
+        plane_rays = np.column_stack([rng.uniform(-0.7, 0.7, count), rng.uniform(-0.2, 0.2, count)])
+        points_a = np.column_stack([plane_rays, np.ones(count)]) * rng.uniform(4, 40, (count, 1))
+        self.pixels_a = lens_a.project(points_a)[0]
+        self.rays_a = unproject(lens_a, self.pixels_a)[0]
+        self.points_a = points_a
+        self.points_lidar = np.array([T_LIDAR_A.transformFrom(p) for p in points_a])
+        normals = rng.standard_normal((count, 3)) - 2 * self.points_lidar / np.linalg.norm(
+            self.points_lidar, axis=1, keepdims=True
+        )
+        across = np.einsum("ni,ni->n", normals, self.points_lidar)
+        self.planes = normals / across[:, None]
+        in_b = np.array([T_LIDAR_B.transformTo(p) for p in self.points_lidar])
+        self.pixels_b = lens_b.project(in_b)[0] + 0.5 * rng.standard_normal((count, 2))
+        wrong = rng.random(count) < 0.2
+        self.pixels_b[wrong] += rng.uniform(-40, 40, (np.count_nonzero(wrong), 2))
+
+    def separate(self, kind: str, loss: str, scale: float) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        options = {"loss": loss, "scale": scale}
+        for n, pixel_b in enumerate(self.pixels_b):
+            if kind == "epipolar":
+                pixels = self.pixels_a[n], pixel_b
+                graph.add(epipolar_factor(A, B, self.lenses, pixels, **options))
+            elif kind == "surface":
+                surface = self.rays_a[n], self.planes[n]
+                graph.add(surface_factor(A, B, self.lenses[1], *surface, pixel_b, **options))
+            else:
+                point = self.points_a[n]
+                graph.add(pair_projection_factor(A, B, self.lenses[1], point, pixel_b, **options))
+        return graph
+
+    def block(self, kind: str, loss: str = "cauchy", scale: float = 2.0) -> PairBlock:
+        if kind == "epipolar":
+            return EpipolarBlock(*self.lenses, self.pixels_a, self.pixels_b, loss, scale)
+        lens = self.lenses[1]
+        if kind == "surface":
+            return SurfaceBlock(lens, self.rays_a, self.planes, self.pixels_b, loss, scale)
+        return ProjectionBlock(lens, self.points_a, self.pixels_b, loss=loss, scale=scale)
+
+
+KINDS = ("point", "surface", "epipolar")
+
+
+def near_truth(seed: int = 1) -> gtsam.Values:
+    """Poses a degree and some centimetres off."""
+    rng, values = np.random.default_rng(seed), gtsam.Values()
+    for key, pose in ((A, T_LIDAR_A), (B, T_LIDAR_B)):
+        values.insert(key, pose.retract(rng.normal(0, 0.02, 6)))
+    return values
+
+
+def linearized(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[float, np.ndarray]:
+    """Error, and the augmented Hessian over both poses."""
+    ordering = gtsam.Ordering()
+    ordering.push_back(A)
+    ordering.push_back(B)
+    return graph.error(values), graph.linearize(values).augmentedHessian(ordering)
+
+
+@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_block_equals_its_separate_factors(
+    kind: str, loss: str, lenses: tuple[Lens, Lens]
+) -> None:
+    features, values = Features(lenses, 60), near_truth()
+    one = gtsam.NonlinearFactorGraph()
+    one.add(pair_block_factor(A, B, features.block(kind, loss)))
+    error, hessian = linearized(one, values)
+    expected_error, expected = linearized(features.separate(kind, loss, 2.0), values)
+    assert error == pytest.approx(expected_error, rel=1e-9)
+    units = np.sqrt(np.maximum(np.diag(expected), 1e-300))
+    # The last row is the gradient, and the last entry the sum of weighted squares (not the error).
+    assert np.abs((hessian - expected)[:, :12] / np.outer(units, units)[:, :12]).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pair_sums_are_those_of_the_factor(kind: str) -> None:
+    features, values = Features(LENSES["mixed"], 80), near_truth()
+    block = features.block(kind).rescale(scale=2.0, sigma=0.7)
+    sums = pair_sums(block, values.atPose3(A), values.atPose3(B))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(pair_block_factor(A, B, block))
+    error, hessian = linearized(graph, values)
+    assert sums.cost == pytest.approx(2 * error, rel=1e-12)
+    units = np.sqrt(np.diag(sums.hessian))
+    assert np.abs((hessian[:12, :12] - sums.hessian) / np.outer(units, units)).max() < 1e-9
+    assert np.abs((hessian[:12, 12] + sums.gradient) / units).max() < 1e-9 * error
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gradient_is_that_of_the_error(kind: str) -> None:
+    """Central differences of the robust error, over both poses."""
+    block, values = Features(LENSES["mixed"], 60).block(kind), near_truth()
+    poses = values.atPose3(A), values.atPose3(B)
+    sums, step = pair_sums(block, *poses), 1e-5
+    for i in range(12):
+        costs = []
+        for sign in (1, -1):
+            moved = list(poses)
+            moved[i // 6] = poses[i // 6].retract(sign * step * np.eye(6)[i % 6])
+            costs.append(pair_sums(block, *moved).cost)
+        # Half the cost has the gradient b; a unit of the Hessian bounds the truncation.
+        difference = (costs[0] - costs[1]) / (4 * step)
+        assert difference == pytest.approx(sums.gradient[i], abs=1e-5 * sums.hessian[i, i] ** 0.5)
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1.0], ids=["near identity", "large angles"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_jacobians_against_differences(kind: str, scale: float) -> None:
+    """Of one factor each, at relative poses near the identity and far from it."""
+    rng = np.random.default_rng(4)
+    features = Features(LENSES["mixed"], 4)
+    graph = features.separate(kind, "l2", 1.0)
+    truth = T_LIDAR_A.between(T_LIDAR_B)
+    twist = np.concatenate([scale * rng.normal(0, 0.3, 3), rng.normal(0, 0.3, 3)])
+    T_lidar_a = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)) if kind != "surface" else T_LIDAR_A
+    values = gtsam.Values()
+    values.insert(A, T_lidar_a)
+    values.insert(B, T_lidar_a.compose(truth if kind == "surface" else gtsam.Pose3.Expmap(twist)))
+    for n in range(graph.size()):
+        factor = graph.at(n)
+        jacobian = factor.linearize(values).jacobian()[0]
+        for i in range(12):
+            residuals = []
+            for sign in (1, -1):
+                moved, key = gtsam.Values(values), (A, B)[i // 6]
+                moved.update(key, values.atPose3(key).retract(sign * 1e-6 * np.eye(6)[i % 6]))
+                residuals.append(factor.unwhitenedError(moved))
+            difference = (residuals[0] - residuals[1]) / 2e-6
+            assert difference == pytest.approx(jacobian[:, i], rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
+def test_residuals_equal_the_literal_formula(lenses: tuple[Lens, Lens]) -> None:
+    """pi_b(T_b T_a^-1 X_a) - u_b with plain matrices; X_a on the ray, where it meets the plane."""
+    features, values = Features(lenses, 40), near_truth(seed=3)
+    T_a, T_b = (np.linalg.inv(values.atPose3(key).matrix()) for key in (A, B))
+    R, center = T_a[:3, :3], -T_a[:3, :3].T @ T_a[:3, 3]
+    for kind in ("point", "surface"):
+        block = features.block(kind)
+        for n in range(len(block)):
+            X_a = features.points_a[n]
+            if kind == "surface":
+                outwards, q = R.T @ features.rays_a[n], features.planes[n]
+                hit = center + (1 - q @ center) / (q @ outwards) * outwards
+                X_a = (T_a @ [*hit, 1])[:3]
+            X_b = (T_b @ np.linalg.inv(T_a) @ [*X_a, 1])[:3]
+            expected = features.lenses[1].project(X_b)[0][0] - features.pixels_b[n]
+            factor = features.separate(kind, "l2", 1.0).at(n)
+            assert factor.unwhitenedError(values) == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_epipolar_residual_is_the_distance_from_the_epipolar_line() -> None:
+    """Side by side, u is free and a difference of 2 px in v is one of sqrt(2) px from each line."""
+    lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)
+    block = EpipolarBlock(lens, lens, np.array([[650.0, 240.0]]), np.array([[610.0, 242.0]]))
+    for length in (0.1, 0.5):
+        T_a_b = gtsam.Pose3(gtsam.Rot3(), np.array([length, 0.0, 0.0]))
+        # Sampson's distance is of first order in the ratio of 2 px to the focal length.
+        assert np.abs(block.residuals(T_a_b)) == pytest.approx([2.0 / np.sqrt(2.0)], rel=1e-5)
+
+
+def test_without_a_baseline_there_is_no_epipolar_constraint() -> None:
+    block = Features(LENSES["pinhole"], 20).block("epipolar")
+    sums = block.sums(gtsam.Pose3(gtsam.Rot3.Ry(0.1), np.zeros(3)))
+    assert not sums.hessian.any() and not sums.gradient.any()
+
+
+def test_a_ray_that_leaves_its_plane_gives_finite_numbers() -> None:
+    """A turns by up to half a turn: rays pass the horizon of their planes."""
+    block = Features(LENSES["pinhole"], 50).block("surface")
+    for angle in np.linspace(0, np.pi, 50):
+        sums = block.sums(T_LIDAR_A.retract(np.array([0, angle, 0, 0, 0, 0])), T_LIDAR_B)
+        assert np.isfinite(sums.hessian).all() and np.isfinite(sums.gradient).all()
+        assert np.isfinite(sums.cost)
+
+
+BAD: dict[str, Callable[[Features], object]] = {
+    "shape": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes[:3], f.pixels_b),
+    "nan": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes * np.nan, f.pixels_b),
+    "loss": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, "welsch"),
+    "sigma": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, sigma=0.0),
+    "ray": lambda f: EpipolarBlock(*f.lenses, f.pixels_a * np.nan, f.pixels_b),
+    "pixels": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b[:2]),
+}
+
+
+@pytest.mark.parametrize("make", BAD.values(), ids=BAD)
+def test_wrong_blocks_are_refused(make: Callable[[Features], object]) -> None:
+    with pytest.raises(ValueError, match=r"expected|unknown|positive|no ray"):
+        make(Features(LENSES["pinhole"], 10))
+
+
+@pytest.mark.parametrize("kind", ["surface", "epipolar"])
+def test_blocks_are_immutable_and_parts_of_them_add_up(kind: str) -> None:
+    features = Features(LENSES["mixed"], 30)
+    block = features.block(kind)
+    with pytest.raises(FrozenInstanceError):
+        block.scale = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        block.pixels_b_px[0] = 0.0
+    parts = [block.select(np.arange(30) < 11), block.select(np.arange(11, 30))]
+    whole = pair_sums(block, T_LIDAR_A, T_LIDAR_B)
+    sums = [pair_sums(part, T_LIDAR_A, T_LIDAR_B) for part in parts]
+    assert whole.cost == pytest.approx(sums[0].cost + sums[1].cost, rel=1e-12)
+    assert np.allclose(whole.hessian, sums[0].hessian + sums[1].hessian, rtol=1e-9, atol=1e-6)

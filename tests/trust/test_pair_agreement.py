@@ -1,0 +1,84 @@
+"""Images of two cameras against their calibration: agree where it is right, and only there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibgraph import Rig, perturb
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.config import Config
+from calibgraph.trust.pair_agreement import PairAgreement, pair_agreements
+from factors import pose_sigmas
+from tests.solver.test_camera_pairs import simulated_pairs
+
+SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
+COVARIANCE = np.diag(np.tile(SIGMAS**2, 2))
+
+
+def agreement(rig: Rig, table: CameraMatches, covariance: np.ndarray | None) -> PairAgreement:
+    (found,) = pair_agreements(rig, table, covariance, Config())
+    return found
+
+
+def test_a_right_calibration_agrees(pair: Rig) -> None:
+    """Differences are within the sigmas that went in: 0.05 deg and 1 cm per camera and axis."""
+    rng = np.random.default_rng(0)
+    table = simulated_pairs(pair)
+    sigmas = []
+    for _ in range(10):
+        twists = rng.normal(0, np.tile(SIGMAS, 2)).reshape(2, 6)
+        moved = {
+            name: _exp(twist) @ T
+            for twist, (name, T) in zip(twists, pair.T_camera_lidar.items(), strict=True)
+        }
+        found = agreement(pair.moved_to(moved), table, COVARIANCE)
+        sigmas.append(found.sigmas)
+        assert found.degrees < 0.4 and found.centimetres < 6
+    # The largest of six standard Gaussians is 0.5 to 3 in 99 of 100 draws.
+    assert 0.5 < np.median(sigmas) < 2.2 and max(sigmas) < 3.5
+
+
+def _exp(twist: np.ndarray) -> np.ndarray:
+    import gtsam
+
+    return np.asarray(gtsam.Pose3.Expmap(twist).matrix())
+
+
+def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
+    moved = perturb(pair, rotation_deg=0.5, translation_m=0.1, seed=4).T_camera_lidar["right"]
+    found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair), COVARIANCE)
+    assert found.degrees == pytest.approx(0.5, abs=0.1)
+    assert found.sigmas > 4
+    assert found.residual_px > 5 * found.least_px
+
+
+def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
+    table = simulated_pairs(pair)
+    swapped = replace(table, pixels_px=np.ascontiguousarray(table.pixels_px[:, ::-1]))
+    found = agreement(pair, swapped, COVARIANCE)
+    assert found.centimetres == pytest.approx(100, abs=10)
+    assert found.sigmas > 10
+
+
+def test_wrong_intrinsics_leave_residuals_that_no_place_explains(pair: Rig) -> None:
+    table, right = simulated_pairs(pair), pair.cameras["right"]
+    k = right.intrinsics_px
+    zoomed = right.model_copy(
+        update={"intrinsics_px": k.model_copy(update={"fx": 1.03 * k.fx, "fy": 1.03 * k.fy})}
+    )
+    wrong = pair.model_copy(update={"cameras": {**pair.cameras, "right": zoomed}})
+    assert agreement(wrong, table, None).least_px > 1.5 * agreement(pair, table, None).least_px
+
+
+def test_without_a_covariance_there_are_no_sigmas(pair: Rig) -> None:
+    found = agreement(pair, simulated_pairs(pair), None)
+    assert np.isnan(found.sigmas) and found.degrees < 0.02
+
+
+def test_pairs_without_surfaces_are_left_out(pair: Rig) -> None:
+    table = simulated_pairs(pair)
+    bare = table.with_planes(np.full_like(table.planes_lidar_per_m, np.nan))
+    assert pair_agreements(pair, bare, None, Config()) == ()
