@@ -278,14 +278,11 @@ def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
-    n = len(points)
-    pixels = np.empty((n, 2))
-    valid = np.empty(n, dtype=np.bool_)
-    for k in range(n):
+    pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         projection = project_one(kind, lens, x, y, z)
-        pixels[k, 0] = projection[0]
-        pixels[k, 1] = projection[1]
+        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
         valid[k] = is_projectable(kind, lens, x, y, z)
     return pixels, valid
 
