@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -130,8 +131,9 @@ class StructureMatcher:
         work = len(rig.cameras) * len(dataset.frames)
         tables, z_scores = [], {}
         with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
-            one = partial(self._match_camera, dataset.frames, self.levels[round_index], cores)
-            matches = pool.map(one, rig.cameras, rig.cameras.values())
+            level = self.levels[round_index]
+            waiting = self._submit_scores(dataset.frames, rig, level, cores)
+            matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
             for index, name in enumerate(rig.cameras):
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
                 done = round_index * work + index * len(dataset.frames)
@@ -156,20 +158,34 @@ class StructureMatcher:
         confident = all(c.accepted and c.z_score >= _CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
-    def _match_camera(
-        self, frames: Sequence[Frame], level: Level, cores: Executor, name: str, camera: Camera
-    ) -> tuple[Correspondences, float]:
-        """The correspondences of one camera in all frames, and their z-score."""
+    def _submit_scores(
+        self, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
+    ) -> dict[str, deque[Future[ShiftScores]]]:
+        """Score every camera in every frame; frame by frame, so that cameras share its windows."""
         per_frame = level.max_windows // min(len(frames), SHARING_FRAMES)
         max_windows = min(per_frame, FRAME_WINDOWS)
 
-        def score(frame: Frame) -> ShiftScores:
+        def score(frame: Frame, name: str, camera: Camera) -> ShiftScores:
             gray, cloud = self._cache.image(frame, name, camera), self._cache.cloud(frame)
             return score_frame(
                 gray, cloud, camera, level, frame=frame.index, max_windows=max_windows
             )
 
-        scores = concatenate_scores(list(cores.map(score, frames)))
+        waiting: dict[str, deque[Future[ShiftScores]]] = {name: deque() for name in rig.cameras}
+        for frame in frames:
+            for name, camera in rig.cameras.items():
+                waiting[name].append(cores.submit(score, frame, name, camera))
+        return waiting
+
+    def _match_camera(
+        self, level: Level, name: str, waiting: deque[Future[ShiftScores]]
+    ) -> tuple[Correspondences, float]:
+        """The correspondences of one camera in all frames, and their z-score."""
+        try:
+            scores = concatenate_scores([waiting.popleft().result() for _ in range(len(waiting))])
+        finally:  # after an error in one frame, the others are not needed
+            for future in waiting:
+                future.cancel()
         twist, z_score = find_consensus(scores, level, seed=self.seed)
         table = extract_correspondences(scores, twist, name, min_quality=level.min_quality)
         return table, z_score
