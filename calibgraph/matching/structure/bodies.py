@@ -29,7 +29,7 @@ def rigid_bodies(rig: Rig) -> list[Body]:
         if pair.rotation_sigma_rad <= RIGID_RAD and pair.translation_sigma_m <= RIGID_M
     ]
     left = dict(rig.cameras)
-    bodies = []
+    bodies: list[Body] = []
     while left:
         name = next(iter(left))
         body = {name: left.pop(name)}

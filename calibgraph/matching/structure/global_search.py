@@ -2,20 +2,21 @@
 
 A pose is accepted when images and clouds agree at it far better than by chance; the more poses were
 tried, the better they must agree. Cameras whose relative pose is known are searched as one body.
-Each body is tried at the guess, and the best one searched for all over the range until one is
-accepted. From then on the located cameras propose poses for the others, by what both see in common
-and by the relative poses of the guess; also for those that have been accepted, if they are
-elsewhere: the pose at which images and clouds agree better is taken. If no pose of a camera is
-accepted, it has not been found: the best of the rejected poses is never taken.
+Each body is tried at the guesses of its cameras, and the most promising one is searched for all
+over the range, until one is accepted. From then on the located cameras propose poses for the
+others, by what both see in common and by the relative poses of the guess; also for those that have
+been accepted, if they are elsewhere: where images and clouds agree better, all in all, is taken. If
+no pose of a camera is accepted, it has not been found: the best of the rejected poses is never
+taken.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from calibgraph.matching.structure.bodies import Body, lead, rigid_bodies
+from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
 from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.model.geometry import pose_difference
@@ -70,10 +71,10 @@ def locate_cameras(
         The best pose per camera, accepted if the camera has been located.
     """
     search = PoseSearch(rig, frames, search_range, seed, out_of_time)
-    return _Locator(search, pool, progress).locate()
+    return Locator(search, pool, progress).locate()
 
 
-class _Locator:
+class Locator:
     """What has been tried for each body of a rig, and decides what is tried next.
 
     Attributes:
@@ -93,10 +94,12 @@ class _Locator:
     def locate(self) -> dict[str, Located]:
         """Locate all bodies, as far as time allows."""
         self._report("trying the guess")
-        tried = self._pool.map(self._search.near, self._bodies.values())
-        self._near = dict(zip(self._bodies, tried, strict=True))
-        for name, candidate in self._near.items():
-            self._consider(name, candidate)
+        for name, body in self._bodies.items():
+            guesses = _distinct(place_member(body, n, self._search.guess[n]) for n in body)
+            tried = list(self._pool.map(self._search.near, guesses))
+            best = max(range(len(tried)), key=lambda k: tried[k].z_score)
+            self._bodies[name], self._near[name] = guesses[best], tried[best]
+            self._consider(name, tried[best])
         steps = (
             self._propose,
             self._search_next,
@@ -159,7 +162,7 @@ class _Locator:
     def _replace(self, old: Candidate, new: Candidate) -> None:
         """Move a body; if it is not accepted there, against one that is, it is not located."""
         name = next(iter(old.body))
-        del self.located[name]
+        del self.located[name], self.best[name]
         self._searches[name] = SEARCHES
         self._consider(name, new, alone=True)
 
@@ -224,6 +227,15 @@ class _Locator:
             for name in self._bodies
             for member, camera in found[name].body.items()
         }
+
+
+def _distinct(bodies: Iterable[Body]) -> list[Body]:
+    """Without those that are at the pose of an earlier one."""
+    kept: list[Body] = []
+    for body in bodies:
+        if not any(_is_same_pose(body, other) for other in kept):
+            kept.append(body)
+    return kept
 
 
 def _is_same_pose(one: Body, two: Body) -> bool:

@@ -61,7 +61,7 @@ class PoseSearch:
         seed: int,
         out_of_time: Callable[[], bool],
     ) -> None:
-        self.rig, self.out_of_time = rig, out_of_time
+        self.rig, self.guess, self.out_of_time = rig, rig.T_camera_lidar, out_of_time
         self._frames, self._range, self._seed = frames, search_range, seed
         self._chances: dict[str, Chance] = {}
 
@@ -103,7 +103,7 @@ class PoseSearch:
         """The body at its relative pose in the guess to a located one."""
         by, camera = next(iter(other.items()))
         old = lead(body).T_camera_lidar
-        relative = relative_transform(old, self.rig.cameras[by].T_camera_lidar)
+        relative = relative_transform(old, self.guess[by])
         return place(body, relative @ camera.T_camera_lidar)
 
     def least_z_score(self, name: str) -> float:
@@ -149,8 +149,9 @@ class PoseSearch:
         All candidates of the box search are approached, and the best are refined.
         """
         maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
+        nothing = Candidate(body, -math.inf)
         if not maps.maps:
-            return Candidate(body, -math.inf)
+            return nothing
         box = Box(lead(body).T_camera_lidar, self._range.rotation_rad, self._range.translation_m)
         cores = self._frames[next(iter(body))].cores
         found = search_box(maps, box, cores, effort=effort, seed=self._seed + effort)
@@ -160,8 +161,9 @@ class PoseSearch:
             if self.out_of_time():
                 break
         near.sort(key=_by_z_score, reverse=True)
-        refined = [refine(self._frames, one.body) for one in near[: effort * SURVIVORS]]
-        return self._refine_on(max(refined, key=_by_z_score))
+        survivors = near[: 1 if self.out_of_time() else effort * SURVIVORS]
+        refined = [refine(self._frames, one.body) for one in survivors]
+        return self._refine_on(max(refined, key=_by_z_score, default=nothing))
 
     def _refine_on(self, candidate: Candidate) -> Candidate:
         """The candidate refined further, if that may be of use."""
