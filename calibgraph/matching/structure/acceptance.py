@@ -50,9 +50,9 @@ class Chance:
         return location + scale * (math.log(tries) - math.log(-math.log1p(-FALSE_ACCEPTANCE)))
 
     def may_be_accepted(self, z_score: float) -> bool:
-        """Whether there are scenes on which a z-score is accepted."""
-        lucky = Chance((PRIOR_MEAN - 2 * PRIOR_SIGMA,) * 10)
-        return z_score >= lucky.least_z_score(alone=True)
+        """Whether there are scenes, not too rare, on which a search's z-score is accepted."""
+        lucky = Chance((PRIOR_MEAN - PRIOR_SIGMA,) * 10)
+        return z_score >= lucky.least_z_score()
 
     def _predictive(self) -> tuple[float, float]:
         """Location and scale: the prior, moved by what has been seen on the scene.
