@@ -16,9 +16,11 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
+from calibgraph.matching.structure.acceptance import Chance
 from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
+from calibgraph.matching.structure.box_search import CANDIDATES
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
-from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
+from calibgraph.matching.structure.pose_search import ROLLS_RAD, PoseSearch, SearchRange
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
@@ -26,6 +28,10 @@ from calibgraph.progress import Progress
 SEARCHES = 2  # per body
 RETRY_EFFORT = 2
 """Factor on the candidates, and as far as memory allows on the windows, of a second search."""
+TRIES = {1: len(ROLLS_RAD), 2: (1 + RETRY_EFFORT) * len(ROLLS_RAD)}
+"""How much has been searched after so many searches, in searches for one roll."""
+ALONE = 1 / CANDIDATES  # the same of a single pose
+
 SAME_DEG, SAME_CM = 1.0, 30.0
 """Poses nearer than this are the same: what refinements leave, the rounds correct."""
 
@@ -99,7 +105,7 @@ class Locator:
             tried = list(self._pool.map(self._search.near, guesses))
             best = max(range(len(tried)), key=lambda k: tried[k].z_score)
             self._bodies[name], self._near[name] = guesses[best], tried[best]
-            self._consider(name, tried[best])
+            self._consider(name, tried[best], TRIES[1])
         steps = (
             self._propose,
             self._search_next,
@@ -111,11 +117,11 @@ class Locator:
             pass
         return self._result()
 
-    def _consider(self, name: str, candidate: Candidate, *, alone: bool = False) -> bool:
+    def _consider(self, name: str, candidate: Candidate, tries: float) -> bool:
         """Keep a candidate if it is the best of its body, and locate the body if it is accepted."""
         if name not in self.best or candidate.z_score > self.best[name].z_score:
             self.best[name] = candidate
-        if not self._search.accepts(self._bodies[name], candidate.z_score, alone=alone):
+        if not self._search.accepts(self._bodies[name], candidate.z_score, tries):
             return False
         self.located[name] = candidate
         return True
@@ -141,10 +147,10 @@ class Locator:
     def _place_next_to(self, proposer: Candidate, name: str) -> None:
         """Try an unlocated body where a located one sees it, else where the guess has it."""
         proposed = self._search.seen_by(proposer.body, self._bodies[name])
-        if proposed is not None and self._consider(name, self._search.at(proposed), alone=True):
+        if proposed is not None and self._consider(name, self._search.at(proposed), ALONE):
             return
         guessed = self._search.as_in_guess(proposer.body, self._bodies[name])
-        self._consider(name, self._search.from_afar(guessed), alone=True)
+        self._consider(name, self._search.from_afar(guessed), ALONE)
 
     def _compare(self, one: Candidate, two: Candidate) -> None:
         """Where two located bodies see each other elsewhere, keep what agrees better all in all."""
@@ -164,7 +170,7 @@ class Locator:
         name = next(iter(old.body))
         del self.located[name], self.best[name]
         self._searches[name] = SEARCHES
-        self._consider(name, new, alone=True)
+        self._consider(name, new, ALONE)
 
     def _search_next(self) -> bool:
         """Search for the most promising body that has not been searched for."""
@@ -181,9 +187,9 @@ class Locator:
         """
         for name in self._missing():
             near = self._near[name]
-            if _is_same_pose(near.body, self.best[name].body) and self._consider(
-                name, near, alone=True
-            ):
+            if not _is_same_pose(near.body, self.best[name].body):
+                continue
+            if self._consider(name, near, ALONE):
                 return True
         return False
 
@@ -200,8 +206,8 @@ class Locator:
         for name in self._missing():
             body, best = self._bodies[name], self.best[name]
             if self._search.measure_chance(body, best.z_score):
-                alone = _is_same_pose(self._near[name].body, best.body)
-                if self._consider(name, best, alone=alone):
+                near = _is_same_pose(self._near[name].body, best.body)
+                if self._consider(name, best, ALONE if near else TRIES[self._searches[name]]):
                     return True
         return False
 
@@ -209,11 +215,13 @@ class Locator:
         return [name for name in self._bodies if name not in self.located]
 
     def _search_for(self, name: str, effort: int) -> None:
-        z_score, least = self.best[name].z_score, self._search.least_z_score(name)
+        tries = TRIES[self._searches[name] + 1]
+        z_score, least = self.best[name].z_score, Chance().least_z_score(tries)
         before = f" (best z-score {z_score:.1f}, {least:.1f} needed)" if z_score > 0 else ""
         self._report(f"searching: {name}{before}")
         self._searches[name] += 1
-        self._consider(name, self._search.everywhere(self._bodies[name], effort))
+        found = self._search.everywhere(self._bodies[name], effort, tries)
+        self._consider(name, found, tries)
 
     def _report(self, what: str) -> None:
         total = SEARCHES * len(self._bodies)

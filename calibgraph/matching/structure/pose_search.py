@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.acceptance import Chance
+from calibgraph.matching.structure.acceptance import Chance, may_be_accepted
 from calibgraph.matching.structure.bodies import Body, lead, place, place_member
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
@@ -81,12 +81,12 @@ class PoseSearch:
         """The body near a pose that is off by less than a degree."""
         return self._refine_on(refine(self._frames, body))
 
-    def everywhere(self, body: Body, effort: int) -> Candidate:
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
         """The best pose in all of the range; of those that are accepted, the first."""
         best = Candidate(body, -math.inf)
         for roll in ROLLS_RAD:
             best = max(best, self._best_of(body, roll, effort), key=_by_z_score)
-            if self.accepts(body, best.z_score) or self.out_of_time():
+            if self.accepts(body, best.z_score, tries) or self.out_of_time():
                 break
         return best
 
@@ -106,20 +106,16 @@ class PoseSearch:
         relative = relative_transform(old, self.guess[by])
         return place(body, relative @ camera.T_camera_lidar)
 
-    def least_z_score(self, name: str) -> float:
-        """The z-score from which a pose of a body is accepted, as far as it is known."""
-        return self._chances.get(name, Chance()).least_z_score()
-
-    def accepts(self, body: Body, z_score: float, *, alone: bool = False) -> bool:
+    def accepts(self, body: Body, z_score: float, tries: float) -> bool:
         """Whether a z-score is too high to have come about by chance.
 
         Args:
             body: the one that was searched for.
             z_score: at its best pose.
-            alone: a single pose was tried.
+            tries: see :meth:`Chance.least_z_score`.
         """
         chance = self._chances.get(next(iter(body)), Chance())
-        return z_score >= chance.least_z_score(alone=alone)
+        return z_score >= chance.least_z_score(tries)
 
     def measure_chance(self, body: Body, z_score: float) -> bool:
         """Measure what chance brings about on this scene, by searches with nothing to find.
@@ -128,7 +124,7 @@ class PoseSearch:
             Whether it was measured: once, and only if the z-score may be accepted afterwards.
         """
         name = next(iter(body))
-        if name in self._chances or not Chance().may_be_accepted(z_score):
+        if name in self._chances or not may_be_accepted(z_score, len(ROLLS_RAD)):
             return False
         chance = Chance()
         for angle in TURNS_RAD:
@@ -167,7 +163,7 @@ class PoseSearch:
 
     def _refine_on(self, candidate: Candidate) -> Candidate:
         """The candidate refined further, if that may be of use."""
-        if not Chance().may_be_accepted(candidate.z_score):
+        if not may_be_accepted(candidate.z_score, len(ROLLS_RAD)):
             return candidate
         return refine_on(self._frames, candidate)
 

@@ -12,10 +12,10 @@ import pytest
 
 import calibgraph
 from calibgraph import RelativePose, Rig, StructureMatcher
-from calibgraph.matching.structure import pose_search
+from calibgraph.matching.structure import acceptance, global_search, pose_search
 from calibgraph.matching.structure.acceptance import Chance
 from calibgraph.matching.structure.bodies import Body, lead, place
-from calibgraph.matching.structure.global_search import Located, Locator
+from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.progress import no_progress
@@ -24,7 +24,8 @@ from tests.matching.structure.data import never
 
 NAMES = ("front_left", "front_right")
 BOTH = (NAMES, NAMES[::-1])
-MANY, ALONE = Chance().least_z_score(), Chance().least_z_score(alone=True)
+MANY, AGAIN = (Chance().least_z_score(TRIES[searches]) for searches in (1, 2))
+ALONE = Chance().least_z_score(global_search.ALONE)
 
 
 def off(T_camera_lidar: np.ndarray, metres: float = 1.0) -> np.ndarray:
@@ -65,7 +66,7 @@ class MadeUp(PoseSearch):
 
     near = from_afar = at
 
-    def everywhere(self, body: Body, effort: int) -> Candidate:
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
         name = next(iter(body))
         self.searches.append(name)
         found = self.found.get(name, [off(lead(body).T_camera_lidar, 1.4)])
@@ -236,9 +237,24 @@ def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.Mon
     assert "left" in start.findings.missed
 
 
-def test_chance_moves_with_what_is_seen_and_alone_needs_less() -> None:
-    assert ALONE < MANY < math.inf
-    low, high = (Chance((z,) * 3).least_z_score() for z in (4.0, 10.0))
-    assert low < Chance().least_z_score() < high + 2
+def test_chance_moves_with_what_is_seen_and_fewer_tries_need_less() -> None:
+    assert ALONE < MANY < AGAIN < math.inf
+    low, high = (Chance((z,) * 3).least_z_score(3) for z in (4.0, 10.0))
     assert high - low > 4  # three searches outweigh the prior
-    assert Chance((6.5,) * 3).least_z_score() < MANY  # more certain of the same
+    assert low < MANY < high
+    assert Chance((5.7 + 0.92 * 0.577,) * 3).least_z_score(3) < MANY  # more certain of the same
+
+
+def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None:
+    """Scenes, and the best z-scores on them, drawn from the distributions that are assumed."""
+    rng = np.random.default_rng(0)
+    tries, scenes, rate = 3, 400_000, acceptance.FALSE_ACCEPTANCE
+    locations = rng.normal(acceptance.PRIOR_LOCATION, acceptance.PRIOR_SIGMA, scenes)
+    best = rng.gumbel(locations + acceptance.SCALE * math.log(tries), acceptance.SCALE)
+    share = np.mean(best >= Chance().least_z_score(tries))
+    assert 0.5 * rate < share < 1.1 * rate
+    seen = rng.gumbel(locations[:, None], acceptance.SCALE, (scenes, 3))
+    zero, one, two = (Chance((z,) * 3).least_z_score(tries) for z in (0.0, 1.0, 2.0))
+    assert two - one == pytest.approx(one - zero)  # linear in the mean of what is seen
+    share = np.mean(best >= zero + (one - zero) * seen.mean(axis=1))
+    assert 0.7 * rate < share < 1.1 * rate
