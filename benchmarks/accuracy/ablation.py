@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,12 @@ from calibgraph.matching.structure import (
     global_search,
     matcher,
     pose_refinement,
+    pose_search,
     shift_scores,
     windows,
 )
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
+from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
@@ -174,17 +176,18 @@ ROUNDS: Mapping[str, Part] = {
 }
 
 
-def _no_proposals(*_: Any, **__: Any) -> Iterator[Any]:
-    return iter(())
+def _stay(_: Any, body: Any) -> Candidate:
+    """In place of an approach; all candidates have the same z-score."""
+    return Candidate(body, 0.0)
 
 
 def _sample_without_shifts(
-    coarse: CorrelationMaps, box: box_search.Box, rng: np.random.Generator
-) -> list[Any]:
-    """Samples of the box, best first, as they are."""
+    coarse: CorrelationMaps, _: Any, box: box_search.Box, rng: np.random.Generator
+) -> tuple[Any, Any]:
+    """Samples of the box and their z-scores, as they are; for bodies of one camera."""
     unit = qmc.Sobol(6, seed=rng).random(box_search.SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
-    return list(displacements[np.argsort(-coarse.z_scores(box.transforms(displacements)))])
+    return displacements, coarse.z_scores(box.transforms(displacements))
 
 
 def _plain_sums() -> AbstractContextManager[Any]:
@@ -198,11 +201,17 @@ def _plain_sums() -> AbstractContextManager[Any]:
 
 SEARCH: Mapping[str, Part] = {
     "all of it": nullcontext,
-    "cameras do not help each other": lambda: patch.object(global_search, "propose", _no_proposals),
-    "samples not shifted": lambda: patch.object(box_search, "_sample", _sample_without_shifts),
+    "cameras do not help each other": lambda: patch.object(
+        global_search.Locator, "_propose", lambda _: False
+    ),
+    "samples not shifted": lambda: patch.object(
+        box_search, "_sample_camera", _sample_without_shifts
+    ),
+    "one roll": lambda: patch.object(pose_search, "ROLLS_RAD", pose_search.ROLLS_RAD[:1]),
+    "no approach": lambda: patch.object(pose_search, "approach", _stay),
     "all groups' spread": _plain_sums,
     "one search per camera": lambda: patch.object(global_search, "SEARCHES", 1),
-    "refined once": lambda: patch.object(pose_refinement, "REPEATED", np.inf),
+    "refined once": lambda: patch.object(pose_refinement, "MAX_REFINEMENTS", 0),
     "no intensity": _without_column(1),
     "no inverse range": _without_column(0),
 }

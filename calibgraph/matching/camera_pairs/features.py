@@ -38,14 +38,15 @@ class Features:
         return Features(self.pixels_px[rows], self.rays[rows], self.descriptors[rows])
 
 
-def detect_features(gray: Gray, camera: Camera) -> Features:
+def detect_features(gray: Gray, camera: Camera, *, max_side_px: int = MAX_SIDE_PX) -> Features:
     """SIFT features of an image that lie on rays of the lens, one per place.
 
     Args:
         gray: (height, width).
         camera: its lens.
+        max_side_px: larger images are reduced to it.
     """
-    factor = min(1.0, MAX_SIDE_PX / max(gray.shape))
+    factor = min(1.0, max_side_px / max(gray.shape))
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     # Without the precise upscaling, keypoints are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)

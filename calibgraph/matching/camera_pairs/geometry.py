@@ -21,7 +21,7 @@ MAX_LOG10_FALSE_ALARMS = -3.0
 _THRESHOLD_PX = 1.0  # of MAGSAC, a scale that it need not know exactly
 _ITERATIONS = 5000
 _SAMPLE, _MODELS = 5, 10  # matches that determine an essential matrix, and at most how many of them
-_MAX_ANGLE_RAD = math.radians(60.0)  # off the mean ray: a plane magnifies the errors of wider rays
+MAX_ANGLE_RAD = math.radians(60.0)  # off the mean ray: a plane magnifies the errors of wider rays
 _FOCAL_PX = 1000.0
 
 
@@ -121,9 +121,9 @@ def _essential_matrix(
     """(3, 3) E of ``ray_b . E ray_a = 0``; None if there is none."""
     if len(rays_a) <= _SAMPLE:
         return None
-    turns = [_turn_to_axis(rays) for rays in (rays_a, rays_b)]
+    turns = [turn_to_axis(rays) for rays in (rays_a, rays_b)]
     turned = [rays @ turn.T for rays, turn in zip((rays_a, rays_b), turns, strict=True)]
-    narrow = np.all([rays[:, 2] > math.cos(_MAX_ANGLE_RAD) for rays in turned], axis=0)
+    narrow = np.all([rays[:, 2] > math.cos(MAX_ANGLE_RAD) for rays in turned], axis=0)
     if np.count_nonzero(narrow) <= _SAMPLE:
         return None
     a, b = (_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned)
@@ -145,7 +145,7 @@ def _essential_matrix(
     return np.asarray(turns[1].T @ found @ turns[0])
 
 
-def _turn_to_axis(rays: Array) -> Array:
+def turn_to_axis(rays: Array) -> Array:
     """(3, 3) the shortest rotation that takes the mean ray to the z axis."""
     mean = rays.mean(axis=0)
     x, y, z = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)

@@ -1,4 +1,4 @@
-"""Box search: the poses within a range of a guess at which a camera's correlation maps agree best.
+"""Box search: the poses within a range of a guess at which a body's correlation maps agree best.
 
 Samples of the box are shifted to where the view agrees best, and refined on blurred maps, then on
 sharper ones. Each stage keeps the best, without near duplicates.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
 from calibgraph.matching.structure.cross_entropy import maximize
-from calibgraph.model.geometry import relative_transform
+from calibgraph.model.geometry import invert, relative_transform
 
 Array = NDArray[np.float64]
 
 COARSE_BLUR_CELLS, COARSE_EVERY, FINE_BLUR_CELLS = 2.0, 2, 1.0
-SAMPLES = 2048  # of the box
+SAMPLES = 1024  # of the box
 SHIFT_DOWN_RAD = np.radians(6.0)  # a rotation down is nearly a shift of the maps within so much
-COARSE_STARTS, FINE_STARTS, CANDIDATES = 24, 16, 10  # how many go on from each stage
+COARSE_STARTS, FINE_STARTS, CANDIDATES = 24, 12, 8  # how many go on from each stage
 DUPLICATE = np.repeat([np.radians(3.0), 0.6], 3)  # nearer poses are duplicates
 COARSE_SIGMAS = np.repeat([np.radians(1.5), 0.3], 3)
 FINE_SIGMAS = np.repeat([np.radians(0.8), 0.15], 3)
@@ -58,53 +58,94 @@ class Box:
         T[:, :3, 3] = displacements[:, 3:]
         return np.asarray(T @ self.guess_T_camera_lidar)
 
-    def displacement(self, T_camera_lidar: Array) -> Array:
-        """(6,) the displacement of an extrinsic from the guess."""
+    def displacements(self, T_camera_lidar: Array) -> Array:
+        """(n, 6) the displacements of extrinsics (n, 4, 4) from the guess."""
         T = relative_transform(T_camera_lidar, self.guess_T_camera_lidar)
-        return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+        rotations = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+        return np.column_stack([rotations, T[:, :3, 3]])
 
     def excess(self, displacements: Array) -> Array:
         """(n,) distance outside of the box in half-widths, summed over the axes."""
         return np.asarray(np.maximum(np.abs(displacements) / self.half_widths - 1, 0).sum(axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class BodyMaps:
+    """The correlation maps of the cameras of a body, the lead's first.
+
+    Attributes:
+        maps: one per camera.
+        T_camera_lead: (4, 4) of each.
+    """
+
+    maps: Sequence[CorrelationMaps]
+    T_camera_lead: Sequence[Array]
+
+    def blur(self, sigma_cells: float, every: int = 1) -> BodyMaps:
+        """With maps blurred, of only every so many rows and columns."""
+        return replace(self, maps=[maps.blur(sigma_cells, every) for maps in self.maps])
+
+    def z_scores(self, T_lead_lidar: Array) -> Array:
+        """(n,) of all cameras together (Stouffer's), at (n, 4, 4) transforms."""
+        each = zip(self.maps, self.T_camera_lead, strict=True)
+        total = sum(maps.z_scores(T_camera_lead @ T_lead_lidar) for maps, T_camera_lead in each)
+        return np.asarray(total / np.sqrt(len(self.maps)))
+
+
 def search_box(
-    maps: CorrelationMaps, box: Box, cores: Executor, *, effort: int = 1, seed: int
+    maps: BodyMaps, box: Box, cores: Executor, *, effort: int = 1, seed: int
 ) -> list[Array]:
     """Find the best extrinsics in a box.
 
     Args:
-        maps: of one camera.
-        box: where to search.
+        maps: of a body.
+        box: where to search the lead.
         cores: works on several starts in parallel.
         effort: factor on the number of poses that go on from each stage.
         seed: of the search.
 
     Returns:
-        T_camera_lidar (4, 4), best first, without near duplicates.
+        T_lead_lidar (4, 4), best first, without near duplicates.
     """
-    coarse = maps.blur(COARSE_BLUR_CELLS, COARSE_EVERY)
     rng = np.random.default_rng(seed)
-    samples = _sample(coarse, box, rng)
-    starts = _suppress_duplicates(samples, effort * COARSE_STARTS)
+    coarse = maps.blur(COARSE_BLUR_CELLS, COARSE_EVERY)
+    starts = _suppress_duplicates(_sample(coarse, box, rng), effort * COARSE_STARTS)
     rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng, cores)[: effort * FINE_STARTS]
     fine = maps.blur(FINE_BLUR_CELLS)
-    refined = _refine(fine, box, rough, FINE_SIGMAS, rng, cores)
-    return list(box.transforms(np.array(_suppress_duplicates(refined, effort * CANDIDATES))))
+    refined = _refine(fine, box, [start for start, _ in rough], FINE_SIGMAS, rng, cores)
+    best_first = [displacement for displacement, _ in refined]
+    return list(box.transforms(np.array(_suppress_duplicates(best_first, effort * CANDIDATES))))
 
 
-def _sample(coarse: CorrelationMaps, box: Box, rng: np.random.Generator) -> list[Array]:
-    """Samples of the box, each shifted to the right and down to its best z-score; best first."""
+def _sample(maps: BodyMaps, box: Box, rng: np.random.Generator) -> list[Array]:
+    """Samples of the box at which the views of one of the cameras agree best; best first."""
+    samples = [
+        _sample_camera(of_camera, T_camera_lead, box, rng)
+        for of_camera, T_camera_lead in zip(maps.maps, maps.T_camera_lead, strict=True)
+    ]
+    displacements, values = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    return list(displacements[np.argsort(-values)])
+
+
+def _sample_camera(
+    coarse: CorrelationMaps, T_camera_lead: Array, box: Box, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """(n, 6) displacements of the lead and (n,) values of samples of a camera's box.
+
+    Each is shifted to the right and down to its best z-score.
+    """
     from scipy.stats import qmc  # takes half a second, which solve() does not need
 
+    own = replace(box, guess_T_camera_lidar=T_camera_lead @ box.guess_T_camera_lidar)
     unit = qmc.Sobol(6, seed=rng).random(SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
     displacements[:, 1] = 0.0  # the rotation to the right, of which all values are tried
     down = min(SHIFT_DOWN_RAD, box.rotation_rad)
-    transforms = box.transforms(displacements)
+    transforms = own.transforms(displacements)
     z_scores, shifts = coarse.find_best_shifts(transforms, (box.rotation_rad, down))
-    shifted = _shift_view(displacements, shifts)
-    return list(shifted[np.argsort(PENALTY * box.excess(shifted) - z_scores)])
+    shifted = own.transforms(_shift_view(displacements, shifts))
+    of_lead = box.displacements(invert(T_camera_lead) @ shifted)
+    return of_lead, z_scores - PENALTY * box.excess(of_lead)
 
 
 def _shift_view(displacements: Array, shifts: Array) -> Array:
@@ -126,14 +167,14 @@ def _suppress_duplicates(displacements: Sequence[Array], most: int) -> list[Arra
 
 
 def _refine(
-    maps: CorrelationMaps,
+    maps: BodyMaps,
     box: Box,
     starts: Sequence[Array],
     sigmas: Array,
     rng: np.random.Generator,
     cores: Executor,
-) -> list[Array]:
-    """The displacements of the best z-score near each start; best first."""
+) -> list[tuple[Array, float]]:
+    """The displacement of the best z-score near each start, and that; best first."""
 
     def penalised(displacements: Array) -> Array:
         z_scores = maps.z_scores(box.transforms(displacements))
@@ -151,4 +192,4 @@ def _refine(
         )
 
     maxima = cores.map(maximize_from, starts, rng.spawn(len(starts)))
-    return [displacement for displacement, _ in sorted(maxima, key=lambda pair: -pair[1])]
+    return sorted(maxima, key=lambda pair: -pair[1])

@@ -1,57 +1,55 @@
 """Global search: where the rounds begin, at the guess if it is near enough, else where it finds.
 
-A pose is accepted when image and cloud agree at it far better than by chance; the more poses were
-tried, the better they must agree. Each camera is tried at the guess first, then wherever the
-cameras located so far propose it, then all over the range. A camera that has been located proposes
-poses for the others at once. If no pose of a camera is accepted, it has not been found: the best of
-the rejected poses is never taken.
+A pose is accepted when images and clouds agree at it far better than by chance; the more poses were
+tried, the better they must agree. Cameras whose relative pose is known are searched as one body.
+Each body is tried at the guesses of its cameras, and the most promising one is searched for all
+over the range, until one is accepted. From then on the located cameras propose poses for the
+others, by what both see in common and by the relative poses of the guess; also for those that have
+been accepted, if they are elsewhere: where images and clouds agree better, all in all, is taken. If
+no pose of a camera is accepted, it has not been found: the best of the rejected poses is never
+taken.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calibgraph.matching.structure.box_search import Box, search_box
-from calibgraph.matching.structure.correlation_maps import correlate
-from calibgraph.matching.structure.pose_refinement import (
-    ACCEPTED,
-    CameraFrames,
-    Candidate,
-    refine,
-    select_candidate,
-)
-from calibgraph.matching.structure.proposals import propose
-from calibgraph.model.rig import Rig
+from calibgraph.matching.structure.acceptance import Chance
+from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
+from calibgraph.matching.structure.box_search import CANDIDATES
+from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
+from calibgraph.matching.structure.pose_search import ROLLS_RAD, PoseSearch, SearchRange
+from calibgraph.model.geometry import pose_difference
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
 
-Array = NDArray[np.float64]
-
-SEARCH_WINDOWS = 2100  # of the first search, per camera over all frames
-SEARCHES = 2  # per camera
-RETRY_EFFORT = 3
+SEARCHES = 2  # per body
+RETRY_EFFORT = 2
 """Factor on the candidates, and as far as memory allows on the windows, of a second search."""
+TRIES = {1: len(ROLLS_RAD), 2: (1 + RETRY_EFFORT) * len(ROLLS_RAD)}
+"""How much has been searched after so many searches, in searches for one roll."""
+ALONE = 1 / CANDIDATES  # the same of a single pose
 
-MAX_PARALLEL = 4  # cameras searched at once; then those that were located propose for the others
+SAME_DEG, SAME_CM = 1.0, 30.0
+"""Poses nearer than this are the same: what refinements leave, the rounds correct."""
 
 
 @dataclass(frozen=True, eq=False)
-class SearchRange:
-    """How far from the guess to search, per axis."""
+class Located:
+    """The result of the search for one camera.
 
-    rotation_rad: float
-    translation_m: float
+    Attributes:
+        camera: at its best pose.
+        z_score: agreement of image and cloud there, in standard deviations of chance agreement; of
+            the whole body.
+        accepted: whether that is far better than by chance.
+    """
 
-    @property
-    def rotation_deg(self) -> float:
-        """The rotation in degrees."""
-        return float(np.degrees(self.rotation_rad))
+    camera: Camera
+    z_score: float
+    accepted: bool
 
 
 def locate_cameras(
@@ -63,7 +61,7 @@ def locate_cameras(
     out_of_time: Callable[[], bool],
     pool: Executor,
     progress: Progress,
-) -> dict[str, Candidate]:
+) -> dict[str, Located]:
     """Locate all cameras of a rig.
 
     Args:
@@ -76,147 +74,178 @@ def locate_cameras(
         progress: called as the work goes on.
 
     Returns:
-        The best candidate per camera, accepted if the camera has been located.
+        The best pose per camera, accepted if the camera has been located.
     """
-    total = SEARCHES * len(rig.cameras)
-    progress("trying the guess", 0, total)
-    refined = pool.map(lambda name: refine(frames[name], rig.cameras[name]), rig.cameras)
-    state = _SearchState(dict(zip(rig.cameras, refined, strict=True)))
-    search = _CameraSearch(rig, frames, search_range, seed, out_of_time)
-    while True:
-        best, new = state.select()
-        missing = state.missing(best) if new else state.next_to_search(best)
-        if not missing or out_of_time():
-            return best
-        if new:
-            work = partial(search.try_proposals, state.count_proposers(new))
-        else:
-            progress(state.describe(missing), sum(state.searches.values()), total)
-            work = partial(search.search_range, state.count_searches(missing))
-        state.add(missing, pool.map(work, missing))
+    search = PoseSearch(rig, frames, search_range, seed, out_of_time)
+    return Locator(search, pool, progress).locate()
 
 
-class _SearchState:
-    """What has been tried for each camera, and the best candidates so far.
+class Locator:
+    """What has been tried for each body of a rig, and decides what is tried next.
 
     Attributes:
-        near: the candidates refined from the guess.
-        far: the best candidates of proposals and searches.
-        proposers: the located cameras that have proposed poses for the others.
-        searches: number of searches per camera.
+        best: the candidate of the highest z-score of each body, by its lead's name.
+        located: those that are accepted.
     """
 
-    def __init__(self, near: Mapping[str, Candidate]) -> None:
-        self.near = near
-        self.far: dict[str, Candidate] = {}
-        self.proposers: set[str] = set()
-        self.searches = dict.fromkeys(near, 0)
+    def __init__(self, search: PoseSearch, pool: Executor, progress: Progress) -> None:
+        self._search, self._pool, self._progress = search, pool, progress
+        self._bodies = {next(iter(body)): body for body in rigid_bodies(search.rig)}
+        self._searches = dict.fromkeys(self._bodies, 0)
+        self._proposers: list[Candidate] = []  # that have proposed
+        self._near: dict[str, Candidate] = {}
+        self.best: dict[str, Candidate] = {}
+        self.located: dict[str, Candidate] = {}
 
-    def select(self) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
-        """The best candidate per camera, and the accepted ones that have not proposed yet.
-
-        Candidates that are accepted only because a search found no better one come last.
-        """
-        for after_search in (False, True):
-            best = {
-                name: select_candidate(
-                    near, self.far.get(name), after_search=after_search and self.searches[name] > 0
-                )
-                for name, near in self.near.items()
-            }
-            accepted = {name: candidate for name, candidate in best.items() if candidate.accepted}
-            new = {name: c for name, c in accepted.items() if name not in self.proposers}
-            if new:
-                break
-        return best, new
-
-    def missing(self, best: Mapping[str, Candidate]) -> list[str]:
-        """The cameras that have not been located."""
-        return [name for name in self.near if not best[name].accepted]
-
-    def next_to_search(self, best: Mapping[str, Candidate]) -> list[str]:
-        """The missing cameras to search now: those with the fewest searches."""
-        left = [name for name in self.missing(best) if self.searches[name] < SEARCHES]
-        return sorted(left, key=self.searches.__getitem__)[:MAX_PARALLEL]
-
-    def describe(self, missing: Sequence[str]) -> str:
-        """What is searched now, and how little the searches before have found."""
-        words = []
-        for name in missing:
-            z_score = self.far[name].z_score if name in self.far else -math.inf
-            before = f" (best z-score {z_score:.1f}, {ACCEPTED:g} needed)" if z_score > 0 else ""
-            words.append(name + before)
-        return f"searching: {', '.join(words)}"
-
-    def count_proposers(self, new: dict[str, Candidate]) -> dict[str, Candidate]:
-        """Count these cameras among those that have proposed, and return them."""
-        self.proposers |= new.keys()
-        return new
-
-    def count_searches(self, names: Iterable[str]) -> dict[str, int]:
-        """Count a search of each of these cameras, and return the number of searches per camera."""
-        self.searches |= {name: self.searches[name] + 1 for name in names}
-        return dict(self.searches)
-
-    def add(self, names: Iterable[str], candidates: Iterable[Candidate]) -> None:
-        """Keep each candidate that is the best of its camera away from the guess."""
-        for name, candidate in zip(names, candidates, strict=True):
-            before = self.far.get(name, candidate)
-            self.far[name] = max(candidate, before, key=lambda each: each.z_score)
-
-
-@dataclass(frozen=True, eq=False)
-class _CameraSearch:
-    """Tries poses of one camera of a rig at a time, see :func:`locate_cameras`."""
-
-    rig: Rig
-    frames: Mapping[str, CameraFrames]
-    range: SearchRange
-    seed: int
-    out_of_time: Callable[[], bool]
-
-    def search_range(self, searches: Mapping[str, int], name: str) -> Candidate:
-        """Search all of the range for a camera, with more effort if it is not the first time."""
-        camera, frames = self.rig.cameras[name], self.frames[name]
-        effort = 1 if searches[name] == 1 else RETRY_EFFORT
-        seed = self.seed + 1000 * (searches[name] - 1)
-        maps = correlate(
-            frames.grays,
-            frames.clouds,
-            camera,
-            frames.cores,
-            range_rad=self.range.rotation_rad,
-            max_windows=effort * SEARCH_WINDOWS // len(frames.grays),
-            seed=seed,
+    def locate(self) -> dict[str, Located]:
+        """Locate all bodies, as far as time allows."""
+        self._report("trying the guess")
+        for name, body in self._bodies.items():
+            guesses = _distinct(place_member(body, n, self._search.guess[n]) for n in body)
+            tried = list(self._pool.map(self._search.near, guesses))
+            best = max(range(len(tried)), key=lambda k: tried[k].z_score)
+            self._bodies[name], self._near[name] = guesses[best], tried[best]
+            self._consider(name, tried[best], TRIES[1])
+        steps = (
+            self._propose,
+            self._search_next,
+            self._accept_guess,
+            self._search_again,
+            self._accept_by_chance,
         )
-        if not len(maps.maps):
-            return Candidate(camera, -math.inf, False)
-        transforms = search_box(maps, self._box(name), frames.cores, effort=effort, seed=seed)
-        return self.first_accepted(name, ([T_camera_lidar] for T_camera_lidar in transforms))
+        while not self._search.out_of_time() and any(step() for step in steps):
+            pass
+        return self._result()
 
-    def try_proposals(self, located: Mapping[str, Candidate], name: str) -> Candidate:
-        """Try a camera at the poses that follow from those of located cameras."""
-        known = {other: c.camera.T_camera_lidar for other, c in located.items()}
-        groups = propose(name, self.rig, known, self.frames, self._box(name), seed=self.seed)
-        return self.first_accepted(name, groups)
+    def _consider(self, name: str, candidate: Candidate, tries: float) -> bool:
+        """Keep a candidate if it is the best of its body, and locate the body if it is accepted."""
+        if name not in self.best or candidate.z_score > self.best[name].z_score:
+            self.best[name] = candidate
+        if not self._search.accepts(self._bodies[name], candidate.z_score, tries):
+            return False
+        self.located[name] = candidate
+        return True
 
-    def first_accepted(self, name: str, groups: Iterable[Iterable[Array]]) -> Candidate:
-        """The best candidate of the first group of T_camera_lidar that has an accepted one.
-
-        If none has, the best of all.
-        """
-        camera = self.rig.cameras[name]
-        best = Candidate(camera, -math.inf, False)
-        for group in groups:
-            for T_camera_lidar in group:
-                refined = refine(self.frames[name], camera.moved_to(T_camera_lidar))
-                best = max(best, refined, key=lambda candidate: candidate.z_score)
-                if self.out_of_time():
-                    return best
-            if best.accepted:
+    def _propose(self) -> bool:
+        """Let the best located body that has not proposed yet propose poses for all others."""
+        new = [c for c in self.located.values() if c not in self._proposers]
+        if not new or len(self._bodies) == 1:
+            return False
+        proposer = max(new, key=lambda candidate: candidate.z_score)
+        self._proposers.append(proposer)
+        self._report("trying what located cameras see")
+        others = [name for name in self._bodies if name != next(iter(proposer.body))]
+        for name in others:
+            if self._search.out_of_time() or proposer not in self.located.values():
                 break
-        return best
+            if name in self.located:
+                self._compare(proposer, self.located[name])
+            else:
+                self._place_next_to(proposer, name)
+        return True
 
-    def _box(self, name: str) -> Box:
-        guess = self.rig.cameras[name].T_camera_lidar
-        return Box(guess, self.range.rotation_rad, self.range.translation_m)
+    def _place_next_to(self, proposer: Candidate, name: str) -> None:
+        """Try an unlocated body where a located one sees it, else where the guess has it."""
+        proposed = self._search.seen_by(proposer.body, self._bodies[name])
+        if proposed is not None and self._consider(name, self._search.at(proposed), ALONE):
+            return
+        guessed = self._search.as_in_guess(proposer.body, self._bodies[name])
+        self._consider(name, self._search.from_afar(guessed), ALONE)
+
+    def _compare(self, one: Candidate, two: Candidate) -> None:
+        """Where two located bodies see each other elsewhere, keep what agrees better all in all."""
+        seen_two = self._search.seen_by(one.body, two.body)
+        if seen_two is None or _is_same_pose(seen_two, two.body):
+            return
+        moved_two = self._search.at(seen_two)
+        seen_one = self._search.seen_by(two.body, one.body)
+        moved_one = None if seen_one is None else self._search.at(seen_one)
+        if moved_one and moved_one.z_score + two.z_score > one.z_score + moved_two.z_score:
+            self._replace(one, moved_one)
+        else:
+            self._replace(two, moved_two)
+
+    def _replace(self, old: Candidate, new: Candidate) -> None:
+        """Move a body; if it is not accepted there, against one that is, it is not located."""
+        name = next(iter(old.body))
+        del self.located[name], self.best[name]
+        self._searches[name] = SEARCHES
+        self._consider(name, new, ALONE)
+
+    def _search_next(self) -> bool:
+        """Search for the most promising body that has not been searched for."""
+        missing = [n for n in self._bodies if n not in self.located and not self._searches[n]]
+        if not missing:
+            return False
+        self._search_for(max(missing, key=lambda name: self.best[name].z_score), effort=1)
+        return True
+
+    def _accept_guess(self) -> bool:
+        """Accept a body near its guess, if a search found nothing better anywhere.
+
+        It is unlikely that of all poses that were tried the guess is the best one by chance.
+        """
+        for name in self._missing():
+            near = self._near[name]
+            if not _is_same_pose(near.body, self.best[name].body):
+                continue
+            if self._consider(name, near, ALONE):
+                return True
+        return False
+
+    def _search_again(self) -> bool:
+        """Search again, with more effort, for a body that was not found."""
+        again = [name for name in self._missing() if self._searches[name] < SEARCHES]
+        if not again:
+            return False
+        self._search_for(again[0], effort=RETRY_EFFORT)
+        return True
+
+    def _accept_by_chance(self) -> bool:
+        """Accept the best pose of a body by what chance brings about on this scene."""
+        for name in self._missing():
+            body, best = self._bodies[name], self.best[name]
+            if self._search.measure_chance(body, best.z_score):
+                near = _is_same_pose(self._near[name].body, best.body)
+                if self._consider(name, best, ALONE if near else TRIES[self._searches[name]]):
+                    return True
+        return False
+
+    def _missing(self) -> list[str]:
+        return [name for name in self._bodies if name not in self.located]
+
+    def _search_for(self, name: str, effort: int) -> None:
+        tries = TRIES[self._searches[name] + 1]
+        z_score, least = self.best[name].z_score, Chance().least_z_score(tries)
+        before = f" (best z-score {z_score:.1f}, {least:.1f} needed)" if z_score > 0 else ""
+        self._report(f"searching: {name}{before}")
+        self._searches[name] += 1
+        found = self._search.everywhere(self._bodies[name], effort, tries)
+        self._consider(name, found, tries)
+
+    def _report(self, what: str) -> None:
+        total = SEARCHES * len(self._bodies)
+        done = sum(SEARCHES if n in self.located else k for n, k in self._searches.items())
+        self._progress(what, min(done, total), total)
+
+    def _result(self) -> dict[str, Located]:
+        found = {name: self.located.get(name, self.best[name]) for name in self._bodies}
+        return {
+            member: Located(camera, found[name].z_score, name in self.located)
+            for name in self._bodies
+            for member, camera in found[name].body.items()
+        }
+
+
+def _distinct(bodies: Iterable[Body]) -> list[Body]:
+    """Without those that are at the pose of an earlier one."""
+    kept: list[Body] = []
+    for body in bodies:
+        if not any(_is_same_pose(body, other) for other in kept):
+            kept.append(body)
+    return kept
+
+
+def _is_same_pose(one: Body, two: Body) -> bool:
+    degrees, centimetres = pose_difference(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
+    return degrees < SAME_DEG and centimetres < SAME_CM

@@ -15,9 +15,10 @@ from calibgraph.io.dataset import Dataset, Frame, spread_out
 from calibgraph.matching.protocol import Stage1Source, Start
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.frame_cache import FrameCache
-from calibgraph.matching.structure.global_search import SearchRange, locate_cameras
+from calibgraph.matching.structure.global_search import Located, locate_cameras
 from calibgraph.matching.structure.peaks import extract_correspondences
-from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
+from calibgraph.matching.structure.pose_refinement import CameraFrames
+from calibgraph.matching.structure.pose_search import SearchRange
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -154,7 +155,7 @@ class StructureMatcher:
             for name, camera in rig.cameras.items()
         }
 
-    def _first_round(self, candidates: Mapping[str, Candidate]) -> int:
+    def _first_round(self, candidates: Mapping[str, Located]) -> int:
         confident = all(c.accepted and c.z_score >= _CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
@@ -205,7 +206,7 @@ class StructureMatcher:
 
 
 def _search_findings(
-    candidates: Mapping[str, Candidate], search_range: SearchRange
+    candidates: Mapping[str, Located], search_range: SearchRange
 ) -> MatcherFindings:
     return MatcherFindings(
         found={n: c.z_score for n, c in candidates.items() if c.accepted},

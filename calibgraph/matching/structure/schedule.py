@@ -64,6 +64,10 @@ def _level(
     )
 
 
+WIDE = _level(0.5, 10.0, 7.0, 1.2, 0.6, fine=False)
+"""From errors of about 4 degrees and 0.8 m, where a search ends, to 1 degree and 0.3 m."""
+
+
 def _last(level: Level) -> Level:
     """The level with more windows, in smaller groups, and a higher quality demanded of them."""
     return replace(level, group_rad=np.radians(2.0), max_windows=30_000, min_quality=0.1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -122,6 +122,18 @@ def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     columns = ("grids", "jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
     return ShiftScores(**stacked, steps_per_px=scores[0].steps_per_px)
+
+
+def pad_grids(scores: Sequence[ShiftScores]) -> list[ShiftScores]:
+    """The same scores with all grids as large as the largest: shifts beyond count 0."""
+    size = max(one.grids.shape[1] for one in scores)
+    margins = [(size - one.grids.shape[1]) // 2 for one in scores]
+    return [
+        replace(one, grids=np.pad(one.grids, ((0, 0), (margin,) * 2, (margin,) * 2)))
+        if margin
+        else one
+        for one, margin in zip(scores, margins, strict=True)
+    ]
 
 
 def downscale_log_gray(

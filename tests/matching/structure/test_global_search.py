@@ -1,159 +1,260 @@
-"""The global search: its decisions with fake refinements; on the sample see test_matcher.py."""
+"""The global search: its decisions with made-up poses; on the sample see test_matcher.py."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Camera, Rig, StructureMatcher
-from calibgraph.matching.structure import global_search, proposals
-from calibgraph.matching.structure.global_search import SearchRange, locate_cameras
-from calibgraph.matching.structure.pose_refinement import ACCEPTED, CameraFrames, Candidate
+from calibgraph import RelativePose, Rig, StructureMatcher
+from calibgraph.matching.structure import acceptance, global_search, pose_search
+from calibgraph.matching.structure.acceptance import Chance
+from calibgraph.matching.structure.bodies import Body, lead, place
+from calibgraph.matching.structure.global_search import TRIES, Located, Locator
+from calibgraph.matching.structure.pose_refinement import Candidate
+from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.progress import no_progress
 from tests.conftest import SAMPLE
 from tests.matching.structure.data import never
 
 NAMES = ("front_left", "front_right")
+BOTH = (NAMES, NAMES[::-1])
+MANY, AGAIN = (Chance().least_z_score(TRIES[searches]) for searches in (1, 2))
+ALONE = Chance().least_z_score(global_search.ALONE)
 
 
-def a_metre_off(T_camera_lidar: np.ndarray) -> np.ndarray:
+def off(T_camera_lidar: np.ndarray, metres: float = 1.0) -> np.ndarray:
     T = T_camera_lidar.copy()
-    T[0, 3] += 1.0
+    T[0, 3] += metres
     return T
 
 
-def key(T_camera_lidar: np.ndarray) -> tuple[float, ...]:
-    """The translation [mm], as a key."""
-    return tuple((1000 * T_camera_lidar[:3, 3]).round().tolist())
+class MadeUp(PoseSearch):
+    """Poses that stay where they are, with given z-scores (else 1).
 
-
-def fake_search(
-    monkeypatch: pytest.MonkeyPatch,
-    z_scores: dict[tuple[float, ...], float],
-    searched: dict[str, np.ndarray],
-) -> list[str]:
-    """Refinements that stay where they are, with given z-scores (else 1), and given search results.
-
-    Returns the names of the cameras in the order in which they are searched.
+    Args:
+        rig: the guess.
+        z_scores: T_camera_lidar of a lead, and its z-score.
+        searched: what the searches for a camera find, in turn; the last one again and again.
+        sees: per (other camera, camera): where the other, at its first pose, sees the camera.
+        chance: best z-score where nothing can be found.
     """
-    searches: list[str] = []
 
-    def refine(frames: CameraFrames, camera: Camera) -> Candidate:
-        z_score = z_scores.get(key(camera.T_camera_lidar), 1.0)
-        return Candidate(camera, z_score, z_score >= ACCEPTED)
+    def __init__(
+        self,
+        rig: Rig,
+        z_scores: Iterable[tuple[np.ndarray, float]],
+        searched: Mapping[str, list[np.ndarray]] | None = None,
+        sees: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]] | None = None,
+        chance: float = 5.0,
+    ) -> None:
+        super().__init__(rig, {}, SearchRange(0.3, 1.5), 0, never)
+        self.z_scores, self.found, self.sees = list(z_scores), dict(searched or {}), sees or {}
+        self.chance = chance
+        self.searches: list[str] = []
+        self.turned: list[str] = []
 
-    def search_range(
-        search: global_search._CameraSearch, counts: dict[str, int], name: str
-    ) -> Candidate:
-        searches.append(name)
-        return search.first_accepted(name, [[searched[name]]])
+    def at(self, body: Body) -> Candidate:
+        T = lead(body).T_camera_lidar
+        values = [value for where, value in self.z_scores if np.allclose(where, T, atol=1e-9)]
+        return Candidate(body, values[0] if values else 1.0)
 
-    monkeypatch.setattr(global_search, "refine", refine)
-    monkeypatch.setattr(global_search._CameraSearch, "search_range", search_range)
-    return searches
+    near = from_afar = at
+
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
+        name = next(iter(body))
+        self.searches.append(name)
+        found = self.found.get(name, [off(lead(body).T_camera_lidar, 1.4)])
+        return self.at(place(body, found.pop(0) if len(found) > 1 else found[0]))
+
+    def seen_by(self, other: Body, body: Body) -> Body | None:
+        by, name = next(iter(other)), next(iter(body))
+        if (by, name) not in self.sees:
+            return None
+        of_other, of_this = self.sees[by, name]
+        relative = of_this @ np.linalg.inv(of_other)
+        return place(body, relative @ lead(other).T_camera_lidar)
+
+    def _search_turned(self, body: Body, angle_rad: float) -> float:
+        self.turned.append(next(iter(body)))
+        return self.chance
 
 
-def locate_without_images(rig: Rig) -> dict[str, Candidate]:
+def locate(search: PoseSearch) -> dict[str, Located]:
     with ThreadPoolExecutor(1) as pool:
-        frames = {name: CameraFrames([], [], pool) for name in rig.cameras}
-        return locate_cameras(
-            rig,
-            frames,
-            SearchRange(0.3, 1.5),
-            seed=0,
-            out_of_time=never,
-            pool=pool,
-            progress=no_progress,
-        )
+        return Locator(search, pool, no_progress).locate()
 
 
-def test_the_best_of_the_lengths_that_overlap_leaves_open_is_taken(
-    truth: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Transforms that are right but for the length of their translation may be accepted too."""
-    rig = Rig(cameras={name: truth.cameras[name] for name in NAMES})
-    right = rig.T_camera_lidar[NAMES[1]] @ np.linalg.inv(rig.T_camera_lidar[NAMES[0]])
-    right[:3, 3] *= 1.25 / np.linalg.norm(right[:3, 3])
-    goal = right @ rig.T_camera_lidar[NAMES[0]]
-    direction = right.copy()
-    direction[:3, 3] /= 1.25
+@pytest.fixture
+def one(truth: Rig) -> Rig:
+    return Rig(cameras={"left": truth.cameras["left"]})
 
-    def refine(frames: CameraFrames, camera: Camera) -> Candidate:
-        if np.array_equal(camera.T_camera_lidar, rig.T_camera_lidar[NAMES[0]]):
-            return Candidate(camera, 50.0, True)
-        if np.array_equal(camera.T_camera_lidar, rig.T_camera_lidar[NAMES[1]]):
-            return Candidate(camera, 5.0, False)
-        off = np.linalg.norm((camera.T_camera_lidar - goal)[:3, 3])
-        z_score = 80.0 if off < 0.1 else 18.0 if 0.4 < off < 0.9 else 5.0
-        return Candidate(camera, z_score, z_score >= ACCEPTED)
 
-    monkeypatch.setattr(global_search, "refine", refine)
-    monkeypatch.setattr(proposals, "relative_pose_up_to_scale", lambda *_, **__: direction)
-    found = locate_without_images(rig)[NAMES[1]]
-    assert found.z_score == 80.0
-    np.testing.assert_allclose(found.camera.T_camera_lidar, goal, atol=1e-9)
+@pytest.fixture
+def two(truth: Rig) -> Rig:
+    return Rig(cameras={name: truth.cameras[name] for name in NAMES})
 
 
 @pytest.mark.parametrize(
-    ("near", "elsewhere", "taken"),
+    ("near", "elsewhere", "taken", "searches"),
     [
-        (12.3, 19.0, "elsewhere"),
-        (14.9, 17.2, "near"),
-        (11.5, 9.0, "near"),
-        (11.5, 12.0, "none"),
-        (8.4, 6.3, "near"),
-        (7.0, 5.0, "none"),
+        (MANY + 0.1, 0.0, "near", 0),
+        (ALONE + 0.1, MANY + 0.1, "elsewhere", 1),
+        (ALONE + 0.1, ALONE - 1, "near", 1),
+        (ALONE + 0.1, ALONE + 1, "none", 2),
+        (ALONE - 0.1, ALONE - 1, "none", 2),
     ],
 )
-def test_a_low_z_score_near_the_guess_is_accepted_after_a_search_without_rival(
-    truth: Rig, monkeypatch: pytest.MonkeyPatch, near: float, elsewhere: float, taken: str
+def test_a_lower_z_score_is_accepted_at_the_guess_if_a_search_found_no_better(
+    one: Rig, near: float, elsewhere: float, taken: str, searches: int
 ) -> None:
-    rig = Rig(cameras={"left": truth.cameras["left"]})
-    guess = rig.T_camera_lidar["left"]
-    other = a_metre_off(guess)
-    z_scores = {key(guess): near, key(other): elsewhere}
-    searches = fake_search(monkeypatch, z_scores, {"left": other})
-    found = locate_without_images(rig)["left"]
-    assert searches[0] == "left"
+    guess = one.T_camera_lidar["left"]
+    search = MadeUp(
+        one, [(guess, near), (off(guess), elsewhere)], {"left": [off(guess)]}, chance=12
+    )
+    found = locate(search)["left"]
+    assert len(search.searches) == searches
     assert found.accepted == (taken != "none")
     if found.accepted:
-        T = guess if taken == "near" else other
+        T = guess if taken == "near" else off(guess)
         np.testing.assert_allclose(found.camera.T_camera_lidar, T, atol=1e-9)
 
 
-def test_proposals_of_other_cameras_come_before_a_poor_guess(
-    truth: Rig, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("chance", "accepted"), [(4.0, True), (9.0, False)])
+def test_what_chance_brings_about_on_the_scene_decides_last(
+    one: Rig, chance: float, accepted: bool
 ) -> None:
-    """One camera's guess is refined to a low z-score, its search finds less; the other is found."""
-    rig = Rig(cameras={name: truth.cameras[name] for name in NAMES})
-    first, second = (rig.T_camera_lidar[name] for name in NAMES)
-    found_first, nowhere = a_metre_off(first), a_metre_off(a_metre_off(second))
-    proposed = second @ np.linalg.inv(first) @ found_first
-    z_scores = {key(second): 8.4, key(found_first): 19.0, key(proposed): 22.0}
-    fake_search(monkeypatch, z_scores, {NAMES[0]: found_first, NAMES[1]: nowhere})
-    monkeypatch.setattr(proposals, "relative_pose_up_to_scale", lambda *_, **__: None)
-    found = locate_without_images(rig)
-    assert found[NAMES[0]].z_score == 19.0
-    assert found[NAMES[1]].accepted
-    np.testing.assert_allclose(found[NAMES[1]].camera.T_camera_lidar, proposed, atol=1e-9)
+    guess = one.T_camera_lidar["left"]
+    search = MadeUp(one, [(off(guess), 13.0)], {"left": [off(guess)]}, chance=chance)
+    assert locate(search)["left"].accepted == accepted
+    assert search.searches == ["left", "left"]  # before chance is measured
+    assert len(search.turned) == 3
 
 
-def test_no_pose_is_tried_after_the_time_limit(truth: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    tried: list[Camera] = []
+def test_a_hopeless_z_score_is_rejected_without_measuring_chance(one: Rig) -> None:
+    search = MadeUp(one, [])
+    assert not locate(search)["left"].accepted
+    assert search.turned == []
 
-    def refine(frames: CameraFrames, camera: Camera) -> Candidate:
-        tried.append(camera)
-        return Candidate(camera, 0.0, False)
 
-    monkeypatch.setattr(global_search, "refine", refine)
-    monkeypatch.setattr(global_search, "search_box", lambda *_, **__: [np.eye(4)] * 50)
-    rig = Rig(cameras={"left": truth.cameras["left"]})
-    data = calibgraph.load_dataset(SAMPLE, rig).select("0")
+def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) -> None:
+    """The camera that is more promising at its guess is searched first."""
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    right = off(first), off(second, -1.2)
+    search = MadeUp(
+        two,
+        [(second, 7.0), (right[1], 30.0), (right[0], ALONE + 1)],
+        {NAMES[1]: [right[1]]},
+        {(NAMES[1], NAMES[0]): (right[1], right[0])},
+    )
+    found = locate(search)
+    assert search.searches == [NAMES[1]]
+    for name, T in zip(NAMES, right, strict=True):
+        assert found[name].accepted
+        np.testing.assert_allclose(found[name].camera.T_camera_lidar, T, atol=1e-9)
+
+
+def test_without_common_features_the_relative_pose_of_the_guess_is_tried(two: Rig) -> None:
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    proposed = second @ np.linalg.inv(first) @ off(first)
+    search = MadeUp(
+        two, [(first, 7.0), (off(first), 30.0), (proposed, ALONE + 1)], {NAMES[0]: [off(first)]}
+    )
+    found = locate(search)[NAMES[1]]
+    assert found.accepted and search.searches == [NAMES[0]]
+    np.testing.assert_allclose(found.camera.T_camera_lidar, proposed, atol=1e-9)
+
+
+def test_an_accepted_camera_moves_to_where_a_better_founded_one_sees_it(two: Rig) -> None:
+    """Also if it agrees slightly better where it is: their sums decide."""
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    wrong = off(second, 0.8)
+    sees = {pair: (two.T_camera_lidar[pair[0]], two.T_camera_lidar[pair[1]]) for pair in BOTH}
+    for at_right in (30.0, MANY + 1):
+        search = MadeUp(
+            two,
+            [(first, 34.0), (wrong, MANY + 2), (second, at_right), (off(first, 0.8), 9.0)],
+            sees=sees,
+        )
+        search.guess = {NAMES[0]: first, NAMES[1]: wrong}
+        found = locate(search)
+        assert all(each.accepted for each in found.values())
+        np.testing.assert_allclose(found[NAMES[0]].camera.T_camera_lidar, first, atol=1e-9)
+        np.testing.assert_allclose(found[NAMES[1]].camera.T_camera_lidar, second, atol=1e-9)
+
+
+def test_a_camera_that_agrees_with_nothing_where_it_is_seen_is_not_located(two: Rig) -> None:
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    wrong = off(second, 0.8)
+    search = MadeUp(
+        two,
+        [(first, 34.0), (wrong, MANY + 2), (second, ALONE - 1)],
+        sees={NAMES: (first, second)},
+        chance=12,
+    )
+    search.guess = {NAMES[0]: first, NAMES[1]: wrong}
+    found = locate(search)
+    assert found[NAMES[0]].accepted and not found[NAMES[1]].accepted
+
+
+def test_a_body_is_tried_at_the_guesses_of_all_its_cameras(two: Rig) -> None:
+    """The lead's guess is far off, the other camera's is right, and the relative pose is known."""
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    pair = RelativePose(
+        a=NAMES[0],
+        b=NAMES[1],
+        T_a_b=first @ np.linalg.inv(second),
+        rotation_sigma_rad=0.001,
+        translation_sigma_m=0.002,
+    )
+    rig = Rig(cameras=two.moved_to({NAMES[0]: off(first, 9.0)}).cameras, relative_poses=(pair,))
+    found = locate(MadeUp(rig, [(first, 30.0)]))
+    for name, T in zip(NAMES, (first, second), strict=True):
+        assert found[name].accepted
+        np.testing.assert_allclose(found[name].camera.T_camera_lidar, T, atol=1e-9)
+
+
+def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Body] = []
+
+    def improve(_: Any, body: Body) -> Candidate:
+        tried.append(body)
+        return Candidate(body, 0.0)
+
+    monkeypatch.setattr(pose_search, "approach", improve)
+    monkeypatch.setattr(pose_search, "refine", lambda _, body: Candidate(body, 0.0))
+    monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [np.eye(4)] * 50)
+    data = calibgraph.load_dataset(SAMPLE, one).select("0")
     start = StructureMatcher().locate(
-        data, rig, out_of_time=lambda: len(tried) > 3, progress=no_progress
+        data, one, out_of_time=lambda: len(tried) > 3, progress=no_progress
     )
     assert len(tried) == 4  # the guess, and three poses
     assert "left" in start.findings.missed
+
+
+def test_chance_moves_with_what_is_seen_and_fewer_tries_need_less() -> None:
+    assert ALONE < MANY < AGAIN < math.inf
+    low, high = (Chance((z,) * 3).least_z_score(3) for z in (4.0, 10.0))
+    assert high - low > 4  # three searches outweigh the prior
+    assert low < MANY < high
+    assert Chance((5.7 + 0.92 * 0.577,) * 3).least_z_score(3) < MANY  # more certain of the same
+
+
+def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None:
+    """Scenes, and the best z-scores on them, drawn from the distributions that are assumed."""
+    rng = np.random.default_rng(0)
+    tries, scenes, rate = 3, 400_000, acceptance.FALSE_ACCEPTANCE
+    locations = rng.normal(acceptance.PRIOR_LOCATION, acceptance.PRIOR_SIGMA, scenes)
+    best = rng.gumbel(locations + acceptance.SCALE * math.log(tries), acceptance.SCALE)
+    share = np.mean(best >= Chance().least_z_score(tries))
+    assert 0.5 * rate < share < 1.1 * rate
+    seen = rng.gumbel(locations[:, None], acceptance.SCALE, (scenes, 3))
+    zero, one, two = (Chance((z,) * 3).least_z_score(tries) for z in (0.0, 1.0, 2.0))
+    assert two - one == pytest.approx(one - zero)  # linear in the mean of what is seen
+    share = np.mean(best >= zero + (one - zero) * seen.mean(axis=1))
+    assert 0.7 * rate < share < 1.1 * rate

@@ -14,7 +14,7 @@ import pytest
 import calibgraph
 from calibgraph import CorrespondenceError, Rig, StructureMatcher
 from calibgraph.matching.protocol import Start
-from calibgraph.matching.structure import global_search
+from calibgraph.matching.structure import global_search, pose_search
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
@@ -82,7 +82,7 @@ class TestSearch:
         self, truth: Rig, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """One camera has its true guess; the other's is far off, and no search finds it."""
-        monkeypatch.setattr(global_search, "search_box", lambda *_, **__: [])
+        monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [])
         far, names = far_from(truth, seed=1), ("front_left", "front_right")
         rig = Rig(cameras={names[0]: truth.cameras[names[0]], names[1]: far.cameras[names[1]]})
         start = locate(calibgraph.load_dataset(SAMPLE, rig).select("0:3"), rig)

@@ -1,0 +1,68 @@
+"""The relative pose of two cameras from features whose depth the LiDAR gives: robust PnP."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.matching.camera_pairs.geometry import MAX_ANGLE_RAD, turn_to_axis
+
+Array = NDArray[np.float64]
+
+MIN_INLIERS = 12
+"""Features that must agree on a pose: 4 determine one, and of those that agree on an epipolar
+geometry few others agree by chance."""
+
+_THRESHOLD_RAD = math.radians(
+    0.3
+)  # depths beside silhouettes, of an estimate a degree off, are off
+_ITERATIONS = 2000
+_FOCAL_PX = 1000.0
+
+
+def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | None:
+    """T_b_a from points in the frame of camera A and the rays on which camera B sees them.
+
+    MAGSAC and PnP on the plane across the mean ray, so that any field of view serves.
+
+    Args:
+        points_a_m: (n, 3).
+        rays_b: (n, 3) unit vectors.
+        seed: of the choice of samples.
+
+    Returns:
+        (4, 4); None if too few agree on a pose.
+    """
+    if len(rays_b) < MIN_INLIERS:
+        return None
+    turn = turn_to_axis(rays_b)
+    turned = rays_b @ turn.T
+    narrow = turned[:, 2] > math.cos(MAX_ANGLE_RAD)
+    if np.count_nonzero(narrow) < MIN_INLIERS:
+        return None
+    plane = _FOCAL_PX * turned[narrow, :2] / turned[narrow, 2:]
+    parameters = cv2.UsacParams()
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.threshold = _THRESHOLD_RAD * _FOCAL_PX
+    parameters.maxIterations = _ITERATIONS
+    parameters.confidence = 0.999
+    parameters.randomGeneratorState = seed
+    ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
+    try:
+        found, _, rotation, translation, inliers = cv2.solvePnPRansac(
+            points_a_m[narrow], plane, ideal, None, params=parameters
+        )
+    except cv2.error:  # degenerate samples
+        return None
+    if not found or inliers is None or len(inliers) < MIN_INLIERS:
+        return None
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3], T_b_a[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    T_b_a[:3] = turn.T @ T_b_a[:3]
+    return T_b_a

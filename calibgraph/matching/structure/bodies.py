@@ -1,0 +1,77 @@
+"""Bodies: cameras whose relative poses are known, which are searched as one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.model.rig import Camera, RelativePose, Rig
+
+Array = NDArray[np.float64]
+
+Body = Mapping[str, Camera]
+"""Cameras at their places; the first one leads: its extrinsic is that of the body."""
+
+RIGID_RAD, RIGID_M = np.radians(0.5), 0.1
+"""Sigmas of a known relative pose up to which two cameras are one body: what is left of them, the
+rounds correct camera by camera."""
+
+
+def rigid_bodies(rig: Rig) -> list[Body]:
+    """The cameras of a rig in bodies, the first of each at its guess."""
+    tight = [
+        pair
+        for pair in rig.relative_poses
+        if pair.rotation_sigma_rad <= RIGID_RAD and pair.translation_sigma_m <= RIGID_M
+    ]
+    left = dict(rig.cameras)
+    bodies: list[Body] = []
+    while left:
+        name = next(iter(left))
+        body = {name: left.pop(name)}
+        while pair := next((p for p in tight if _one_side(p, body, left)), None):
+            new, T = _other_side(pair, body)
+            body[new] = left.pop(new).moved_to(T)
+        bodies.append(body)
+    return bodies
+
+
+def _one_side(pair: RelativePose, body: Body, left: Body) -> bool:
+    return (pair.a in body and pair.b in left) or (pair.b in body and pair.a in left)
+
+
+def _other_side(pair: RelativePose, body: Body) -> tuple[str, Array]:
+    """The camera of a pair that is not in a body yet, and its T_camera_lidar."""
+    if pair.a in body:
+        return pair.b, invert(pair.T_a_b) @ body[pair.a].T_camera_lidar
+    return pair.a, pair.T_a_b @ body[pair.b].T_camera_lidar
+
+
+def lead(body: Body) -> Camera:
+    """The camera whose extrinsic is that of the body."""
+    return next(iter(body.values()))
+
+
+def place(body: Body, T_lead_lidar: Array) -> Body:
+    """The body with its lead at an extrinsic."""
+    old = lead(body).T_camera_lidar
+    return {
+        name: camera.moved_to(relative_transform(camera.T_camera_lidar, old) @ T_lead_lidar)
+        for name, camera in body.items()
+    }
+
+
+def place_member(body: Body, name: str, T_camera_lidar: Array) -> Body:
+    """The body with one of its cameras at an extrinsic."""
+    T_lead_member = relative_transform(lead(body).T_camera_lidar, body[name].T_camera_lidar)
+    return place(body, T_lead_member @ T_camera_lidar)
+
+
+def adjoint(body: Body, name: str) -> Array:
+    """(6, 6) a twist in the lead's axes to the same in a camera's."""
+    T = relative_transform(body[name].T_camera_lidar, lead(body).T_camera_lidar)
+    return np.asarray(gtsam.Pose3(T).AdjointMap())

@@ -1,0 +1,201 @@
+"""Pose search: tries poses of the bodies of a rig, near a given one or all over the range."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.matching.structure.acceptance import Chance, may_be_accepted
+from calibgraph.matching.structure.bodies import Body, lead, place, place_member
+from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
+from calibgraph.matching.structure.common_features import CommonFeatures
+from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
+from calibgraph.matching.structure.pose_refinement import (
+    CameraFrames,
+    Candidate,
+    approach,
+    refine,
+    refine_on,
+)
+from calibgraph.model.geometry import relative_transform
+from calibgraph.model.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+
+SEARCH_WINDOWS = 2100  # of the maps, per camera over all frames
+ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
+"""Windows lie in the maps as they are seen from the guess: if it is rolled by more than some 8
+degrees, right places stand out no more."""
+SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
+
+TURNS_RAD = np.radians([90.0, 180.0, 270.0])  # of the clouds, with which nothing can be found
+
+
+@dataclass(frozen=True, eq=False)
+class SearchRange:
+    """How far from the guess to search, per axis."""
+
+    rotation_rad: float
+    translation_m: float
+
+    @property
+    def rotation_deg(self) -> float:
+        """The rotation in degrees."""
+        return float(np.degrees(self.rotation_rad))
+
+
+class PoseSearch:
+    """Tries poses of bodies, see :func:`locate_cameras`."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        frames: Mapping[str, CameraFrames],
+        search_range: SearchRange,
+        seed: int,
+        out_of_time: Callable[[], bool],
+    ) -> None:
+        self.rig, self.guess, self.out_of_time = rig, rig.T_camera_lidar, out_of_time
+        self._frames, self._range, self._seed = frames, search_range, seed
+        self._chances: dict[str, Chance] = {}
+
+    @cached_property
+    def _common(self) -> CommonFeatures:
+        return CommonFeatures(self.rig, self._frames, seed=self._seed)
+
+    def near(self, body: Body) -> Candidate:
+        """The body about its guess, refined on."""
+        return self._refine_on(self.from_afar(body))
+
+    def from_afar(self, body: Body) -> Candidate:
+        """The body near a pose that may be off by some degrees."""
+        return refine(self._frames, approach(self._frames, body).body)
+
+    def at(self, body: Body) -> Candidate:
+        """The body near a pose that is off by less than a degree."""
+        return self._refine_on(refine(self._frames, body))
+
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
+        """The best pose in all of the range; of those that are accepted, the first."""
+        best = Candidate(body, -math.inf)
+        for roll in ROLLS_RAD:
+            best = max(best, self._best_of(body, roll, effort), key=_by_z_score)
+            if self.accepts(body, best.z_score, tries) or self.out_of_time():
+                break
+        return best
+
+    def seen_by(self, other: Body, body: Body) -> Body | None:
+        """The body where a located one sees it; None if they see nothing in common."""
+        for name in body:
+            for by, camera in other.items():
+                T = self._common.place(name, by, camera.T_camera_lidar)
+                if T is not None:
+                    return place_member(body, name, T)
+        return None
+
+    def as_in_guess(self, other: Body, body: Body) -> Body:
+        """The body at its relative pose in the guess to a located one."""
+        by, camera = next(iter(other.items()))
+        old = lead(body).T_camera_lidar
+        relative = relative_transform(old, self.guess[by])
+        return place(body, relative @ camera.T_camera_lidar)
+
+    def accepts(self, body: Body, z_score: float, tries: float) -> bool:
+        """Whether a z-score is too high to have come about by chance.
+
+        Args:
+            body: the one that was searched for.
+            z_score: at its best pose.
+            tries: see :meth:`Chance.least_z_score`.
+        """
+        chance = self._chances.get(next(iter(body)), Chance())
+        return z_score >= chance.least_z_score(tries)
+
+    def measure_chance(self, body: Body, z_score: float) -> bool:
+        """Measure what chance brings about on this scene, by searches with nothing to find.
+
+        Returns:
+            Whether it was measured: once, and only if the z-score may be accepted afterwards.
+        """
+        name = next(iter(body))
+        if name in self._chances or not may_be_accepted(z_score, len(ROLLS_RAD)):
+            return False
+        chance = Chance()
+        for angle in TURNS_RAD:
+            chance = chance.with_seen(self._search_turned(body, angle))
+        self._chances[name] = chance
+        return True
+
+    def _search_turned(self, body: Body, angle_rad: float) -> float:
+        """The best z-score in clouds that are turned about the vertical."""
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
+        turned = place(body, lead(body).T_camera_lidar @ turn)
+        return self._best_of(turned, 0.0, effort=1).z_score
+
+    def _best_of(self, body: Body, roll_rad: float, effort: int) -> Candidate:
+        """The best pose all over the range about a body's guess, with maps for one roll.
+
+        All candidates of the box search are approached, and the best are refined.
+        """
+        maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
+        nothing = Candidate(body, -math.inf)
+        if not maps.maps:
+            return nothing
+        box = Box(lead(body).T_camera_lidar, self._range.rotation_rad, self._range.translation_m)
+        cores = self._frames[next(iter(body))].cores
+        found = search_box(maps, box, cores, effort=effort, seed=self._seed + effort)
+        near = []
+        for T_lead_lidar in found:
+            near.append(approach(self._frames, place(body, T_lead_lidar)))
+            if self.out_of_time():
+                break
+        near.sort(key=_by_z_score, reverse=True)
+        survivors = near[: 1 if self.out_of_time() else effort * SURVIVORS]
+        refined = [refine(self._frames, one.body) for one in survivors]
+        return self._refine_on(max(refined, key=_by_z_score, default=nothing))
+
+    def _refine_on(self, candidate: Candidate) -> Candidate:
+        """The candidate refined further, if that may be of use."""
+        if not may_be_accepted(candidate.z_score, len(ROLLS_RAD)):
+            return candidate
+        return refine_on(self._frames, candidate)
+
+    def _correlate(self, body: Body, effort: int) -> BodyMaps:
+        """The maps of those cameras that the clouds are in view of."""
+        maps = {name: self._correlate_camera(name, camera, effort) for name, camera in body.items()}
+        of_lead = lead(body).T_camera_lidar
+        seen = [name for name, one in maps.items() if len(one.maps)]
+        return BodyMaps(
+            [maps[name] for name in seen],
+            [relative_transform(body[name].T_camera_lidar, of_lead) for name in seen],
+        )
+
+    def _correlate_camera(self, name: str, camera: Camera, effort: int) -> CorrelationMaps:
+        frames = self._frames[name]
+        return correlate(
+            frames.grays,
+            frames.clouds,
+            camera,
+            frames.cores,
+            range_rad=self._range.rotation_rad,
+            max_windows=effort * SEARCH_WINDOWS // len(frames.grays),
+            seed=self._seed + 1000 * (effort - 1),
+        )
+
+
+def _by_z_score(candidate: Candidate) -> float:
+    return candidate.z_score
+
+
+def _turn_about_axis(body: Body, angle_rad: float) -> Body:
+    """The body after a turn about the axis of its lead."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
+    return place(body, turn @ lead(body).T_camera_lidar)
