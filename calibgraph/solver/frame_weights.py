@@ -21,7 +21,7 @@ from scipy.optimize import isotonic_regression
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import local_coordinates, retract_all
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread
@@ -106,8 +106,7 @@ def weigh_all_frames(
             stage1[name].by_frame if name in stage1 else {},
         )
 
-    with core_pool() as pool:
-        weighed = dict(zip(blocks, pool.map(weigh, blocks), strict=True))
+    weighed = dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
     return WeighedFrames(
         blocks={name: camera.block for name, camera in weighed.items()},
         T_camera_lidar={

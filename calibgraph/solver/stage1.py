@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import frame_pose, ransac_pnp, refine_frames, select_evenly
@@ -61,21 +61,18 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     if config.stage1 == "rig":
         named = [name for name in rig.cameras if name in table.cameras]
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
-    cameras = rig.cameras.values()
+    cameras = [*rig.cameras.values()]
     rows = [table.of_camera(name) for name in rig.cameras]
-    with core_pool() as pool:
-        common = [*pool.map(partial(_from_common_pose, config=config), cameras, rows)]
-        searches = [
-            {
-                int(i): pool.submit(frame_pose, camera, frames.rows_of(int(i)), config)
-                for i in np.flatnonzero(~frames.found)
-            }
-            for camera, frames in zip(cameras, common, strict=True)
-        ]
-        searched = [{i: search.result() for i, search in each.items()} for each in searches]
+    common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows)
+    left = [(k, i) for k, f in enumerate(common) for i in np.flatnonzero(~f.found).tolist()]
+    searched = map_on_cores(
+        lambda k, i: frame_pose(cameras[k], common[k].rows_of(i), config), *np.transpose(left)
+    ) if left else []
+    poses = [{i: T for (of, i), T in zip(left, searched, strict=True) if of == k}
+             for k in range(len(cameras))]
     return {
-        name: _aggregate_frames(frames.with_poses(poses), config)
-        for name, frames, poses in zip(rig.cameras, common, searched, strict=True)
+        name: _aggregate_frames(frames.with_poses(poses[k]), config)
+        for k, (name, frames) in enumerate(zip(rig.cameras, common, strict=True))
     }
 
 
