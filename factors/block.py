@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.block_arrays import check_shape, join_roots, read_only, rows_of_root
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.kernel import (
     accumulate_alone,
@@ -74,20 +75,20 @@ class ProjectionBlock:
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
-        _check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
-        _check_shape("pixels_px", self.pixels_px, (n, 2))
+        check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
+        check_shape("pixels_px", self.pixels_px, (n, 2))
         if self.sqrt_information is not None:
-            _check_shape("sqrt_information", self.sqrt_information, (n, 3))
+            check_shape("sqrt_information", self.sqrt_information, (n, 3))
         loss_id(self.loss)
         _check_positive(scale=self.scale, sigma=self.sigma)
         columns = np.empty((5, n))
         columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
-        self._initialize(columns, *_rows_of_root(self.sqrt_information))
+        self._initialize(columns, *rows_of_root(self.sqrt_information))
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        columns = _read_only(columns)
-        root = None if root is None else _read_only(root)
+        columns = read_only(columns)
+        root = None if root is None else read_only(root)
         whitening = np.empty((0, columns.shape[1])) if root is None else root[:rows]
         object.__setattr__(self, "_columns", columns)
         object.__setattr__(self, "_whitening", whitening)
@@ -111,9 +112,9 @@ class ProjectionBlock:
     def rewhiten(self, sqrt_information: Array | None) -> ProjectionBlock:
         """The same correspondences, not copied, with other (n, 3) whitening matrices, or none."""
         if sqrt_information is not None:
-            _check_shape("sqrt_information", sqrt_information, (len(self), 3))
+            check_shape("sqrt_information", sqrt_information, (len(self), 3))
         other = copy.copy(self)
-        other._initialize(self._columns, *_rows_of_root(sqrt_information))
+        other._initialize(self._columns, *rows_of_root(sqrt_information))
         return other
 
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
@@ -131,9 +132,9 @@ class ProjectionBlock:
     @staticmethod
     def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
         """The correspondences of blocks of one lens under each other; loss as of the first."""
-        roots = _joined_roots(parts)
+        roots = join_roots([part.sqrt_information for part in parts], [*map(len, parts)])
         joined, columns = copy.copy(parts[0]), np.hstack([part._columns for part in parts])
-        joined._initialize(columns, *_rows_of_root(roots))
+        joined._initialize(columns, *rows_of_root(roots))
         return joined
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
@@ -271,43 +272,7 @@ def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     return np.ascontiguousarray(T_lidar_camera.inverse().matrix())
 
 
-def _read_only(array: Array) -> Array:
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
 def _check_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise ValueError(f"the robust {name} must be positive, found {value}")
-
-
-def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
-
-
-def _joined_roots(parts: Sequence[ProjectionBlock]) -> Array | None:
-    """Whitening matrices of blocks under each other; the identity where a block has none."""
-    roots = [part.sqrt_information for part in parts]
-    if all(root is None for root in roots):
-        return None
-    return np.concatenate([
-        np.tile([1.0, 0.0, 1.0], (len(part), 1)) if root is None else root
-        for root, part in zip(roots, parts, strict=True)
-    ])  # fmt: skip
-
-
-def _rows_of_root(root: Array | None) -> tuple[Array | None, int]:
-    """(3, n) whitening matrices by columns, and how many of these rows the kernel takes.
-
-    One, if they are all numbers.
-    """
-    if root is None:
-        return None, 0
-    isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
-    return np.ascontiguousarray(root.T), 1 if isotropic else 3

@@ -142,10 +142,6 @@ class CameraBlock:
         at = self.at(T_camera_lidar)
         return at.errors_px, at.projectable
 
-    def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
-        """As :attr:`BlockResiduals.sizes`."""
-        return self.at(T_camera_lidar).sizes
-
     def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
         """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
         return self.select(self.within_gate(T_camera_lidar, scale.gate_px))

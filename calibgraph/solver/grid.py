@@ -129,9 +129,7 @@ def _best_of_equal_keys(camera, frame, cell, confidence, among):  # type: ignore
         slot = (mixed ^ (mixed >> 29)) & (size - 1)
         other = best[slot]
         while other >= 0 and not (
-            cell[other] == cell[row]
-            and frame[other] == frame[row]
-            and camera[other] == camera[row]
+            cell[other] == cell[row] and frame[other] == frame[row] and camera[other] == camera[row]
         ):
             slot = (slot + 1) & (size - 1)
             other = best[slot]

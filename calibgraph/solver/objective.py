@@ -95,7 +95,9 @@ class Objective:
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:
         """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
-        return {name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()}
+        return {
+            name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()
+        }
 
     def coarse(self, matches: int) -> Objective:
         """With at most so many correspondences of each camera, and less exact minima.

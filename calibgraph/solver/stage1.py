@@ -64,15 +64,16 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     cameras = [*rig.cameras.values()]
     rows = [table.of_camera(name) for name in rig.cameras]
     common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows)
-    left = [(k, i) for k, f in enumerate(common) for i in np.flatnonzero(~f.found).tolist()]
+    left = [[*np.flatnonzero(~frames.found).tolist()] for frames in common]
     searched = map_on_cores(
-        lambda k, i: frame_pose(cameras[k], common[k].rows_of(i), config), *np.transpose(left)
-    ) if left else []
-    poses = [{i: T for (of, i), T in zip(left, searched, strict=True) if of == k}
-             for k in range(len(cameras))]
+        partial(frame_pose, config=config),
+        [camera for camera, numbers in zip(cameras, left, strict=True) for _ in numbers],
+        [f.rows_of(i) for f, numbers in zip(common, left, strict=True) for i in numbers],
+    )
+    poses = iter(searched)
     return {
-        name: _aggregate_frames(frames.with_poses(poses[k]), config)
-        for k, (name, frames) in enumerate(zip(rig.cameras, common, strict=True))
+        name: _aggregate_frames(frames.with_poses({i: next(poses) for i in numbers}), config)
+        for name, frames, numbers in zip(rig.cameras, common, left, strict=True)
     }
 
 

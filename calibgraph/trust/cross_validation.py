@@ -64,8 +64,12 @@ def restart_checks(evidence: Evidence) -> Checks:
         return {}
     solution = evidence.solution
     coarse = solution.objective.coarse(_RESTART_SAMPLE)
-    solve = partial(_solve_from_displaced_start, solution, coarse)
-    ends = map_on_cores(solve, range(RESTARTS))
+    rig = solution.solved_rig
+    displaced = [
+        perturb(rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed).T_camera_lidar
+        for seed in range(RESTARTS)
+    ]
+    ends = map_on_cores(partial(_solve_from, solution, coarse), displaced)
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
     name = f"solving again from starts {starts}: largest difference"
     checks = {}
@@ -84,16 +88,11 @@ def restart_checks(evidence: Evidence) -> Checks:
     return checks
 
 
-def _solve_from_displaced_start(
-    solution: Solution, coarse: Objective, seed: int
-) -> Transforms | None:
-    """The T_camera_lidar from a displaced start; None if it keeps too few matches.
+def _solve_from(solution: Solution, coarse: Objective, start: Transforms) -> Transforms | None:
+    """The T_camera_lidar from a start; None if it keeps too few matches.
 
     First coarsely with a selection of the matches, then both passes with all of them from there.
     """
-    start = perturb(
-        solution.solved_rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
-    ).T_camera_lidar
     objective = solution.objective
     try:
         near, _ = coarse.minimize_with_scale(start)

@@ -84,8 +84,7 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
         block: all of the camera's matches, not only those within the gate.
         scale: of their residuals.
     """
-    step = -(-len(block.frame) // _MAX_MATCHES)
-    some = block.select(np.arange(len(block.frame)) % step == 0)
+    some = block.select_evenly(_MAX_MATCHES)
     errors_px, in_front = some.errors_px(camera.T_camera_lidar)
     table = some.select(in_front).as_table(camera="camera")
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the

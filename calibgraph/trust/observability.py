@@ -104,7 +104,9 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
 
 def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float]:
     """Distances [m] from the camera between which 96 % of its matches lie."""
-    x, y, z = block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
+    x, y, z = (
+        block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
+    )
     near, far = np.quantile(np.sqrt(x * x + y * y + z * z), [0.02, 0.98])
     return float(near), float(far)
 
