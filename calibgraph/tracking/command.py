@@ -23,6 +23,7 @@ from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.run import Notify, follow
 from calibgraph.tracking.streams import Item, frames_of
+from calibgraph.tracking.warm_up import warm_up
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 
@@ -67,6 +68,8 @@ def track(
     require_stdout()
     history = History()
     with _stopped_by_signals() as stop:
+        if settings.follow or str(source[0]) == "-":  # frames come at their own times
+            warm_up()
         items, calibrator = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         with calibrator:
