@@ -28,7 +28,7 @@ from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.factor_graph import pose_key, prior_graph, to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
-from calibgraph.tracking import warm_up
+from calibgraph.tracking import warm_up_tracker
 from factors import block_factor
 
 RIG = Rig(
@@ -57,7 +57,7 @@ def resident_mb() -> float:
 
 def measure_ours(count: int) -> tuple[dict[int, float], Table]:
     """Median seconds of the updates around some frames, by their number; and over the run."""
-    warm_up()
+    warm_up_tracker()
     tracker = IncrementalCalibrator(GUESS)
     seconds, memory = [], {}
     gc.freeze()  # as the command does

@@ -248,8 +248,7 @@ def _order_of(confidence):  # type: ignore[no-untyped-def]
         place = np.zeros((1 << _DIGIT) + 1, dtype=np.int64)
         for i in range(len(bits)):
             place[((bits[i] >> shift) & _DIGIT_MASK) + 1] += 1
-        for digit in range(1 << _DIGIT):
-            place[digit + 1] += place[digit]
+        place = np.cumsum(place)
         for i in order:
             digit = (bits[i] >> shift) & _DIGIT_MASK
             other[place[digit]] = i

@@ -21,9 +21,9 @@ from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
+from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.run import Notify, follow
 from calibgraph.tracking.streams import Item, frames_of
-from calibgraph.tracking.warm_up import warm_up
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 
@@ -69,7 +69,7 @@ def track(
     history = History()
     with _stopped_by_signals() as stop:
         if settings.follow or str(source[0]) == "-":  # frames come at their own times
-            warm_up()
+            warm_up_tracker()
         items, calibrator = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         with calibrator:

@@ -11,7 +11,7 @@ from numba.core.dispatcher import Dispatcher
 from calibgraph import IncrementalCalibrator, perturb
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.tracking import warm_up
+from calibgraph.tracking import warm_up_tracker
 
 def loaded():
     modules = [m for n, m in sys.modules.items() if n.startswith(("calibgraph.", "factors."))]
@@ -19,7 +19,7 @@ def loaded():
     return sum(len(kernel.overloads) for kernel in kernels.values())
 
 before = loaded()
-warm_up()
+warm_up_tracker()
 warm = loaded()
 rig = rig_of("kitti")
 tracker = IncrementalCalibrator(perturb(rig, rotation_deg=1.0, translation_m=0.1))
