@@ -249,9 +249,9 @@ def _order_of(confidence):  # type: ignore[no-untyped-def]
         for i in range(len(bits)):
             place[((bits[i] >> shift) & _DIGIT_MASK) + 1] += 1
         place = np.cumsum(place)
-        for i in order:
-            digit = (bits[i] >> shift) & _DIGIT_MASK
-            other[place[digit]] = i
+        for row in order:
+            digit = (bits[row] >> shift) & _DIGIT_MASK
+            other[place[digit]] = row
             place[digit] += 1
         order, other = other, order
     return order
