@@ -48,3 +48,4 @@ from .tracking import DurableCalibrator as DurableCalibrator
 from .tracking import Event as Event
 from .tracking import IncrementalCalibrator as IncrementalCalibrator
 from .tracking import Update as Update
+from .tracking import warm_up_tracker as warm_up_tracker

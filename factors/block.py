@@ -21,11 +21,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.block_arrays import check_shape, join_roots, read_only, rows_of_root
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.kernel import (
     accumulate_alone,
     accumulate_shared,
     costs_alone,
+    gradients_alone,
     linearize_alone,
     norms_alone,
     residuals_alone,
@@ -73,26 +75,28 @@ class ProjectionBlock:
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
-        _check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
-        _check_shape("pixels_px", self.pixels_px, (n, 2))
+        check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
+        check_shape("pixels_px", self.pixels_px, (n, 2))
         if self.sqrt_information is not None:
-            _check_shape("sqrt_information", self.sqrt_information, (n, 3))
+            check_shape("sqrt_information", self.sqrt_information, (n, 3))
         loss_id(self.loss)
         _check_positive(scale=self.scale, sigma=self.sigma)
         columns = np.empty((5, n))
         columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
-        self._initialize(columns, _whitening(self.sqrt_information, n), self.sqrt_information)
+        self._initialize(columns, *rows_of_root(self.sqrt_information))
 
-    def _initialize(self, columns: Array, whitening: Array, root: Array | None) -> None:
+    def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        columns, whitening = _read_only(columns), _read_only(whitening)
+        columns = read_only(columns)
+        root = None if root is None else read_only(root)
+        whitening = np.empty((0, columns.shape[1])) if root is None else root[:rows]
         object.__setattr__(self, "_columns", columns)
         object.__setattr__(self, "_whitening", whitening)
         edges = np.append(np.arange(0, columns.shape[1], _CHUNK), columns.shape[1])
         object.__setattr__(self, "_chunks", to_runs(edges))
         object.__setattr__(self, "points_lidar_m", columns[:3].T)
         object.__setattr__(self, "pixels_px", columns[3:].T)
-        object.__setattr__(self, "sqrt_information", None if root is None else _read_only(root))
+        object.__setattr__(self, "sqrt_information", None if root is None else root.T)
 
     def __len__(self) -> int:
         return len(self.pixels_px)
@@ -105,6 +109,14 @@ class ProjectionBlock:
         object.__setattr__(other, "sigma", sigma)
         return other
 
+    def rewhiten(self, sqrt_information: Array | None) -> ProjectionBlock:
+        """The same correspondences, not copied, with other (n, 3) whitening matrices, or none."""
+        if sqrt_information is not None:
+            check_shape("sqrt_information", sqrt_information, (len(self), 3))
+        other = copy.copy(self)
+        other._initialize(self._columns, *rows_of_root(sqrt_information))
+        return other
+
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
         """The block with only some correspondences: a mask or an index array."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
@@ -112,17 +124,17 @@ class ProjectionBlock:
         other = copy.copy(self)
         other._initialize(
             self._columns.take(rows, axis=1),
-            self._whitening.take(rows, axis=1),
-            None if root is None else root.take(rows, axis=0),
+            None if root is None else root.T.take(rows, axis=1),
+            len(self._whitening),
         )
         return other
 
     @staticmethod
     def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
         """The correspondences of blocks of one lens under each other; loss as of the first."""
-        roots = _joined_roots(parts)
+        roots = join_roots([part.sqrt_information for part in parts], [*map(len, parts)])
         joined, columns = copy.copy(parts[0]), np.hstack([part._columns for part in parts])
-        joined._initialize(columns, _whitening(roots, columns.shape[1]), roots)
+        joined._initialize(columns, *rows_of_root(roots))
         return joined
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
@@ -130,12 +142,14 @@ class ProjectionBlock:
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         return unpack_sums(sums.sum(axis=0))
 
-    def sums_at(self, poses: Sequence[gtsam.Pose3]) -> BlockSums:
-        """H, b and c of the whole block at each of some T_lidar_camera, stacked."""
+    def gradients_at_each(self, poses: Sequence[gtsam.Pose3]) -> Array:
+        """(p, 6) b of the whole block at each of some T_lidar_camera."""
         each = np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4)
-        runs = np.tile(self._chunks, (len(each), 1))
-        sums = self._run_sums(np.repeat(each, len(self._chunks), axis=0), runs, None)
-        return unpack_sums(sums.reshape(len(each), len(self._chunks), 28).sum(axis=1))
+        gradients: Array = gradients_alone(
+            self.lens.kind, self.lens.packed, each, self._columns, self._whitening,
+            loss_id(self.loss), self.scale * self.sigma,
+        )  # fmt: skip
+        return gradients / self.sigma**2
 
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
@@ -258,40 +272,7 @@ def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     return np.ascontiguousarray(T_lidar_camera.inverse().matrix())
 
 
-def _read_only(array: Array) -> Array:
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
 def _check_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise ValueError(f"the robust {name} must be positive, found {value}")
-
-
-def _check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
-
-
-def _joined_roots(parts: Sequence[ProjectionBlock]) -> Array | None:
-    """Whitening matrices of blocks under each other; the identity where a block has none."""
-    roots = [part.sqrt_information for part in parts]
-    if all(root is None for root in roots):
-        return None
-    return np.concatenate([
-        np.tile([1.0, 0.0, 1.0], (len(part), 1)) if root is None else root
-        for root, part in zip(roots, parts, strict=True)
-    ])  # fmt: skip
-
-
-def _whitening(root: Array | None, n: int) -> Array:
-    """The whitening for the kernel: matrices by columns, or (1, n) if they are all numbers."""
-    if root is None:
-        return np.empty((0, n))
-    isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
-    return np.ascontiguousarray((root[:, :1] if isotropic else root).T)

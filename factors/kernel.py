@@ -20,8 +20,10 @@ from factors.kernel_projection import project, project_pinhole, project_radtan, 
 from factors.kernel_sums import (
     apply_weights,
     scale_residuals,
+    sum_ray_gradients,
     sum_rays,
     sum_tile,
+    sum_tile_gradients,
     weigh,
     whiten,
 )
@@ -30,6 +32,15 @@ from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
+
+
+@compiled(error_model="numpy")
+def _project_with_derivatives(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """Fill in a tile, for any lens and any points."""
+    if kind == PINHOLE:
+        project_pinhole(lens, T, columns, start, n, tile)
+    elif kind != RADTAN or not project_radtan(lens, T, columns, start, n, tile):
+        project(kind, lens, T, columns, start, n, tile)
 
 
 @compiled(error_model="numpy")
@@ -45,10 +56,7 @@ def _accumulate(kind, lens, T, columns, whitening, loss, scale, first, end, sums
             apply_weights(whitening, start, n, tile)
             sum_rays(lens, n, tile, sums)
             continue
-        if kind == PINHOLE:
-            project_pinhole(lens, T, columns, start, n, tile)
-        elif kind != RADTAN or not project_radtan(lens, T, columns, start, n, tile):
-            project(kind, lens, T, columns, start, n, tile)
+        _project_with_derivatives(kind, lens, T, columns, start, n, tile)
         whiten(whitening, start, n, tile)
         sums[27] += weigh(loss, scale, n, tile)
         sum_tile(n, tile, sums)
@@ -108,6 +116,28 @@ def costs_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ig
             _project_any(kind, lens, poses[i], columns, start, count, tile)
             whiten(whitening, start, count, tile)
             out[i] += weigh(loss, scale, count, tile)
+    return out
+
+
+@compiled(nogil=True, error_model="numpy")
+def gradients_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ignore[no-untyped-def]
+    """(p, 6) gradients b of all correspondences at each of (p, 4, 4) T_camera_lidar."""
+    out, tile = np.zeros((len(poses), 6)), np.empty((ROWS, TILE))
+    n = columns.shape[1]
+    for start in range(0, n, TILE):
+        count = min(TILE, n - start)
+        for i in range(len(poses)):
+            rays = kind == PINHOLE and whitening.shape[0] < MATRICES
+            if rays and project_rays(lens, poses[i], columns, start, count, tile):
+                scale_residuals(whitening, start, count, tile)
+                weigh(loss, scale, count, tile)
+                apply_weights(whitening, start, count, tile)
+                sum_ray_gradients(lens, count, tile, out[i])
+                continue
+            _project_with_derivatives(kind, lens, poses[i], columns, start, count, tile)
+            whiten(whitening, start, count, tile)
+            weigh(loss, scale, count, tile)
+            sum_tile_gradients(count, tile, out[i])
     return out
 
 

@@ -163,7 +163,6 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
     A = 1 + a^2 and B = 1 + b^2: their 21 products share most of their terms, and the focal lengths
     come in at the end. ``u05``: of the first row's entries 0 and 5, without sign and focal length.
     """
-    pull_u, pull_v = tile[RU], tile[RV]
     ray_a, ray_b, ray_w, weight = tile[A], tile[B], tile[W], tile[PSI]
     u00 = v00 = u11 = u01 = v01 = u02 = v02 = u12 = v12 = u22 = v22 = 0.0
     for i in range(n):
@@ -201,6 +200,24 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
         u55 += psi * aw * aw
         v55 += psi * bw * bw
     fx, fy = lens[0], lens[1]
+    p, q = fx * fx, fy * fy
+    sums = (
+        p * u00 + q * v00, -p * u01 - q * v01, p * u02 - q * v02, -p * u03, -q * v04,
+        p * u05 + q * v05, p * u11 + q * u00, -p * u12 + q * v12, p * u13, q * u03,
+        -p * u15 - q * v15, p * u22 + q * v22, -p * u23, q * v24, (p - q) * u03,
+        p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55,
+    )  # fmt: skip
+    for k in range(21):
+        out[k] += sums[k]
+    sum_ray_gradients(lens, n, tile, out[21:])
+
+
+@compiled(fastmath=FAST, error_model="numpy")
+def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
+    """Add the gradient of a tile of a pinhole to 6 sums, see ``sum_rays``."""
+    pull_u, pull_v = tile[RU], tile[RV]
+    ray_a, ray_b, ray_w = tile[A], tile[B], tile[W]
+    fx, fy = lens[0], lens[1]
     b0 = b1 = b2 = b3 = b4 = b5 = 0.0
     for i in range(n):
         a, b, w, u, v = ray_a[i], ray_b[i], ray_w[i], fx * pull_u[i], fy * pull_v[i]
@@ -211,12 +228,30 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
         b3 -= w * u
         b4 -= w * v
         b5 += w * both
-    p, q = fx * fx, fy * fy
-    sums = (
-        p * u00 + q * v00, -p * u01 - q * v01, p * u02 - q * v02, -p * u03, -q * v04,
-        p * u05 + q * v05, p * u11 + q * u00, -p * u12 + q * v12, p * u13, q * u03,
-        -p * u15 - q * v15, p * u22 + q * v22, -p * u23, q * v24, (p - q) * u03,
-        p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55, b0, b1, b2, b3, b4, b5,
-    )  # fmt: skip
-    for k in range(27):
+    sums = (b0, b1, b2, b3, b4, b5)
+    for k in range(6):
+        out[k] += sums[k]
+
+
+@compiled(fastmath=FAST, error_model="numpy")
+def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
+    """Add J^T psi r of a tile to 6 sums, see ``sum_tile``."""
+    rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    res_u, res_v = tile[RU], tile[RV]
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for i in range(n):
+        pull_u, pull_v = rp[i] * res_u[i], rp[i] * res_v[i]
+        g3 = -(pull_u * ux[i] + pull_v * vx[i])
+        g4 = -(pull_u * uy[i] + pull_v * vy[i])
+        g5 = -(pull_u * uz[i] + pull_v * vz[i])
+        x, y, z = rx[i], ry[i], rz[i]
+        b0 += g5 * y - g4 * z
+        b1 += g3 * z - g5 * x
+        b2 += g4 * x - g3 * y
+        b3 += g3
+        b4 += g4
+        b5 += g5
+    sums = (b0, b1, b2, b3, b4, b5)
+    for k in range(6):
         out[k] += sums[k]

@@ -224,7 +224,7 @@ def oracle_weights(matches: CameraBlock, T_camera_lidar: Array) -> Array:
     weights = []
     for edge in pairwise(matches.frame_edges):
         part = matches.select(np.arange(*edge))
-        spread = robust_spread(part.sizes(T_camera_lidar)[1])
+        spread = robust_spread(part.at(T_camera_lidar).sizes[1])
         block = replace(part.block, scale=CAUCHY_SCALE_SIGMAS * max(spread, part.least_spread))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar))
         squared_error = sums.gradient @ np.linalg.pinv(sums.hessian, hermitian=True) @ sums.gradient

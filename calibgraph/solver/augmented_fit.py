@@ -16,7 +16,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.normal_kernel import (
     combine,
     grouped_gradients,
-    reweighted_products,
+    solve_reweighted,
     weighted_products,
 )
 from calibgraph.solver.whitening import upper_root
@@ -28,7 +28,7 @@ MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20
 _CONVERGED = 1e-4  # largest change of an error in a step, in units of the loss' scale
 _MIN_EIGENVALUE = 1e-10  # of a unit-diagonal matrix; smaller ones are rounding errors
-_LOSS_SCALE = 2.0  # of the Cauchy loss, in units of the residuals' standard deviation
+_LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,24 +113,14 @@ class LinearRows:
         Returns:
             (k,) solution; (k, k) normal matrix; (n,) weights. None if the matrix is singular.
         """
-        solution = np.zeros(len(which) - 1)
-        for _ in range(_MAX_ITERATIONS):
-            factors = np.append(solution, -1.0)
-            scale = loss_scale or self._median_scale(which, factors)
-            products, weights = reweighted_products(self.columns, which, factors, scale)
-            normal = products[:-1, :-1]
-            if _is_singular(normal):
-                return None
-            before, solution = solution, np.linalg.solve(normal, products[:-1, -1])
-            moved = combine(self.columns, which[:-1], solution - before)
-            if np.abs(moved).max() < _CONVERGED * scale:
-                break
-        return solution, normal, weights
-
-    def _median_scale(self, which: NDArray[np.intp], factors: Array) -> float:
-        """The loss scale by the median of the errors."""
-        u, v = combine(self.columns, which, factors)
-        return float(_LOSS_SCALE * 1.4826 * np.sqrt(np.median(u * u + v * v)) + 1e-12)
+        solution, normal, weights, regular = solve_reweighted(
+            self.columns,
+            which,
+            0.0 if loss_scale is None else float(loss_scale),
+            _LOSS_MEDIANS,
+            (_MAX_ITERATIONS, _CONVERGED, _MIN_EIGENVALUE),
+        )
+        return (solution, normal, weights) if regular else None
 
     def _cluster_sigmas(
         self, which: NDArray[np.intp], normal: Array, errors: Array, weights: Array
@@ -210,9 +200,3 @@ def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Arr
     """
     rows = linearize(camera, table, lambda _: jacobian_px)
     return rows.compensating_twists(range(jacobian_px.shape[2]), np.ones(len(table)))
-
-
-def _is_singular(normal: Array) -> bool:
-    """Whether an unknown's column is nearly a combination of the others, whatever its unit."""
-    units = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-    return bool(np.linalg.eigvalsh(normal / np.outer(units, units))[0] < _MIN_EIGENVALUE)

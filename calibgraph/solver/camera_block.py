@@ -61,6 +61,11 @@ class CameraBlock:
         new = np.flatnonzero(np.diff(self.frame)) + 1
         return np.concatenate([[0], new, [len(self.frame)]])
 
+    @property
+    def frames(self) -> int:
+        """How many frames they come from."""
+        return len(self.frame_edges) - 1
+
     def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) which correspondences belong to frames of some numbers."""
         edges = self.frame_edges
@@ -76,7 +81,7 @@ class CameraBlock:
         root = self.block.sqrt_information
         ones = np.tile(IDENTITY, (len(self.frame), 1)) if root is None else root
         root = ones * np.sqrt(weights)[:, None]
-        return replace(self, block=replace(self.block, sqrt_information=root))
+        return replace(self, block=self.block.rewhiten(root))
 
     def with_scale(self, scale: ResidualScale) -> ProjectionBlock:
         """The projection block with its loss, in units of the residuals' sigma."""
@@ -137,13 +142,16 @@ class CameraBlock:
         at = self.at(T_camera_lidar)
         return at.errors_px, at.projectable
 
-    def sizes(self, T_camera_lidar: Array) -> tuple[Array, Array]:
-        """As :attr:`BlockResiduals.sizes`."""
-        return self.at(T_camera_lidar).sizes
-
     def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
         """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
-        return self.select(self.at(T_camera_lidar).inliers(scale))
+        return self.select(self.within_gate(T_camera_lidar, scale.gate_px))
+
+    def within_gate(self, T_camera_lidar: Array, gate_px: float) -> NDArray[np.bool_]:
+        """(n,) which are projectable, with an error of at most so many pixels."""
+        if self.information is None:
+            return np.asarray(self.block.run_norms(T_camera_lidar[None])[0] <= gate_px)
+        errors_px, projectable = self.errors_px(T_camera_lidar)
+        return np.asarray(projectable & (errors_px <= gate_px))
 
     def gate_hessian(self, T_camera_lidar: Array, scale: ResidualScale) -> Array:
         """As :meth:`BlockResiduals.gate_hessian`."""
@@ -155,9 +163,7 @@ class CameraBlock:
             return 0
         sample = self.select_evenly(_MAX_SAMPLE)
         root = None if sample.information is None else constrained_root(sample.information)
-        errors = replace(
-            sample.block, sqrt_information=root, loss="cauchy", scale=scale_px, sigma=1.0
-        )
+        errors = replace(sample.block.rewhiten(root), loss="cauchy", scale=scale_px, sigma=1.0)
         return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
@@ -239,7 +245,7 @@ class BlockResiduals:
         across = _error_gradient(residuals, errors, edge.information)
         across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
-        weighted = replace(edge, block=replace(edge.block, sqrt_information=root))
+        weighted = replace(edge, block=edge.block.rewhiten(root))
         added: Array = -weighted.with_scale(scale).sums(self.T_lidar_camera).hessian
         return added / (2 * _GATE_BAND)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.factor_graph import to_values
 from factors import ProjectionBlock, unit_diagonal
@@ -84,8 +84,8 @@ def hessians_of_blocks(
 ) -> dict[str, Array]:
     """Per camera with correspondences, its :func:`robust_hessian`, (6, 6)."""
     poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in blocks]
-    with core_pool() as pool:
-        return dict(zip(blocks, pool.map(robust_hessian, blocks.values(), poses), strict=True))
+    hessians = map_on_cores(robust_hessian, [*blocks.values()], poses)
+    return dict(zip(blocks, hessians, strict=True))
 
 
 def _add_pair_hessians(
@@ -111,20 +111,26 @@ def _frame_gradients(
 ) -> Array:
     """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
     cameras = list(T_camera_lidar)
+    starts = {name: _first_of_each_frame(frame) for name, frame in frames.items()}
+    own = {name: frames[name][first] for name, first in starts.items()}
     of_pairs = [pair.frame for pair in pairs]
-    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *frames.values(), *of_pairs]))
+    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *own.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
     for name, block in blocks.items():
-        own, starts = np.unique(frames[name], return_index=True)
-        edges = np.append(starts, len(frames[name]))
+        edges = np.append(starts[name], len(frames[name]))
         sums = block.frame_sums(to_T_lidar_camera(T_camera_lidar[name]), edges)
-        rows = np.searchsorted(numbers, own)
+        rows = np.searchsorted(numbers, own[name])
         gradients[rows, pose_rows(cameras.index(name))] = sums.gradient
     for pair in pairs:
         rows = np.searchsorted(numbers, np.unique(pair.frame))
         columns = _rows_of_pair(cameras, pair)
         gradients[np.ix_(rows, columns)] += pair.frame_gradients(T_camera_lidar)
     return gradients
+
+
+def _first_of_each_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each number begins among sorted ones."""
+    return np.flatnonzero(np.concatenate([[len(frame) > 0], frame[1:] != frame[:-1]]))
 
 
 def with_pseudo_frames(scatter: Array, hessian: Array, frames: Array) -> Array:
@@ -207,7 +213,7 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         T_lidar_camera: where; the Hessian is in its tangent.
     """
     steps = np.vstack([np.eye(6), -np.eye(6)]) * _STEP
-    gradients = block.sums_at([T_lidar_camera.retract(step) for step in steps]).gradient
+    gradients = block.gradients_at_each([T_lidar_camera.retract(step) for step in steps])
     hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
     hessian = (hessian + hessian.T) / 2
     if np.linalg.eigvalsh(hessian)[0] > 0:

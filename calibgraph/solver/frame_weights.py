@@ -21,11 +21,12 @@ from scipy.optimize import isotonic_regression
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import local_coordinates, retract_all
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread
 from calibgraph.solver.stage1 import Stage1
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ _MAX_CANDIDATES = 200  # frames of which the own extrinsic is tried as a start
 _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
-_PLACE_BITS = 32  # of a match's place among those of a camera
+_DIGIT, _DIGIT_MASK = 16, 0xFFFF  # bits of a confidence that it is sorted by at a time
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
 
 
@@ -106,8 +107,7 @@ def weigh_all_frames(
             stage1[name].by_frame if name in stage1 else {},
         )
 
-    with core_pool() as pool:
-        weighed = dict(zip(blocks, pool.map(weigh, blocks), strict=True))
+    weighed = dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
     return WeighedFrames(
         blocks={name: camera.block for name, camera in weighed.items()},
         T_camera_lidar={
@@ -230,15 +230,28 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     counts = np.array([len(group) for group in groups])
     middles = np.array([np.median(confidence[group]) for group in groups])
     falling = isotonic_regression(np.log(spreads), weights=counts, increasing=False).x
-    learnt = np.exp(np.interp(confidence, middles, falling))
+    learnt = np.empty(len(sizes))
+    for rows in (order, np.flatnonzero(~np.isfinite(sizes))):  # in order, places are found faster
+        learnt[rows] = np.exp(np.interp(confidence[rows], middles, falling))
     return np.asarray(learnt / np.median(learnt))
 
 
-def _order_of(confidence: Array) -> NDArray[np.int64]:
+@compiled(nogil=True, error_model="numpy")
+def _order_of(confidence):  # type: ignore[no-untyped-def]
     """(n,) stable ascending order of positive numbers, in single precision.
 
-    By whole numbers, the number's bits before its place, which sort in a quarter of the time.
+    By their bits, which order positive floats: the lower half of them, then the upper half.
     """
-    bits = confidence.astype(np.float32).view(np.int32).astype(np.int64)
-    keys = np.sort((bits << _PLACE_BITS) | np.arange(len(bits)))
-    return np.asarray(keys & ((1 << _PLACE_BITS) - 1))
+    bits = confidence.astype(np.float32).view(np.int32)
+    order, other = np.arange(len(bits)), np.empty(len(bits), dtype=np.int64)
+    for shift in (0, _DIGIT):
+        place = np.zeros((1 << _DIGIT) + 1, dtype=np.int64)
+        for i in range(len(bits)):
+            place[((bits[i] >> shift) & _DIGIT_MASK) + 1] += 1
+        place = np.cumsum(place)
+        for row in order:
+            digit = (bits[row] >> shift) & _DIGIT_MASK
+            other[place[digit]] = row
+            place[digit] += 1
+        order, other = other, order
+    return order

@@ -14,6 +14,9 @@ from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
+_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, a hash table holds those that are taken
+_ROWS_OF_RUN = 4  # of one camera and frame, at least, in a table that is worth taking run by run
+
 
 def best_in_cell(
     rig: Rig,
@@ -40,24 +43,34 @@ def best_in_cell(
     """
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
     shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
-    edges, cells_of_run = np.array([0, len(table)]), 0
-    if frame_order(camera, table.frame) is None:  # a small hash table each, which stays in cache
-        edges = frame_edges(camera, table.frame)
-        cells_of_run = config.grid_columns * config.grid_rows
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
-    cells = _cells(camera, table.pixels_px, sizes, shape)
-    keep: NDArray[np.bool_] = _best_of_equal_keys(
-        edges, cells_of_run, camera, table.frame, cells, table.confidence, among
-    )
+    cell = _cells(camera, table.pixels_px, sizes, shape)
+    cells = config.grid_columns * config.grid_rows
+    keep: NDArray[np.bool_]
+    edges = frame_edges(camera, table.frame)
+    first = edges[:-1]
+    if cells <= _MOST_CELLS and _all_differ(camera[first], table.frame[first], len(table)):
+        keep = _best_of_runs(edges, cells, cell, table.confidence, among)
+    else:
+        keep = _best_of_equal_keys(camera, table.frame, cell, table.confidence, among)
     return keep
 
 
 def frame_order(camera: NDArray[np.int64], frame: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """(n,) order of rows by camera and frame; None if they are in it already."""
+    """(n,) stable order of rows by camera and frame; None if they are in it already."""
     same, later = camera[1:] == camera[:-1], camera[1:] > camera[:-1]
     if (later | (same & (frame[1:] >= frame[:-1]))).all():
         return None
     return np.lexsort((frame, camera))
+
+
+def _all_differ(camera: NDArray[np.int64], frame: NDArray[np.int64], rows: int) -> bool:
+    """Whether no two runs of so many rows are of the same camera and frame."""
+    if rows < _ROWS_OF_RUN * len(frame):  # rows in any order: their runs cost more to compare
+        return False
+    order = np.lexsort((frame, camera))
+    camera, frame = camera[order], frame[order]
+    return not ((camera[1:] == camera[:-1]) & (frame[1:] == frame[:-1])).any()
 
 
 def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -79,42 +92,49 @@ def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, error_model="numpy")
-def _best_of_equal_keys(edges, cells, camera, frame, cell, confidence, among):  # type: ignore[no-untyped-def]
-    """(n,) which rows have the largest confidence, the first of them, among those of equal keys.
+def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-untyped-def]
+    """As ``_best_of_equal_keys``, where the rows of each run differ by their cell alone.
 
-    A hash table with open addressing, at most half full, holds the best row of every key so far;
-    rows of different runs ``edges[i]:edges[i + 1]`` have different keys. Where the runs are frames,
-    the numbers of their ``cells`` themselves are the places in the table, if it is small enough.
+    A place per cell holds the best row so far; one of an earlier run counts as none.
     """
-    keep = np.zeros(len(frame), dtype=np.bool_)
-    longest = 1
+    keep, best = np.zeros(len(cell), dtype=np.bool_), np.full(cells, -1)
     for run in range(len(edges) - 1):
-        longest = max(longest, edges[run + 1] - edges[run])
-    direct = 0 < cells <= 4 * longest
-    best = np.empty(4 * longest, dtype=np.int64)
-    for run in range(len(edges) - 1):
-        size = cells if direct else 2
-        while not direct and size < 2 * (edges[run + 1] - edges[run]):
-            size *= 2
-        best[:size] = -1
-        for row in range(edges[run], edges[run + 1]):
+        first = edges[run]
+        for row in range(first, edges[run + 1]):
             if not among[row]:
                 continue
-            slot = cell[row]
-            if not direct:
-                mixed = (frame[row] * 1_000_003 + camera[row]) * 10_000_000_019 + cell[row]
-                slot = (mixed ^ (mixed >> 29)) & (size - 1)
+            other = best[cell[row]]
+            if other < first:
+                best[cell[row]], keep[row] = row, True
+            elif confidence[row] > confidence[other]:
+                best[cell[row]], keep[row], keep[other] = row, True, False
+    return keep
+
+
+@compiled(nogil=True, error_model="numpy")
+def _best_of_equal_keys(camera, frame, cell, confidence, among):  # type: ignore[no-untyped-def]
+    """(n,) which rows have the largest confidence, the first of them, among those of equal keys.
+
+    A hash table with open addressing, at most half full, holds the best row of every key so far.
+    """
+    keep = np.zeros(len(frame), dtype=np.bool_)
+    size = 2
+    while size < 2 * len(frame):
+        size *= 2
+    best = np.full(size, -1)
+    for row in range(len(frame)):
+        if not among[row]:
+            continue
+        mixed = (frame[row] * 1_000_003 + camera[row]) * 10_000_000_019 + cell[row]
+        slot = (mixed ^ (mixed >> 29)) & (size - 1)
+        other = best[slot]
+        while other >= 0 and not (
+            cell[other] == cell[row] and frame[other] == frame[row] and camera[other] == camera[row]
+        ):
+            slot = (slot + 1) & (size - 1)
             other = best[slot]
-            while other >= 0 and not (
-                cell[other] == cell[row]
-                and frame[other] == frame[row]
-                and camera[other] == camera[row]
-            ):
-                slot = (slot + 1) & (size - 1)
-                other = best[slot]
-            if other < 0 or confidence[row] > confidence[other]:
-                best[slot] = row
-        for slot in range(size):
-            if best[slot] >= 0:
-                keep[best[slot]] = True
+        if other < 0:
+            best[slot], keep[row] = row, True
+        elif confidence[row] > confidence[other]:
+            best[slot], keep[row], keep[other] = row, True, False
     return keep

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -91,17 +89,14 @@ def count_correspondences(
     """Per camera: correspondences left after each filter and the gate, and its frames."""
     counts = {}
     for name, before in filters.items():
-        given, used = (
-            part.blocks[name].frame if name in part.blocks else np.empty(0, np.int64)
-            for part in (objective, inliers)
-        )
+        given, used = (part.blocks.get(name) for part in (objective, inliers))
         outliers = outlier_frames.get(name, 0)
         counts[name] = {
             **before,
-            "used": len(used),
-            "frames": len(np.unique(given)) + outliers,
+            "used": 0 if used is None else len(used.frame),
+            "frames": (0 if given is None else given.frames) + outliers,
             "outlier_frames": outliers,
-            "frames_used": len(np.unique(used)),
+            "frames_used": 0 if used is None else used.frames,
             "frames_without_pnp": pairwise[name].failed_frames if name in pairwise else 0,
         }
     return counts

@@ -57,14 +57,56 @@ def weighted_products(columns, which, weights):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, fastmath=_FAST, error_model="numpy")
-def reweighted_products(columns, which, factors, scale):  # type: ignore[no-untyped-def]
-    """As ``weighted_products``, with the Cauchy weights of the errors ``combine`` gives."""
-    errors = combine(columns, which, factors)
+def _reweighted_products(columns, which, errors, scale):  # type: ignore[no-untyped-def]
+    """As ``weighted_products``, with the Cauchy weights of (2, n) errors; and (n,) weights."""
     u, v, over = errors[0], errors[1], 1.0 / (scale * scale)
     weights = np.empty(len(u))
     for i in range(len(u)):
         weights[i] = 1.0 / (1.0 + over * (u[i] * u[i] + v[i] * v[i]))
     return weighted_products(columns, which, weights), weights
+
+
+@compiled(nogil=True, error_model="numpy")
+def _is_singular(normal, least):  # type: ignore[no-untyped-def]
+    """Whether an unknown's column is nearly a combination of the others, whatever its unit."""
+    units = np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
+    return np.linalg.eigvalsh(normal / np.outer(units, units))[0] < least
+
+
+@compiled(nogil=True, error_model="numpy")
+def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: ignore[no-untyped-def]
+    """Iteratively reweighted least squares with a Cauchy loss on the norm of each row's error.
+
+    Args:
+        columns: as above.
+        which: numbers of the columns of the k unknowns, and last that of the errors at zero.
+        loss_scale: of the loss; 0: ``medians`` times the median of the errors.
+        medians: see there.
+        limits: iterations; largest change of an error, in units of the loss' scale; least
+            eigenvalue of a unit-diagonal normal matrix.
+
+    Returns:
+        (k,) solution; (k, k) normal matrix; (n,) weights; whether that matrix is regular.
+    """
+    k = len(which) - 1
+    factors = np.zeros(k + 1)
+    factors[k] = -1.0
+    normal, weights = np.zeros((k, k)), np.zeros(columns.shape[2])
+    for _ in range(limits[0]):
+        errors = combine(columns, which, factors)
+        scale = loss_scale
+        if scale == 0.0:
+            scale = medians * np.sqrt(np.median(errors[0] ** 2 + errors[1] ** 2)) + 1e-12
+        products, weights = _reweighted_products(columns, which, errors, scale)
+        normal = products[:k, :k].copy()
+        if _is_singular(normal, limits[2]):
+            return factors[:k], normal, weights, False
+        solution = np.linalg.solve(normal, products[:k, k].copy())
+        moved = combine(columns, which[:k], solution - factors[:k])
+        factors[:k] = solution
+        if np.abs(moved).max() < limits[1] * scale:
+            break
+    return factors[:k], normal, weights, True
 
 
 @compiled(nogil=True, error_model="numpy")

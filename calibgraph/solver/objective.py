@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, pair_graph
 from calibgraph.solver.factor_graph import (
     RELATIVE_TOLERANCE,
@@ -23,6 +24,7 @@ from calibgraph.solver.factor_graph import (
     objective_graph,
     optimize,
     pose_key,
+    projection_graph,
 )
 from calibgraph.solver.residual_scale import ResidualScale
 
@@ -47,8 +49,8 @@ class Objective:
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: the mean of the priors.
         config: the weights lambda and mu, the loss and its scales.
         terms: which terms of Eq. 5 are used.
-        gated: after the gate, per camera the residuals of all correspondences and the scale that
-            it was drawn at; before it, empty.
+        gated: after the gate, per camera all correspondences, and the (4, 4) T_camera_lidar and the
+            scale that it was drawn at; before it, empty.
         relative_tolerance: of Levenberg-Marquardt.
         pairs: what cameras see in common, each term with its sigma.
     """
@@ -58,7 +60,7 @@ class Objective:
     T_hat: Mapping[str, Array]
     config: Config
     terms: Terms
-    gated: Mapping[str, tuple[BlockResiduals, ResidualScale]] = field(default_factory=dict)
+    gated: Mapping[str, tuple[CameraBlock, Array, ResidualScale]] = field(default_factory=dict)
     relative_tolerance: float = RELATIVE_TOLERANCE
     pairs: tuple[PairTerm, ...] = ()
 
@@ -82,20 +84,20 @@ class Objective:
         blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
         keys = {name: pose_key(self.cameras, name) for name in self.cameras}
         pairs = [pair for pair in self.pairs if {pair.a, pair.b} <= scales.keys()]
-        return join(
-            objective_graph(self.rig, blocks, self.T_hat, self.config, self.terms),
-            pair_graph(pairs, keys),
-        )
+        reprojection = projection_graph(self.cameras, blocks if self.uses_correspondences else {})
+        return join(reprojection, self.pose_graph, pair_graph(pairs, keys))
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
         """All terms but the reprojection term: priors and measured relative poses."""
-        return self.graph({})
+        return objective_graph(self.rig, {}, self.T_hat, self.config, self.terms)
 
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:
         """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
-        return {name: at.gate_hessian(scale) for name, (at, scale) in self.gated.items()}
+        return {
+            name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()
+        }
 
     def coarse(self, matches: int) -> Objective:
         """With at most so many correspondences of each camera, and less exact minima.
@@ -107,15 +109,21 @@ class Objective:
 
     def with_tolerance(self, relative_tolerance: float) -> Objective:
         """The same objective, with less exact minima."""
-        return replace(self, relative_tolerance=relative_tolerance)
+        return self._with(relative_tolerance=relative_tolerance)
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences, and the pairs of their frames."""
         if not self.pairs:
-            return replace(self, blocks=dict(blocks))
-        frames = np.concatenate([np.unique(block.frame) for block in blocks.values()])
+            return self._with(blocks=dict(blocks))
+        frames = np.concatenate([b.frame[b.frame_edges[:-1]] for b in blocks.values()])
         pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
-        return replace(self, blocks=dict(blocks), pairs=pairs)
+        return self._with(blocks=dict(blocks), pairs=pairs)
+
+    def _with(self, **fields: Any) -> Objective:
+        """With other fields, on which the terms between poses do not depend."""
+        other = replace(self, **fields)
+        other.__dict__["pose_graph"] = self.pose_graph
+        return other
 
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
@@ -199,9 +207,8 @@ class Objective:
         Raises:
             CorrespondenceError: if a camera is left with too few.
         """
-        at = {name: block.at(T_camera_lidar[name]) for name, block in self.blocks.items()}
         inliers = {
-            name: block.select(at[name].inliers(scales[name]))
+            name: block.without_outliers(T_camera_lidar[name], scales[name])
             for name, block in self.blocks.items()
         }
         for name, kept in inliers.items():
@@ -213,6 +220,5 @@ class Objective:
                     "gate is too narrow",
                     camera=name,
                 )
-        return replace(
-            self.with_blocks(inliers), gated={name: (at[name], scales[name]) for name in at}
-        )
+        gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
+        return self.with_blocks(inliers)._with(gated=gated)

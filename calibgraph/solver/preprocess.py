@@ -120,7 +120,9 @@ def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) ->
     keep = np.empty(len(table), dtype=np.bool_)
     for number, model in enumerate(rig.cameras.values()):
         rows = rows_where(camera == number)
-        keep[rows] = model.lens.are_projectable(table.points_lidar_m[rows], model.T_camera_lidar)
+        points = table.points_lidar_m
+        own = points[rows] if isinstance(rows, slice) else points.take(rows, axis=0)
+        keep[rows] = model.lens.are_projectable(own, model.T_camera_lidar)
     return keep
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import frame_pose, ransac_pnp, refine_frames, select_evenly
@@ -61,21 +61,19 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     if config.stage1 == "rig":
         named = [name for name in rig.cameras if name in table.cameras]
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
-    cameras = rig.cameras.values()
+    cameras = [*rig.cameras.values()]
     rows = [table.of_camera(name) for name in rig.cameras]
-    with core_pool() as pool:
-        common = [*pool.map(partial(_from_common_pose, config=config), cameras, rows)]
-        searches = [
-            {
-                int(i): pool.submit(frame_pose, camera, frames.rows_of(int(i)), config)
-                for i in np.flatnonzero(~frames.found)
-            }
-            for camera, frames in zip(cameras, common, strict=True)
-        ]
-        searched = [{i: search.result() for i, search in each.items()} for each in searches]
+    common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows)
+    left = [[*np.flatnonzero(~frames.found).tolist()] for frames in common]
+    searched = map_on_cores(
+        partial(frame_pose, config=config),
+        [camera for camera, numbers in zip(cameras, left, strict=True) for _ in numbers],
+        [f.rows_of(i) for f, numbers in zip(common, left, strict=True) for i in numbers],
+    )
+    poses = iter(searched)
     return {
-        name: _aggregate_frames(frames.with_poses(poses), config)
-        for name, frames, poses in zip(rig.cameras, common, searched, strict=True)
+        name: _aggregate_frames(frames.with_poses({i: next(poses) for i in numbers}), config)
+        for name, frames, numbers in zip(rig.cameras, common, left, strict=True)
     }
 
 

@@ -2,7 +2,8 @@
 
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.tracking.update import Update
 
-__all__ = ["DurableCalibrator", "Event", "IncrementalCalibrator", "Update"]
+__all__ = ["DurableCalibrator", "Event", "IncrementalCalibrator", "Update", "warm_up_tracker"]

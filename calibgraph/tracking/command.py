@@ -21,6 +21,7 @@ from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
+from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.run import Notify, follow
 from calibgraph.tracking.streams import Item, frames_of
 
@@ -67,6 +68,8 @@ def track(
     require_stdout()
     history = History()
     with _stopped_by_signals() as stop:
+        if settings.follow or str(source[0]) == "-":  # frames come at their own times
+            warm_up_tracker()
         items, calibrator = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         with calibrator:

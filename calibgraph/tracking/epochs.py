@@ -51,20 +51,17 @@ def close_epoch(
 
 def _regate(state: State, epoch: Epoch) -> Epoch:
     """The epoch with its frames gated at its newest estimate."""
-    inliers = [dict(frame.inliers) for frame in epoch.frames]
-    for camera, camera_state in enumerate(state.cameras):
-        seen = [place for place, frame in enumerate(epoch.frames) if camera in frame.raw]
-        if not seen:
-            continue
-        raw = [epoch.frames[place].raw[camera] for place in seen]
-        T_camera_lidar = to_T_camera_lidar(epoch.T_lidar_camera[camera])
-        rows = merge(raw).at(T_camera_lidar).inliers(camera_state.scale)
-        edges = np.cumsum([len(part.frame) for part in raw])[:-1]
-        for place, own in zip(seen, np.split(rows, edges), strict=True):
-            if np.count_nonzero(own) >= MIN_MATCHES:
-                inliers[place][camera] = own
-    frames = zip(epoch.frames, inliers, strict=True)
-    return replace(epoch, frames=tuple(replace(frame, inliers=own) for frame, own in frames))
+    T_camera_lidar = [*map(to_T_camera_lidar, epoch.T_lidar_camera)]
+    gates_px = [camera_state.scale.gate_px for camera_state in state.cameras]
+    frames = []
+    for frame in epoch.frames:
+        inliers = dict(frame.inliers)
+        for camera, raw in frame.raw.items():
+            rows = raw.within_gate(T_camera_lidar[camera], gates_px[camera])
+            if np.count_nonzero(rows) >= MIN_MATCHES:
+                inliers[camera] = rows
+        frames.append(replace(frame, inliers=inliers))
+    return replace(epoch, frames=tuple(frames))
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:

@@ -12,9 +12,9 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.verdict import Check
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.objective import Transforms
+from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence
@@ -63,8 +63,13 @@ def restart_checks(evidence: Evidence) -> Checks:
     if not evidence.fitted_blocks:
         return {}
     solution = evidence.solution
-    with core_pool() as pool:
-        ends = [*pool.map(partial(_solve_from_displaced_start, solution), range(RESTARTS))]
+    coarse = solution.objective.coarse(_RESTART_SAMPLE)
+    rig = solution.solved_rig
+    displaced = [
+        perturb(rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed).T_camera_lidar
+        for seed in range(RESTARTS)
+    ]
+    ends = map_on_cores(partial(_solve_from, solution, coarse), displaced)
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
     name = f"solving again from starts {starts}: largest difference"
     checks = {}
@@ -83,17 +88,14 @@ def restart_checks(evidence: Evidence) -> Checks:
     return checks
 
 
-def _solve_from_displaced_start(solution: Solution, seed: int) -> Transforms | None:
-    """The T_camera_lidar from a displaced start; None if it keeps too few matches.
+def _solve_from(solution: Solution, coarse: Objective, start: Transforms) -> Transforms | None:
+    """The T_camera_lidar from a start; None if it keeps too few matches.
 
     First coarsely with a selection of the matches, then both passes with all of them from there.
     """
-    start = perturb(
-        solution.solved_rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
-    ).T_camera_lidar
     objective = solution.objective
     try:
-        near, _ = objective.coarse(_RESTART_SAMPLE).minimize_with_scale(start)
+        near, _ = coarse.minimize_with_scale(start)
         rough, scales = objective.with_tolerance(_ROUGH).minimize_with_scale(near)
         return objective.without_outliers(rough, scales).minimize(rough, scales).T_camera_lidar
     except CorrespondenceError:
@@ -116,7 +118,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     """
     row = threshold("competing_solution")
     block, gate_px = solution.objective.blocks[camera], solution.scales[camera].gate_px
-    ours = _within_gate(block, solution.T_camera_lidar[camera], gate_px)
+    ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.select(~ours).as_table(camera=camera)
     T = None
     if len(left_out):
@@ -126,7 +128,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         )
     if T is None:
         return row.describe(0.0, "PASS", f"{row.name}: none")
-    theirs = _within_gate(block, T, gate_px)
+    theirs = block.within_gate(T, gate_px)
     degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
     same = degrees < limit("competing_rotation") and centimetres < limit("competing_translation")
     only_theirs, only_ours = int((theirs & ~ours).sum()), int((ours & ~theirs).sum())
@@ -146,8 +148,3 @@ def _ransac_iterations(fewest: float, matches: int) -> int:
     share = min(fewest / 2 / matches, 0.99)
     needed = math.log(_MISSED) / math.log1p(-(share**4)) if share > 0 else math.inf
     return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))
-
-
-def _within_gate(block: CameraBlock, T_camera_lidar: Array, gate_px: float) -> NDArray[np.bool_]:
-    errors_px, valid = block.errors_px(T_camera_lidar)
-    return np.asarray(valid & (errors_px <= gate_px))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, grade
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.augmented_fit import AugmentedFit, linearize
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import apply_twist
@@ -72,10 +72,8 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
         camera = solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name])
         return check_intrinsics(camera, evidence.fitted_blocks[name], solution.scales[name])
 
-    with core_pool() as pool:
-        return dict(
-            zip(evidence.fitted_blocks, pool.map(of_camera, evidence.fitted_blocks), strict=True)
-        )
+    names = [*evidence.fitted_blocks]
+    return dict(zip(names, map_on_cores(of_camera, names), strict=True))
 
 
 def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -> list[Check]:
@@ -86,8 +84,7 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
         block: all of the camera's matches, not only those within the gate.
         scale: of their residuals.
     """
-    step = -(-len(block.frame) // _MAX_MATCHES)
-    some = block.select(np.arange(len(block.frame)) % step == 0)
+    some = block.select_evenly(_MAX_MATCHES)
     errors_px, in_front = some.errors_px(camera.T_camera_lidar)
     table = some.select(in_front).as_table(camera="camera")
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the

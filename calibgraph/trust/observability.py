@@ -104,8 +104,10 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
 
 def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float]:
     """Distances [m] from the camera between which 96 % of its matches lie."""
-    points = block.block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-    near, far = np.quantile(np.linalg.norm(points, axis=1), [0.02, 0.98])
+    x, y, z = (
+        block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
+    )
+    near, far = np.quantile(np.sqrt(x * x + y * y + z * z), [0.02, 0.98])
     return float(near), float(far)
 
 

@@ -174,16 +174,28 @@ def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 40, 5000])
-def test_sums_at_several_poses_are_the_sums_at_each(count: int) -> None:
+def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
     block = world(LENSES["pinhole"], count).rescale(scale=3.0, sigma=0.7)
     poses = [TRUTH.retract(np.full(6, step)) for step in (0.0, 1e-3, -0.02)]
-    found = block.sums_at(poses)
-    for k, pose in enumerate(poses):
-        expected = block.sums(pose)
-        for name in ("hessian", "gradient", "cost"):
-            value = getattr(expected, name)
-            scale = np.abs(value).max() or 1.0  # sums in another order: rounding alone
-            np.testing.assert_allclose(getattr(found, name)[k], value, rtol=0, atol=1e-13 * scale)
+    found = block.gradients_at_each(poses)
+    for gradient, pose in zip(found, poses, strict=True):
+        expected = block.sums(pose).gradient
+        scale = np.abs(expected).max() or 1.0  # sums in another order: rounding alone
+        np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-13 * scale)
+
+
+def test_other_whitening_leaves_the_correspondences_in_their_place() -> None:
+    block = world(LENSES["pinhole"], 40)
+    roots = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
+    other = block.rewhiten(roots)
+    assert other.points_lidar_m.base is block.points_lidar_m.base
+    for given in (roots, roots[:, [0, 0, 0]] * [1, 0, 1], None):
+        found, expected = (b.sums(TRUTH) for b in (
+            block.rewhiten(given), replace(block, sqrt_information=given)))  # fmt: skip
+        np.testing.assert_array_equal(found.hessian, expected.hessian)
+        assert found.cost == expected.cost
+    with pytest.raises(ValueError, match=r"sqrt_information\[3\] is not finite"):
+        block.rewhiten(np.where(np.arange(40)[:, None] == 3, np.nan, roots))
 
 
 def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:

@@ -1,0 +1,51 @@
+"""The arrays of a block of correspondences: checked, read-only, and whitening by columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def read_only(array: Array) -> Array:
+    """A view that cannot be written."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    """Check an array.
+
+    Raises:
+        ValueError: if it has another shape, or values that are not finite.
+    """
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
+
+
+def join_roots(roots: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
+    """Whitening matrices of blocks under each other; the identity where a block has none."""
+    if all(root is None for root in roots):
+        return None
+    return np.concatenate([
+        np.tile([1.0, 0.0, 1.0], (count, 1)) if root is None else root
+        for root, count in zip(roots, counts, strict=True)
+    ])  # fmt: skip
+
+
+def rows_of_root(root: Array | None) -> tuple[Array | None, int]:
+    """(3, n) whitening matrices by columns, and how many of these rows the kernel takes.
+
+    One, if they are all numbers.
+    """
+    if root is None:
+        return None, 0
+    isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
+    return np.ascontiguousarray(root.T), 1 if isotropic else 3

@@ -1,0 +1,39 @@
+"""Tests of loading what updates use before the first frame comes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+PROGRAM = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from calibgraph import IncrementalCalibrator, perturb
+from calibgraph.simulation.correspondences import simulate_correspondences
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.tracking import warm_up_tracker
+
+def loaded():
+    modules = [m for n, m in sys.modules.items() if n.startswith(("calibgraph.", "factors."))]
+    kernels = {id(v): v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)}
+    return sum(len(kernel.overloads) for kernel in kernels.values())
+
+before = loaded()
+warm_up_tracker()
+warm = loaded()
+rig = rig_of("kitti")
+tracker = IncrementalCalibrator(perturb(rig, rotation_deg=1.0, translation_m=0.1))
+table = simulate_correspondences(rig, frames=30, matches=200)
+for frame in range(30):
+    tracker.update(table.select(table.frame == frame))
+print(warm - before, loaded() - warm)
+"""
+
+
+def test_after_the_warm_up_updates_load_no_code() -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True
+    )
+    by_warm_up, by_updates = map(int, found.stdout.split())
+    assert by_warm_up > 0
+    assert by_updates == 0
