@@ -88,6 +88,7 @@ class StructureMatcher:
         self.levels = levels
         self.rounds = len(levels)
         self._cache = FrameCache()
+        self._backwards = False
 
     @property
     def tracking_rounds(self) -> tuple[int, ...]:
@@ -162,7 +163,10 @@ class StructureMatcher:
     def _submit_scores(
         self, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
     ) -> dict[str, deque[Future[ShiftScores]]]:
-        """Score every camera in every frame; frame by frame, so that cameras share its windows."""
+        """Score every camera in every frame; frame by frame, so that cameras share its windows.
+
+        Every other round goes backwards: it begins with the frames that are still in the cache.
+        """
         per_frame = level.max_windows // min(len(frames), SHARING_FRAMES)
         max_windows = min(per_frame, FRAME_WINDOWS)
 
@@ -173,9 +177,11 @@ class StructureMatcher:
             )
 
         waiting: dict[str, deque[Future[ShiftScores]]] = {name: deque() for name in rig.cameras}
-        for frame in frames:
+        add = deque.appendleft if self._backwards else deque.append
+        for frame in reversed(frames) if self._backwards else frames:
             for name, camera in rig.cameras.items():
-                waiting[name].append(cores.submit(score, frame, name, camera))
+                add(waiting[name], cores.submit(score, frame, name, camera))
+        self._backwards = not self._backwards
         return waiting
 
     def _match_camera(
