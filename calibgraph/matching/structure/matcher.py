@@ -132,7 +132,7 @@ class StructureMatcher:
         self._cache.keep_only(dataset.frames)
         work = len(rig.cameras) * len(dataset.frames)
         tables, z_scores = [], {}
-        with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+        with core_pool() as cores, core_pool() as pool:  # a few cameras' scores are copied at once
             level = self.levels[round_index]
             waiting = self._submit_scores(dataset.frames, rig, level, cores)
             matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
@@ -143,6 +143,10 @@ class StructureMatcher:
                 table, z_scores[name] = next(matches)
                 tables.append(table)
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
+
+    def release(self) -> None:
+        """Drop the frames that are kept from round to round."""
+        self._cache = FrameCache()
 
     def _load_frames(
         self, frames: Sequence[Frame], rig: Rig, cores: ThreadPoolExecutor
