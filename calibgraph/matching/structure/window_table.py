@@ -101,7 +101,7 @@ class WindowTable:
             self._cloud, self._centres[missing], neighbours, keep_linear=self._keep_linear
         )
         useful = reliability > MIN_RELIABILITY
-        first, self._count = self._count, self._count + np.count_nonzero(useful)
+        first, self._count = self._count, self._count + int(np.count_nonzero(useful))
         self._windows.put(first, windows.select(useful))
         self._slots[missing] = _USELESS
         self._slots[missing[useful]] = np.arange(first, self._count)

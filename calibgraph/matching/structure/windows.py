@@ -80,7 +80,11 @@ class Windows:
 
 
 def cut_windows(
-    cloud: tuple[Array, Array], centres: Rows, neighbours: Neighbours, *, keep_linear: bool
+    cloud: tuple[Array, Array],
+    centres: NDArray[np.int32],
+    neighbours: Neighbours,
+    *,
+    keep_linear: bool,
 ) -> tuple[Windows, Array]:
     """Cut windows of the nearest rays.
 
@@ -120,7 +124,7 @@ class Neighbours:
         even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
         self._reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
 
-    def of(self, centres: Rows) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    def of(self, centres: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """The nearest rays of some of the m.
 
         Returns:
