@@ -78,6 +78,7 @@ def match_in_rounds(
     if not out_of_time():
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
+    full.release()
     return replace(run, out_of_time=out_of_time())
 
 

@@ -1,4 +1,4 @@
-"""The matcher protocol: three members that every matcher has, and four more that it may have.
+"""The matcher protocol: three members that every matcher has, and five more that it may have.
 
 `Matcher` is what a matcher of your own needs. The program works with `FullMatcher`, which has every
 member; `to_full_matcher` adds the defaults of those that are missing. In calibration they are used
@@ -8,7 +8,8 @@ in this order:
 2. `locate`: from where the rounds begin, and with which round.
 3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
 4. `tracking_rounds`: run again from a start displaced from the result.
-5. `fails_on_images`: whether the checks on images may FAIL the result.
+5. `release`: no more rounds follow.
+6. `fails_on_images`: whether the checks on images may FAIL the result.
 """
 
 from __future__ import annotations
@@ -121,6 +122,10 @@ class FullMatcher(Matcher, Protocol):
         """
         ...
 
+    def release(self) -> None:
+        """Drop what is kept from round to round; by default, nothing is."""
+        ...
+
 
 class CompletedMatcher:
     """A matcher with defaults in place of the members that it lacks: the only place of defaults."""
@@ -133,6 +138,7 @@ class CompletedMatcher:
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
         self.fails_on_images = bool(getattr(matcher, "fails_on_images", False))
         self._locate = getattr(matcher, "locate", None)
+        self._release = getattr(matcher, "release", None)
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
@@ -148,6 +154,11 @@ class CompletedMatcher:
     ) -> Correspondences:
         """The matcher's own correspondences."""
         return self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
+
+    def release(self) -> None:
+        """Drop what the matcher keeps from round to round."""
+        if self._release is not None:
+            self._release()
 
 
 def to_full_matcher(matcher: Matcher) -> FullMatcher:

@@ -55,6 +55,9 @@ class Complete:
         findings = MatcherFindings(z_score=dict.fromkeys(rig.cameras, 20.0))
         return replace(simulate(dataset, self.truth), metadata=findings.to_metadata())
 
+    def release(self) -> None:
+        self.calls.append(("release", 0, 0.0))
+
     def error_m(self, rig: Rig) -> float:
         errors = calibgraph.evaluate(rig, self.truth).cameras.values()
         return max(error.translation_error_cm for error in errors) / 100
@@ -86,6 +89,7 @@ def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
     assert start.findings == MatcherFindings()
     table = full.match(data, truth, round_index=0, progress=no_progress)
     assert len(np.unique(table.frame)) == 6
+    full.release()  # of nothing
 
 
 def test_a_minimal_matcher_calibrates(truth: Rig) -> None:
@@ -101,12 +105,13 @@ def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
     matcher = Complete(truth)
     data = calibgraph.load_dataset(SAMPLE, guess)
     run = match_in_rounds(data, matcher=matcher, progress=no_progress)
-    located, first, second, near, last = matcher.calls
+    located, first, second, near, last, end = matcher.calls
     assert located[:2] == ("locate", 2) and located[2] > 0.2  # most_frames, from the guess
     assert first == ("match 1", 2, pytest.approx(0.0, abs=1e-9))  # first_round, from the start
     assert second[0] == "match 2"
     assert (near[0], last[0]) == ("match 1", "match 2")  # tracking_rounds, then the last round
     assert near[2] > 0.05 > last[2]  # from a displaced start
+    assert end[0] == "release"
     assert run.rematch is not None and run.rematch.again is not None
     assert run.matcher.fails_on_images
 

@@ -130,6 +130,9 @@ class CmrNextMatcher:
         }
         return replace(concatenate(tables), metadata=metadata)
 
+    def release(self) -> None:
+        """Nothing is kept of frames."""
+
     def _load(self, path: str) -> FlowMatcher:
         checkpoint = load_checkpoint(path)
         return FlowMatcher(

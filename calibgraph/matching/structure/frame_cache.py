@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.io.dataset import Frame
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.window_table import WindowTables
+from calibgraph.memory import keep
 from calibgraph.model.rig import Camera
 from calibgraph.parallel import Once
 
@@ -18,8 +19,14 @@ FileVersion = tuple[Path, int, int]
 """Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
 
 
+MAX_IMAGE_BYTES, MAX_CLOUD_BYTES = 1_500_000_000, 500_000_000
+
+
 class FrameCache:
-    """Clouds and images, decoded once from round to round; and the clouds' windows."""
+    """Clouds and images, decoded once from round to round; and the clouds' windows.
+
+    Those used last are kept, up to ``MAX_IMAGE_BYTES`` and ``MAX_CLOUD_BYTES``.
+    """
 
     def __init__(self) -> None:
         self._clouds: Once[FileVersion, PreparedCloud] = Once()
@@ -35,15 +42,19 @@ class FrameCache:
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
-        return self._clouds.get(
+        cloud = self._clouds.get(
             _file_version(frame.cloud_path),
             lambda: PreparedCloud.from_points(frame.load_cloud(), self._tables),
         )
+        self._clouds.keep_last(MAX_CLOUD_BYTES, lambda cloud: cloud.nbytes)
+        return cloud
 
     def image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the camera's image, gray; its size is checked against the camera's."""
         key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
-        return self._images.get(key, lambda: frame.load_gray(name, camera))
+        image = self._images.get(key, lambda: keep(frame.load_gray(name, camera)))
+        self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)
+        return image
 
 
 def _file_version(path: Path) -> FileVersion:

@@ -88,6 +88,7 @@ class StructureMatcher:
         self.levels = levels
         self.rounds = len(levels)
         self._cache = FrameCache()
+        self._backwards = False
 
     @property
     def tracking_rounds(self) -> tuple[int, ...]:
@@ -131,7 +132,7 @@ class StructureMatcher:
         self._cache.keep_only(dataset.frames)
         work = len(rig.cameras) * len(dataset.frames)
         tables, z_scores = [], {}
-        with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+        with core_pool() as cores, core_pool() as pool:  # a few cameras' scores are copied at once
             level = self.levels[round_index]
             waiting = self._submit_scores(dataset.frames, rig, level, cores)
             matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
@@ -142,6 +143,10 @@ class StructureMatcher:
                 table, z_scores[name] = next(matches)
                 tables.append(table)
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
+
+    def release(self) -> None:
+        """Drop the frames that are kept from round to round."""
+        self._cache = FrameCache()
 
     def _load_frames(
         self, frames: Sequence[Frame], rig: Rig, cores: ThreadPoolExecutor
@@ -162,7 +167,10 @@ class StructureMatcher:
     def _submit_scores(
         self, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
     ) -> dict[str, deque[Future[ShiftScores]]]:
-        """Score every camera in every frame; frame by frame, so that cameras share its windows."""
+        """Score every camera in every frame; frame by frame, so that cameras share its windows.
+
+        Every other round goes backwards: it begins with the frames that are still in the cache.
+        """
         per_frame = level.max_windows // min(len(frames), SHARING_FRAMES)
         max_windows = min(per_frame, FRAME_WINDOWS)
 
@@ -173,9 +181,11 @@ class StructureMatcher:
             )
 
         waiting: dict[str, deque[Future[ShiftScores]]] = {name: deque() for name in rig.cameras}
-        for frame in frames:
+        add = deque.appendleft if self._backwards else deque.append
+        for frame in reversed(frames) if self._backwards else frames:
             for name, camera in rig.cameras.items():
-                waiting[name].append(cores.submit(score, frame, name, camera))
+                add(waiting[name], cores.submit(score, frame, name, camera))
+        self._backwards = not self._backwards
         return waiting
 
     def _match_camera(

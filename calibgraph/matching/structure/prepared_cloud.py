@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.matching.structure.directions import scan_angles
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.window_table import WindowTable, WindowTables
+from calibgraph.memory import keep
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
 
@@ -54,11 +55,16 @@ class PreparedCloud:
         intensity = np.nan_to_num(cloud[far, 3].astype(np.float64))
         hidden = ~find_visible(scan_angles(points), distance_m, ORIGIN_CELL_RAD)
         return PreparedCloud(
-            points,
-            rankdata(intensity) / max(1, len(intensity)),
+            keep(points),
+            keep(rankdata(intensity) / max(1, len(intensity))),
             seen_from_origin=bool(hidden.sum() <= MAX_HIDDEN_FROM_ORIGIN * len(hidden)),
             tables=tables or WindowTables(),
         )
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory, without its windows."""
+        return self.points_lidar_m.nbytes + self.intensity_rank.nbytes
 
     def viewpoint_lidar_m(self, camera: Camera) -> Array:
         """(3,) from where windows are cut: the LiDAR if it is at the origin, else the camera."""
@@ -79,8 +85,9 @@ class PreparedCloud:
         """
 
         def make() -> WindowTable:
+            points = self.points_lidar_m
             return WindowTable(
-                self.points_lidar_m - self.viewpoint_lidar_m(camera),
+                points if self.seen_from_origin else points - self.viewpoint_lidar_m(camera),
                 self.intensity_rank,
                 np.arange(len(usable)) if self.seen_from_origin else np.flatnonzero(usable),
                 spacing_rad=spacing_rad,

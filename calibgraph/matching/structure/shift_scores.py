@@ -16,6 +16,7 @@ from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
 from calibgraph.matching.structure.windows import Windows
+from calibgraph.memory import reserve
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
@@ -28,6 +29,7 @@ MIN_GROUP_WINDOWS = 4
 MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
 MAX_COVERED = 0.3  # share of a window that something nearer may cover at a coarse level
 OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample each
+VARIANCES = 256  # grids of which they are computed at once, in double precision
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
@@ -57,7 +59,9 @@ class ShiftScores:
     @cached_property
     def chance_sigma(self) -> float:
         """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
-        return float(np.sqrt(self.grids.var(axis=(1, 2), dtype=np.float64).sum()))
+        parts = np.split(self.grids, range(VARIANCES, len(self.grids), VARIANCES))
+        variances = [part.var(axis=(1, 2), dtype=np.float64) for part in parts]
+        return float(np.sqrt(np.concatenate(variances).sum()))
 
 
 def score_frame(
@@ -82,7 +86,7 @@ def score_frame(
     places = find_places(windows.rays_m, viewpoint_m, camera, scale)
     reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
-    grids = np.zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
+    grids: Grids = reserve((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, image, places, windows, group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
     centres = _mean_by_group(centres_lidar_m, group, counts)
@@ -119,9 +123,11 @@ def select_windows(
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     """The groups of several frames of one camera in one object."""
-    columns = ("grids", "jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
+    columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
-    return ShiftScores(**stacked, steps_per_px=scores[0].steps_per_px)
+    grids: Grids = reserve((len(stacked["counts"]), *scores[0].grids.shape[1:]), np.float32)
+    np.concatenate([s.grids for s in scores], out=grids)
+    return ShiftScores(**stacked, grids=grids, steps_per_px=scores[0].steps_per_px)
 
 
 def pad_grids(scores: Sequence[ShiftScores]) -> list[ShiftScores]:

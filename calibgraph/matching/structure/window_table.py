@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.directions import thin
-from calibgraph.matching.structure.windows import Neighbours, Windows, cut_windows
+from calibgraph.matching.structure.windows import (
+    Neighbours,
+    Windows,
+    cut_windows,
+    to_directions,
+)
+from calibgraph.memory import keep, reserve
 from calibgraph.parallel import Once
 
 Array = NDArray[np.float64]
@@ -17,7 +23,8 @@ Rows = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
-MAX_BYTES = 500_000_000  # of all tables of a cache
+MAX_BYTES = 500_000_000  # of all tables of a cache, without the trees of neighbours
+MAX_TREE_BYTES = 100_000_000  # of their trees: most of a table, and of use only while it is cut
 _UNCUT, _USELESS = -1, -2
 
 
@@ -46,17 +53,16 @@ class WindowTable:
         stride_spacings: float,
         keep_linear: bool,
     ) -> None:
-        directions = rays_m[rows]
-        directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = to_directions(rays_m[rows])
         kept = thin(directions, spacing_rad)
-        self._rows = rows[kept]
-        self._cloud = rays_m[self._rows], intensity_rank[self._rows]
-        self._neighbours = Neighbours(directions[kept], spacing_rad)
         centres = thin(directions[kept], stride_spacings * spacing_rad)
-        self._centres = np.random.default_rng(0).permutation(centres)
-        self._slots = np.full(len(centres), _UNCUT, np.int32)
-        self._windows = Windows.empty()
-        self._keep_linear = keep_linear
+        self._cloud = rays_m, intensity_rank
+        self._rows = keep(rows[kept].astype(np.int32))
+        self._centres = keep(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._slots = keep(np.full(len(centres), _UNCUT, np.int32))
+        self._windows, self._count = Windows.empty(len(centres), reserve), 0
+        self._neighbours: Neighbours | None = None
+        self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._lock = Lock()
 
     def cut(
@@ -75,39 +81,50 @@ class WindowTable:
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
         windows, slots = self._take(chosen[:max_windows])
-        rows = self._rows[windows.members[slots]]
+        rows = windows.members[slots]
         covered = (windows.front[slots] & ~clear[rows]).mean(axis=1)
         return windows.select(slots[in_view[rows].all(axis=1) & (covered <= max_covered)])
 
     def _take(self, chosen: Rows) -> tuple[Windows, NDArray[np.int32]]:
-        """All windows that have been cut, and the rows of those of some centres."""
+        """Room for all windows, and the rows of those of some centres, which are cut."""
         with self._lock:
             missing = chosen[self._slots[chosen] == _UNCUT]
             if len(missing):
-                windows, reliability = cut_windows(
-                    self._cloud,
-                    self._centres[missing],
-                    self._neighbours,
-                    keep_linear=self._keep_linear,
-                )
-                useful = reliability > MIN_RELIABILITY
-                first = len(self._windows.counts)
-                self._slots[missing] = _USELESS
-                self._slots[missing[useful]] = first + np.arange(np.count_nonzero(useful))
-                self._windows = self._windows.join(windows.select(useful))
+                self._cut_missing(missing)
             slots = self._slots[chosen]
             return self._windows, slots[slots >= 0]
 
+    def _cut_missing(self, missing: Rows) -> None:
+        neighbours = self._neighbours or Neighbours(self._cloud[0], self._rows, self._spacing_rad)
+        self._neighbours = neighbours
+        windows, reliability = cut_windows(
+            self._cloud, self._centres[missing], neighbours, keep_linear=self._keep_linear
+        )
+        useful = reliability > MIN_RELIABILITY
+        first, self._count = self._count, self._count + int(np.count_nonzero(useful))
+        self._windows.put(first, windows.select(useful))
+        self._slots[missing] = _USELESS
+        self._slots[missing[useful]] = np.arange(first, self._count)
+
     @property
     def nbytes(self) -> int:
-        """Size in memory."""
-        rays_m, _ = self._cloud
-        own = (self._rows, *self._cloud, rays_m, self._centres, self._slots)  # rays: in a tree too
-        return self._windows.nbytes + sum(values.nbytes for values in own)
+        """Size in memory, without the tree of neighbours and the cloud."""
+        cut = self._count * self._windows.nbytes // max(1, len(self._centres))
+        return cut + self._rows.nbytes + self._centres.nbytes + self._slots.nbytes
+
+    @property
+    def tree_nbytes(self) -> int:
+        """Size in memory of the tree of neighbours; 0 if there is none now."""
+        neighbours = self._neighbours
+        return neighbours.nbytes if neighbours else 0
+
+    def drop_tree(self) -> None:
+        """Drop the tree of neighbours; it is built again when it is needed."""
+        self._neighbours = None
 
 
 class WindowTables:
-    """The tables of several clouds: those used last, up to ``MAX_BYTES``."""
+    """The tables of several clouds: those used last, up to ``MAX_BYTES`` and ``MAX_TREE_BYTES``."""
 
     def __init__(self) -> None:
         self._tables: Once[tuple[Hashable, ...], WindowTable] = Once()
@@ -116,7 +133,15 @@ class WindowTables:
         """The table of a key, of which the first is the cloud; made if it is not there."""
         table = self._tables.get(key, make)
         self._tables.keep_last(MAX_BYTES, lambda table: table.nbytes)
+        self._keep_last_trees()
         return table
+
+    def _keep_last_trees(self) -> None:
+        total = 0
+        for table in reversed(self._tables.values()):
+            total += table.tree_nbytes
+            if total > MAX_TREE_BYTES:
+                table.drop_tree()
 
     def keep_only(self, clouds: Iterable[Hashable]) -> None:
         """Drop the tables of all other clouds."""

@@ -9,7 +9,9 @@ it. Windows belong to a cloud and a viewpoint: they are cut once, see
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ WINDOW_POINTS = 25  # samples of a window; fewer cannot hold an edge and both it
 MIN_WINDOW_POINTS = 9
 WINDOW_STRETCH = 4.0  # longest window by the radius of an even one: room for single scan lines
 MIN_SPACING_RAD = np.radians(0.15)  # few sensors sample more finely along their scan lines
+_TREE_NODE_BYTES = 72
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class Windows:
         rays_m: (w, WINDOW_POINTS, 3) from the viewpoint, along the axes of the LiDAR frame, to
             the points, the window's centre first. Points behind a silhouette are moved along
             their rays to its distance, which determines where the silhouette is in the image.
-        members: (w, WINDOW_POINTS) the same points, as indices into those that were given.
+        members: (w, WINDOW_POINTS) the same points, as rows of the cloud.
         front: (w, WINDOW_POINTS) which of them are not behind a silhouette.
         counts: (w,) how many of the members are in use: the first ones.
         basis: (w, WINDOW_POINTS, 4) columns: inverse range and intensity (orthonormal, shrunk where
@@ -50,25 +53,25 @@ class Windows:
     basis: NDArray[np.float32]
 
     @staticmethod
-    def empty(count: int = 0) -> Windows:
-        """Room for so many windows."""
+    def empty(count: int, make: Callable[..., NDArray[Any]] = np.empty) -> Windows:
+        """Room for so many windows, in arrays that are made from their shapes and dtypes."""
         shape = (count, WINDOW_POINTS)
         return Windows(
-            rays_m=np.empty((*shape, 3), np.float32),
-            members=np.empty(shape, np.int32),
-            front=np.empty(shape, np.bool_),
-            counts=np.empty(count, np.int32),
-            basis=np.empty((*shape, 4), np.float32),
+            rays_m=make((*shape, 3), np.float32),
+            members=make(shape, np.int32),
+            front=make(shape, np.bool_),
+            counts=make((count,), np.int32),
+            basis=make((*shape, 4), np.float32),
         )
 
     def select(self, rows: Mask | Rows) -> Windows:
         """Some of the windows."""
         return Windows(**{name: values[rows] for name, values in vars(self).items()})
 
-    def join(self, others: Windows) -> Windows:
-        """These windows, then others."""
-        pairs = {name: (values, getattr(others, name)) for name, values in vars(self).items()}
-        return Windows(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+    def put(self, first: int, others: Windows) -> None:
+        """Write others in place of the windows from a row on."""
+        for name, values in vars(others).items():
+            getattr(self, name)[first : first + len(values)] = values
 
     @property
     def nbytes(self) -> int:
@@ -77,15 +80,19 @@ class Windows:
 
 
 def cut_windows(
-    cloud: tuple[Array, Array], centres: Rows, neighbours: Neighbours, *, keep_linear: bool
+    cloud: tuple[Array, Array],
+    centres: NDArray[np.int32],
+    neighbours: Neighbours,
+    *,
+    keep_linear: bool,
 ) -> tuple[Windows, Array]:
     """Cut windows of the nearest rays.
 
     Args:
-        cloud: (n, 3) rays from the viewpoint to thinned points, along the axes of the LiDAR
-            frame [m]; (n,) their intensity ranks.
-        centres: (w,) rows of the windows' centres.
-        neighbours: of the rays.
+        cloud: (n, 3) rays from the viewpoint to the points, along the axes of the LiDAR frame
+            [m]; (n,) their intensity ranks.
+        centres: (w,) of the neighbours' rays, those that are the windows' centres.
+        neighbours: of the thinned rays.
         keep_linear: keep the linear parts of the variation.
 
     Returns:
@@ -106,19 +113,37 @@ class Neighbours:
     """The nearest rays of any ray.
 
     Args:
-        directions: (n, 3) unit vectors.
-        spacing_rad: of the rays.
+        rays_m: (n, 3) of a cloud.
+        rows: (m,) those that have neighbours and are some.
+        spacing_rad: between them.
     """
 
-    def __init__(self, directions: Array, spacing_rad: float) -> None:
-        self._tree = cKDTree(directions, balanced_tree=False)
+    def __init__(self, rays_m: Array, rows: NDArray[np.int32], spacing_rad: float) -> None:
+        self._rows = rows
+        self._tree = cKDTree(to_directions(rays_m[rows]), balanced_tree=False)
         even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
         self._reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
 
-    def of(self, centres: Rows) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """(w, WINDOW_POINTS) rows, the centre first and in place of missing ones; (w,) how many."""
-        _, rows = self._tree.query(
+    def of(self, centres: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The nearest rays of some of the m.
+
+        Returns:
+            (w, WINDOW_POINTS) rows of the cloud, the centre first and in place of missing ones;
+            (w,) how many there are.
+        """
+        _, nearest = self._tree.query(
             self._tree.data[centres], WINDOW_POINTS, distance_upper_bound=self._reach
         )
-        found = rows < self._tree.n
-        return np.where(found, rows, centres[:, None]).astype(np.int32), found.sum(axis=1)
+        found = nearest < self._tree.n
+        return self._rows[np.where(found, nearest, centres[:, None])], found.sum(axis=1)
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        tree = self._tree
+        return int(tree.data.nbytes + tree.indices.nbytes + tree.size * _TREE_NODE_BYTES)
+
+
+def to_directions(rays: Array) -> Array:
+    """Rays (n, 3) as unit vectors."""
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -1,0 +1,30 @@
+"""Arrays for values that are kept for long, apart from the heap."""
+
+from __future__ import annotations
+
+import math
+import mmap
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def reserve(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """An array of zeros in pages of its own, of which only those written take memory.
+
+    They return to the system with the array. On the heap, arrays that are kept would lie between
+    the temporary ones of several threads, and hold these threads' memory.
+    """
+    count, flags = math.prod(shape), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    pages = mmap.mmap(-1, max(1, count * np.dtype(dtype).itemsize), flags=flags)
+    return np.frombuffer(pages, dtype, count).reshape(shape)
+
+
+def keep(values: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A copy of an array in pages of its own, see :func:`reserve`."""
+    kept: NDArray[Scalar] = reserve(values.shape, values.dtype)
+    kept[...] = values
+    return kept
