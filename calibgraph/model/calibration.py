@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.files import sha256, write_yaml
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_covariance, relative_transform
@@ -101,6 +102,8 @@ class Calibration:
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
             its last round.
+        camera_matches: what cameras see in common, with the surfaces that were used; None if it was
+            not looked for.
         inputs: SHA-256 of the input files, by path.
         versions: of this package and the libraries that matter.
     """
@@ -122,6 +125,7 @@ class Calibration:
     frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     correspondences: Correspondences | None = None
+    camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=_versions)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.model.camera_matches import CameraMatches
@@ -70,13 +71,30 @@ def solve_joint(
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
-    if camera_matches is not None:                                         # ours: camera pairs
-        with watch("camera_pairs"):
-            inliers, optimum = refine_with_pairs(inliers, optimum, scales, camera_matches)
-
     counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
-    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+    found = Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+    return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
+    """Refine a solution with what its cameras see in common, which is no part of the paper.
+
+    Args:
+        solution: what it has used of other camera matches is left out.
+        matches: with surfaces, taken near the solution; from the correspondences' frames.
+
+    Returns:
+        The same optimum where no pair of cameras has enough in common.
+    """
+    alone, watch = solution.without_pairs(), Stopwatch()
+    with watch("camera_pairs"):
+        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, matches)
+    timings_s = {**solution.timings_s, **watch.seconds}
+    found = replace(alone, timings_s=timings_s, camera_matches=matches)
+    if not inliers.pairs:
+        return found
+    return replace(found, inliers=inliers, optimum=optimum, before_pairs=alone.optimum)
 
 
 def count_correspondences(
