@@ -64,7 +64,7 @@ def calibrate(
     run = match_in_rounds(                                   # match -> solve_joint, in rounds
         dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
     )  # fmt: skip
-    run = tie_cameras(run, report)                           # what cameras see in common
+    run = tie_cameras(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
     with run.watch("checks"):

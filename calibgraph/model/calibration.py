@@ -22,6 +22,7 @@ from calibgraph.model.geometry import relative_covariance, relative_transform
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
+    CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
     VERDICT_KEY,
     require_replaceable,
@@ -182,7 +183,7 @@ class Calibration:
         return replace(self, inputs=dict(inputs))
 
     def save(self, folder: Path | str) -> Path:
-        """Write ``calibration.yaml``, and the correspondences if there are any, into a folder.
+        """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
 
         Each file appears whole or not at all. Returns the path of the YAML file.
 
@@ -191,15 +192,24 @@ class Calibration:
         """
         path = Path(folder) / CALIBRATION_FILE
         require_replaceable(path.parent)
-        table, table_hash = path.with_name(CORRESPONDENCES_FILE), None
-        if self.correspondences is not None:
-            marked = {**self.correspondences.metadata, VERDICT_KEY: self.verdict.status}
-            replace(self.correspondences, metadata=marked).save(table)
-            table_hash = sha256(table)
-        else:
-            table.unlink(missing_ok=True)  # an older result's
-        write_yaml(path, {**self._to_mapping(), "correspondences_sha256": table_hash})
+        hashes = {
+            "correspondences_sha256": self._save_table(
+                self.correspondences, path.with_name(CORRESPONDENCES_FILE)
+            ),
+            "camera_matches_sha256": self._save_table(
+                self.camera_matches, path.with_name(CAMERA_MATCHES_FILE)
+            ),
+        }
+        write_yaml(path, {**self._to_mapping(), **hashes})
         return path
+
+    def _save_table(self, table: Correspondences | CameraMatches | None, path: Path) -> str | None:
+        """Write a table, marked with the verdict, or remove an older result's; its SHA-256."""
+        if table is None:
+            path.unlink(missing_ok=True)
+            return None
+        replace(table, metadata={**table.metadata, VERDICT_KEY: self.verdict.status}).save(path)
+        return sha256(path)
 
     def __repr__(self) -> str:
         return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
@@ -90,11 +91,33 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     alone, watch = solution.without_pairs(), Stopwatch()
     with watch("camera_pairs"):
         inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, matches)
-    timings_s = {**solution.timings_s, **watch.seconds}
-    found = replace(alone, timings_s=timings_s, camera_matches=matches)
-    if not inliers.pairs:
-        return found
-    return replace(found, inliers=inliers, optimum=optimum, before_pairs=alone.optimum)
+    return replace(
+        alone,
+        inliers=inliers,
+        optimum=optimum,
+        counts=count_common_features(alone.counts, inliers.pairs),
+        timings_s={**solution.timings_s, **watch.seconds},
+        camera_matches=matches,
+        before_pairs=alone.optimum if inliers.pairs else None,
+    )
+
+
+def count_common_features(
+    counts: Mapping[str, Mapping[str, int]], pairs: Sequence[PairTerm]
+) -> dict[str, dict[str, int]]:
+    """The counts, with the features of each camera that is part of a pair."""
+    features: dict[str, int] = {}
+    for pair in pairs:
+        for name in (pair.a, pair.b):
+            features[name] = features.get(name, 0) + len(pair.frame)
+    others = {
+        name: {key: value for key, value in of_camera.items() if key != "common_features"}
+        for name, of_camera in counts.items()
+    }
+    return {
+        name: {**of_camera, "common_features": features[name]} if name in features else of_camera
+        for name, of_camera in others.items()
+    }
 
 
 def count_correspondences(

@@ -119,7 +119,7 @@ def covariance_of_fit(
         covariance_a: (6, 6) by which A was held.
     """
     hessian = np.zeros((12, 12))
-    hessian[:6, :6] = np.linalg.inv(covariance_a)
+    hessian[:6, :6] = np.linalg.pinv(covariance_a, hermitian=True)
     for term in terms:
         rows = np.r_[tuple(pose_rows(names.index(name)) for name in (term.a, term.b))]
         scaled = term.with_sigma(term.sigma_px(T_camera_lidar))
