@@ -12,9 +12,9 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.frame_weights import weigh_all_frames
-from calibgraph.solver.objective import Objective
+from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.solution import Solution
@@ -54,12 +54,13 @@ def solve_joint(
 
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
-        require_determined(rig, kept.counts)                               # Preprocessing
+        tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
+        require_determined(rig, kept.counts, tied)                         # Preprocessing
 
     with watch("stage1"):
         pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
         blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
-        start = best_start(rig, blocks, pairwise, config, terms)           # x_0
+        start = best_start(rig, blocks, pairwise, config, terms, tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights
         frames = weigh_all_frames(kept.table, blocks, pairwise, start, config, terms)

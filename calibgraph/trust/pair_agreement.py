@@ -64,8 +64,9 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     solution, covariance = own.solution, _covariance(own)
     checks: dict[str, list[Check]] = {name: [] for name in own.cameras}
     for found in pair_agreements(solution.solved_rig, matches, covariance, solution.config):
-        for name in (found.a, found.b):
-            checks[name].append(_check_agreement(found))
+        if own.fitted_blocks.keys() >= {found.a, found.b}:
+            for name in (found.a, found.b):
+                checks[name].append(_check_agreement(found))
     return checks
 
 
