@@ -5,16 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.dataset import spread_out
-from calibgraph.matching.camera_pairs import match_cameras, overlapping_pairs, with_surfaces
+from calibgraph.matching.camera_pairs import match_some_frames, overlapping_pairs, with_surfaces
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.progress import Progress
 from calibgraph.solver.joint import add_camera_pairs
-
-PAIR_FRAMES = 4
-"""So many frames of a recording. On KITTI 2 to 10 give relative poses within 0.01 deg and 0.2 cm of
-each other."""
 
 _TIMES_SURFACES = 2  # the second changes results by up to 0.003 deg and 0.2 cm, a third by 0.1 cm
 
@@ -43,20 +38,15 @@ def tie_cameras(run: MatchingRun, progress: Progress) -> MatchingRun:
 
 def _match_cameras(run: MatchingRun, progress: Progress) -> CameraMatches | None:
     """The matches of the cameras that can overlap; None if there are none."""
-    frames = spread_out(run.dataset.frames, PAIR_FRAMES)
     with run.watch("match_cameras"):
         missed = run.correspondences.findings.missed.keys()
-        near = overlapping_pairs(run.solution.solved_rig, frames[0].load_cloud())
+        cloud = run.dataset.frames[0].load_cloud()
+        near = overlapping_pairs(run.solution.solved_rig, cloud)
         pairs = [pair for pair in near if missed.isdisjoint(pair)]
         if not pairs:
             return None
-        return match_cameras(
-            run.dataset,
-            run.guess,
-            frames=frames,
-            pairs=pairs,
-            seed=run.solution.config.seed,
-            progress=progress,
+        return match_some_frames(
+            run.dataset, run.guess, pairs, seed=run.solution.config.seed, progress=progress
         )
 
 

@@ -107,7 +107,7 @@ def solve(
     Raises:
         FileError: if the file cannot be read, or holds wrong values.
         CorrespondenceError: if a camera cannot be determined: fewer than 6 usable correspondences
-            and no relative pose that ties it to a camera that has more.
+            and neither a relative pose nor common features that tie it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)

@@ -114,3 +114,18 @@ def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: 
         result.save(tmp_path)
     with pytest.raises(calibgraph.FileError, match="is not the table of"):
         calibgraph.load_calibration(tmp_path)
+
+
+def test_a_camera_without_correspondences_is_calibrated_by_its_neighbour(
+    data: Dataset, truth: Rig
+) -> None:
+    """Its guess is 1 deg and 10 cm off; the camera on the other side sees nothing in common."""
+    table = table_of(truth)
+    off = perturb(truth, rotation_deg=1, translation_m=0.1, seed=2).T_camera_lidar[PAIR[1]]
+    guess = truth.moved_to({PAIR[1]: off})
+    without = {n: table.select(table.camera_index != table.cameras.index(n)) for n in truth.cameras}
+    result = calibgraph.calibrate(data, guess, without[PAIR[1]])
+    assert pair_error(result.rig, truth)[0] < 0.2
+    assert result.camera_verdicts[PAIR[1]].status != "PASS"
+    with pytest.raises(calibgraph.CorrespondenceError, match="'left' has 0 usable"):
+        calibgraph.calibrate(data, guess, without["left"])

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.io.dataset import Dataset, Frame, spread_out
 from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.surfaces import planes_at
@@ -22,6 +22,10 @@ from factors import unproject
 
 Array = NDArray[np.float64]
 Pair = tuple[str, str]
+PAIR_FRAMES = 3
+"""So many frames of a recording are enough: on KITTI, 2 to 10 give relative poses within 0.01 deg
+and 0.3 cm of each other, and 3 take a tenth of the time of a run."""
+
 GrayLoader = Callable[[Frame, str, Camera], NDArray[np.uint8]]
 
 
@@ -68,6 +72,19 @@ def match_cameras(
     tables = [_agreeing(rig, pair, parts, seed) for pair, parts in found.items() if parts]
     metadata = {"camera_features": "sift", "seed": seed}
     return concatenate_camera_matches([CameraMatches.empty(tuple(rig.cameras), metadata), *tables])
+
+
+def match_some_frames(
+    dataset: Dataset,
+    rig: Rig,
+    pairs: Iterable[Pair] | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> CameraMatches:
+    """The matches of as many frames as a calibration needs; arguments as of `match_cameras`."""
+    frames = spread_out(dataset.frames, PAIR_FRAMES)
+    return match_cameras(dataset, rig, frames=frames, pairs=pairs, seed=seed, progress=progress)
 
 
 def _match_frame(
