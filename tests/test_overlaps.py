@@ -56,7 +56,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
     assert tied.solution.camera_matches.pairs() == [PAIR]
     before, after = (pair_error(each.solution.solved_rig, truth) for each in (run, tied))
     assert before[0] > 0.25
-    assert after[0] < before[0] / 3
+    assert after[0] < before[0] / 2
     alone = tied.solution.without_pairs()
     for name, T in run.solution.T_camera_lidar.items():
         np.testing.assert_array_equal(alone.T_camera_lidar[name], T)
