@@ -58,18 +58,8 @@ def load_calibration(path: Path | str) -> Calibration:
             bootstrap={k: np.array(v) for k, v in content["bootstrap_covariance"].items()},
             frames=tuple(content["frames_used"]),
             rounds=tuple(content["rounds"]),
-            correspondences=_table(
-                path.with_name(CORRESPONDENCES_FILE),
-                content,
-                "correspondences_sha256",
-                load_correspondences,
-            ),
-            camera_matches=_table(
-                path.with_name(CAMERA_MATCHES_FILE),
-                content,
-                "camera_matches_sha256",
-                load_camera_matches,
-            ),
+            correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
+            camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
             **{name: content[name] for name in _PLAIN},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -109,23 +99,24 @@ assert {*_PLAIN} <= {f.name for f in fields(Calibration)}
 
 
 def _table(
-    path: Path, content: Mapping[str, Any], key: str, load: Callable[[Path], Table]
+    result: Path, name: str, content: Mapping[str, Any], load: Callable[[Path], Table]
 ) -> Table | None:
     """A table of the result, if there is one.
 
     Args:
-        path: of the table.
-        content: of the result.
-        key: of the table's SHA-256 in it; results of earlier versions have none.
-        load: reads it.
+        result: path of the result's file.
+        name: of the table's file beside it.
+        content: of the result, with the table's hash; results of earlier versions have none.
+        load: reads the table.
 
     Raises:
         FileError: if it is another table than that of the result.
     """
+    path = result.with_name(name)
     if not path.is_file():
         return None
     found = sha256(path)
-    if found != content.get(key, found):
+    if found != content.get(f"{path.stem}_sha256", found):
         raise FileError(
             path, f"is not the table of the {CALIBRATION_FILE} beside it; move it, or put the "
             "result's own there"

@@ -50,9 +50,8 @@ def match_cameras(
         frames: of the dataset; all of them if None.
         pairs: of cameras, A before B in the rig's order; all of them if None.
         seed: of the choice of samples.
-        load_gray: returns the (height, width) gray image of a frame, a camera's name and its lens;
-            by default, decodes the frame's file.
-        progress: called with the stage, its steps done, and their number.
+        load_gray: (height, width) gray image of a frame, a camera's name and its lens.
+        progress: called as frames are done.
 
     Returns:
         Matches without surfaces; see :func:`with_surfaces`.
