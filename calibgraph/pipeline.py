@@ -22,6 +22,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Verdict
+from calibgraph.overlaps import tie_cameras
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
@@ -63,6 +64,7 @@ def calibrate(
     run = match_in_rounds(                                   # match -> solve_joint, in rounds
         dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
     )  # fmt: skip
+    run = tie_cameras(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
     with run.watch("checks"):
@@ -105,7 +107,7 @@ def solve(
     Raises:
         FileError: if the file cannot be read, or holds wrong values.
         CorrespondenceError: if a camera cannot be determined: fewer than 6 usable correspondences
-            and no relative pose that ties it to a camera that has more.
+            and neither a relative pose nor common features that tie it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
@@ -140,6 +142,7 @@ def to_calibration(evidence: Evidence, checks: Checks) -> Calibration:
         prior_share=evidence.prior_shares,
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
+        camera_matches=solution.camera_matches,
     )
 
 

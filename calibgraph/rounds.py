@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
@@ -107,11 +109,16 @@ def _solve(
     """The joint solve; where there is too little to solve from, with a hint about the guess.
 
     Raises:
-        CorrespondenceError: if a camera has too few correspondences.
+        CorrespondenceError: if a camera has too few correspondences, and what it sees in common
+            with another does not place it.
     """
     try:
         return solve_joint(*matched, config, terms)
     except CorrespondenceError as error:
+        with suppress(CalibrationError, OSError):
+            matches = match_some_frames(dataset, guess, seed=config.seed)
+            matches = with_surfaces(matches, dataset, matched[0])
+            return solve_joint(*matched, config, terms, camera_matches=matches)
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise

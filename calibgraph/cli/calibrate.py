@@ -131,7 +131,11 @@ def solve(
 
 def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path]:
     """Write the result, an overlay picture per camera and the report."""
-    from calibgraph.model.result_files import CORRESPONDENCES_FILE, REPORT_FILE
+    from calibgraph.model.result_files import (
+        CAMERA_MATCHES_FILE,
+        CORRESPONDENCES_FILE,
+        REPORT_FILE,
+    )
     from calibgraph.report import write_report
     from calibgraph.report.point_overlay import write_overlays
 
@@ -140,6 +144,7 @@ def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path
     return [
         result.save(folder),
         folder / CORRESPONDENCES_FILE,
+        *([] if result.camera_matches is None else [folder / CAMERA_MATCHES_FILE]),
         *write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark),
         write_report(result, folder / REPORT_FILE),
     ]

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml, sha256
+from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
+    CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 
 Array = NDArray[np.float64]
+Table = TypeVar("Table")
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -56,7 +58,8 @@ def load_calibration(path: Path | str) -> Calibration:
             bootstrap={k: np.array(v) for k, v in content["bootstrap_covariance"].items()},
             frames=tuple(content["frames_used"]),
             rounds=tuple(content["rounds"]),
-            correspondences=_correspondences(path.with_name(CORRESPONDENCES_FILE), content),
+            correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
+            camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
             **{name: content[name] for name in _PLAIN},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -95,25 +98,30 @@ _PLAIN = ("counts", "timings_s", "terms", "prior_share", "inputs", "versions")
 assert {*_PLAIN} <= {f.name for f in fields(Calibration)}
 
 
-def _correspondences(path: Path, content: Mapping[str, Any]) -> Correspondences | None:
-    """The table, if there is one.
+def _table(
+    result: Path, name: str, content: Mapping[str, Any], load: Callable[[Path], Table]
+) -> Table | None:
+    """A table of the result, if there is one.
 
     Args:
-        path: of the table.
+        result: path of the result's file.
+        name: of the table's file beside it.
         content: of the result, with the table's hash; results of earlier versions have none.
+        load: reads the table.
 
     Raises:
         FileError: if it is another table than that of the result.
     """
+    path = result.with_name(name)
     if not path.is_file():
         return None
     found = sha256(path)
-    if found != content.get("correspondences_sha256", found):
+    if found != content.get(f"{path.stem}_sha256", found):
         raise FileError(
             path, f"is not the table of the {CALIBRATION_FILE} beside it; move it, or put the "
             "result's own there"
         )  # fmt: skip
-    return load_correspondences(path)
+    return load(path)
 
 
 def is_calibration(content: Mapping[str, Any]) -> bool:

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.files import sha256, write_yaml
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_covariance, relative_transform
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
+    CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
     VERDICT_KEY,
     require_replaceable,
@@ -101,6 +103,8 @@ class Calibration:
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
             its last round.
+        camera_matches: what cameras see in common, with the surfaces that were used; None if it was
+            not looked for.
         inputs: SHA-256 of the input files, by path.
         versions: of this package and the libraries that matter.
     """
@@ -122,6 +126,7 @@ class Calibration:
     frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     correspondences: Correspondences | None = None
+    camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=_versions)
 
@@ -178,7 +183,7 @@ class Calibration:
         return replace(self, inputs=dict(inputs))
 
     def save(self, folder: Path | str) -> Path:
-        """Write ``calibration.yaml``, and the correspondences if there are any, into a folder.
+        """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
 
         Each file appears whole or not at all. Returns the path of the YAML file.
 
@@ -187,15 +192,24 @@ class Calibration:
         """
         path = Path(folder) / CALIBRATION_FILE
         require_replaceable(path.parent)
-        table, table_hash = path.with_name(CORRESPONDENCES_FILE), None
-        if self.correspondences is not None:
-            marked = {**self.correspondences.metadata, VERDICT_KEY: self.verdict.status}
-            replace(self.correspondences, metadata=marked).save(table)
-            table_hash = sha256(table)
-        else:
-            table.unlink(missing_ok=True)  # an older result's
-        write_yaml(path, {**self._to_mapping(), "correspondences_sha256": table_hash})
+        hashes = {
+            "correspondences_sha256": self._save_table(
+                self.correspondences, path.with_name(CORRESPONDENCES_FILE)
+            ),
+            "camera_matches_sha256": self._save_table(
+                self.camera_matches, path.with_name(CAMERA_MATCHES_FILE)
+            ),
+        }
+        write_yaml(path, {**self._to_mapping(), **hashes})
         return path
+
+    def _save_table(self, table: Correspondences | CameraMatches | None, path: Path) -> str | None:
+        """Write a table, marked with the verdict, or remove an older result's; its SHA-256."""
+        if table is None:
+            path.unlink(missing_ok=True)
+            return None
+        replace(table, metadata={**table.metadata, VERDICT_KEY: self.verdict.status}).save(path)
+        return sha256(path)
 
     def __repr__(self) -> str:
         return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"

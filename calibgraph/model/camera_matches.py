@@ -94,10 +94,14 @@ class CameraMatches:
 
     def of_pair(self, a: str, b: str) -> CameraMatches:
         """The rows of one pair, A and B in the order of ``cameras``; none if it has none."""
+        return self.select(self.rows_of_pair(a, b))
+
+    def rows_of_pair(self, a: str, b: str) -> NDArray[np.intp]:
+        """The numbers of these rows."""
         if a not in self.cameras or b not in self.cameras:
-            return self.select(slice(0, 0))
+            return np.empty(0, np.intp)
         wanted = [self.cameras.index(a), self.cameras.index(b)]
-        return self.select(np.flatnonzero((self.camera_index == wanted).all(axis=1)))
+        return np.flatnonzero((self.camera_index == wanted).all(axis=1))
 
     def select(self, rows: NDArray[Any] | slice) -> CameraMatches:
         """The table with only some rows: a mask, an index array or a slice."""

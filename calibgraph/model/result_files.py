@@ -12,11 +12,13 @@ from typing import Any
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder
+from calibgraph.model.camera_matches import FORMAT as MATCHES_FORMAT
 from calibgraph.model.table_columns import TABLE_FORMAT
 
 CALIBRATION_FORMAT = "calibgraph-calibration/1"
 CALIBRATION_FILE = "calibration.yaml"
 CORRESPONDENCES_FILE = "correspondences.parquet"
+CAMERA_MATCHES_FILE = "camera_matches.parquet"
 REPORT_FILE = "report.html"
 PICTURES = ("overlay_*.png", "track.png")
 
@@ -36,7 +38,7 @@ def require_place_for_result(folder: Path, *read: Path | None) -> None:
             that is read, or is not of an earlier result.
     """
     require_place_for_folder(folder)
-    names = (CALIBRATION_FILE, CORRESPONDENCES_FILE, REPORT_FILE)
+    names = (CALIBRATION_FILE, CORRESPONDENCES_FILE, CAMERA_MATCHES_FILE, REPORT_FILE)
     pictures = [path for pattern in PICTURES for path in folder.glob(pattern)]
     for path in (*(folder / name for name in names), *pictures):
         require_not_read(path, read)
@@ -47,7 +49,7 @@ def require_place_for_result(folder: Path, *read: Path | None) -> None:
 
 
 def require_replaceable(folder: Path) -> None:
-    """Check that a calibration and its table in a folder, if there are any, are of a result.
+    """Check that a calibration and its tables in a folder, if there are any, are of a result.
 
     Raises:
         FileError: if not: something else wrote them.
@@ -55,6 +57,7 @@ def require_replaceable(folder: Path) -> None:
     for name, is_of_result in (
         (CALIBRATION_FILE, is_calibration_file),
         (CORRESPONDENCES_FILE, is_table_of_result),
+        (CAMERA_MATCHES_FILE, is_table_of_result),
     ):
         if not is_of_result(folder / name):
             _refuse_if_there(folder / name)
@@ -105,13 +108,13 @@ def is_table_of_result(path: Path) -> bool:
 
 
 def _table_metadata(path: Path) -> Any:
-    """What a Parquet file's matcher reported; None if it is no table of correspondences."""
+    """What a Parquet file's matcher reported; None if it is no table of this program."""
     import pyarrow as pa
     from pyarrow import parquet
 
     try:
         metadata = parquet.read_schema(path).metadata or {}
-        known = metadata.get(b"format", b"").decode() == TABLE_FORMAT
+        known = metadata.get(b"format", b"").decode() in (TABLE_FORMAT, MATCHES_FORMAT)
         return json.loads(metadata.get(b"matcher", b"{}")) if known else None
     except (pa.ArrowException, OSError, ValueError, TypeError, RecursionError):
         return None

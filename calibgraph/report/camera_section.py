@@ -27,6 +27,7 @@ _COUNT_MEANINGS = {
     "best_in_cell": "the most confident of its grid cell, per frame",
     "capped": "within the cap per camera and frame (matches_max)",
     "used": "inside the gate after the first pass; the result is made from these",
+    "common_features": "features that other cameras see, too; the result is also made from these",
     "left_out": "frames left out, since they disagree with the estimate",
     "failed": "frames whose matches gave no pose",
     "frames": "frames with correspondences",

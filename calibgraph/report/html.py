@@ -17,6 +17,7 @@ from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Cali
 from calibgraph.report.camera_section import camera_section
 from calibgraph.report.check_table import group_reasons
 from calibgraph.report.page_overlays import draw_overlays
+from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.reprojection_errors import errors_before_after
 
 Array = NDArray[np.float64]
@@ -85,6 +86,8 @@ def report_html(result: Calibration) -> str:
         accuracy=_accuracy(result),
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
         reasons=group_reasons(verdicts, weaknesses),
+        between=pair_sections(result),
+        match_scale=match_scale(),
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
         config=yaml.safe_dump(result.config.model_dump(), sort_keys=False, allow_unicode=True),

@@ -115,7 +115,7 @@ def _overlays(
 
 def _by_depth(image: Image, cloud: Array, camera: Camera, budget: int) -> str:
     drawn = _shrink(draw_points(image, cloud, camera), _SIZES[0][0])
-    return _jpeg(drawn, budget)
+    return to_jpeg(drawn, budget)
 
 
 def _by_residual(image: Image, errors: ReprojectionErrors, budget: int) -> str:
@@ -134,7 +134,7 @@ def _by_residual(image: Image, errors: ReprojectionErrors, budget: int) -> str:
         cv2.polylines(drawn, list(lines), False, colour, 1, cv2.LINE_AA, _SHIFT)
         points = np.repeat(lines[:, :1], 2, axis=1)
         cv2.polylines(drawn, list(points), False, colour, dot, cv2.LINE_AA, _SHIFT)
-    return _jpeg(drawn, budget)
+    return to_jpeg(drawn, budget)
 
 
 def _level(gates: Array) -> NDArray[np.int64]:
@@ -160,7 +160,7 @@ def depth_scale() -> Scale:
     at = 100 * (np.log(ticks) - low) / (high - low)
     stops = depth_colours(np.exp(np.linspace(low, high, _STOPS)))
     labels = [f"{ticks[0]} m", *map(str, ticks[1:])]
-    return Scale(_gradient(stops), tuple(zip(at.tolist(), labels, strict=True)))
+    return Scale(to_gradient(stops), tuple(zip(at.tolist(), labels, strict=True)))
 
 
 def residual_scale(gate_px: float) -> Scale:
@@ -169,10 +169,11 @@ def residual_scale(gate_px: float) -> Scale:
     stops = colours[_level(np.linspace(0.0, _MAX_GATES, _STOPS))]
     ticks = ((0.0, "0 px"), (25.0, f"{gate_px / 2:.2g}"), (50.0, f"gate {gate_px:.2g} px"),
              (75.0, f"{1.5 * gate_px:.2g}"))  # fmt: skip
-    return Scale(_gradient(stops), ticks)
+    return Scale(to_gradient(stops), ticks)
 
 
-def _gradient(stops: Image) -> str:
+def to_gradient(stops: Image) -> str:
+    """Colours (n, 3) BGR from left to right, for CSS."""
     return ", ".join(f"#{r:02x}{g:02x}{b:02x}" for b, g, r in stops.tolist())
 
 
@@ -185,7 +186,7 @@ def _shrink(image: Image, max_width: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _jpeg(image: Image, budget: int) -> str:
+def to_jpeg(image: Image, budget: int) -> str:
     """A data URI of the largest and best JPEG of at most ``budget`` bytes."""
     data = b""
     for width, quality in _SIZES:

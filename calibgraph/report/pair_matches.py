@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from calibgraph.io.dataset import Frame
-from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.rig import Rig
-from calibgraph.report.point_overlay import write_image
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -23,37 +16,6 @@ _MAX_LINES = 60  # more hide the images
 _MAX_SIDE_PX = 1600
 _WIDE = 1.8  # aspect ratio from which images stand above each other
 _UNKNOWN = (160, 160, 160)
-
-
-def write_pair_pictures(
-    frame: Frame, rig: Rig, matches: CameraMatches, errors_px: Array, folder: Path
-) -> list[Path]:
-    """Write ``pair_A_B.png`` for every pair of cameras with matches in a frame.
-
-    Args:
-        frame: its images.
-        rig: image sizes.
-        matches: of any pairs and frames.
-        errors_px: (n,) residual of each; NaN where there is none, which is drawn grey.
-        folder: to write to.
-
-    Returns:
-        The paths.
-
-    Raises:
-        CalibrationError: if an image cannot be read, or a picture not be written.
-    """
-    paths = []
-    rows = np.flatnonzero(matches.frame == frame.index)
-    of_frame, errors = matches.select(rows), errors_px[rows]
-    for a, b in of_frame.pairs():
-        numbers = [matches.cameras.index(name) for name in (a, b)]
-        of_pair = (of_frame.camera_index == numbers).all(axis=1)
-        images = tuple(frame.load_image(name, rig.cameras[name]) for name in (a, b))
-        drawn = draw_matches(images, of_frame.pixels_px[of_pair], errors[of_pair])
-        paths.append(folder / f"pair_{a}_{b}.png")
-        write_image(paths[-1], drawn)
-    return paths
 
 
 def draw_matches(images: tuple[Image, ...], pixels_px: Array, errors_px: Array) -> Image:
@@ -83,7 +45,7 @@ def draw_matches(images: tuple[Image, ...], pixels_px: Array, errors_px: Array) 
             cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
         for end in ends[row].tolist():
             cv2.circle(canvas, end, 2, colour, -1, cv2.LINE_AA)
-    return np.vstack([canvas, _legend(canvas.shape[1])])
+    return canvas
 
 
 def residual_colours(errors_px: Array) -> Image:
@@ -108,14 +70,3 @@ def _put_together(images: tuple[Image, ...]) -> tuple[Image, Array, float]:
     scale = min(1.0, _MAX_SIDE_PX / size.max())
     small = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(0.7 * small, dtype=np.uint8), offset.astype(np.float64), scale
-
-
-def _legend(width: int) -> Image:
-    """A strip with the colours of the residuals."""
-    strip = np.zeros((24, width, 3), np.uint8)
-    bar = residual_colours(np.linspace(0, RESIDUAL_LIMIT_PX, 200))
-    strip[6:18, 8:208] = bar[: max(0, width - 8)]
-    text = f"residual 0 to {RESIDUAL_LIMIT_PX:g} px and more; grey: no range from the LiDAR"
-    style = (cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
-    cv2.putText(strip, text, (218, 17), *style)
-    return strip

@@ -154,6 +154,16 @@ def pair_terms(
     return tuple(term for term in terms if len(term.frame) >= MIN_PAIR_MATCHES)
 
 
+def tying_pairs(table: CameraMatches | None) -> list[tuple[str, str]]:
+    """The pairs with enough features on surfaces to place one camera by the other."""
+    if table is None:
+        return []
+    known = np.isfinite(table.planes_lidar_per_m[:, :, 0]).sum(axis=1)
+    return [
+        (a, b) for a, b in table.pairs() if known[table.rows_of_pair(a, b)].sum() >= ENOUGH_SURFACES
+    ]
+
+
 def pair_graph(terms: Iterable[PairTerm], keys: Mapping[str, int]) -> gtsam.NonlinearFactorGraph:
     """One lossless block factor per term.
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.model.camera_matches import CameraMatches
@@ -11,8 +12,9 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.frame_weights import weigh_all_frames
-from calibgraph.solver.objective import Objective
+from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.solution import Solution
@@ -52,12 +54,13 @@ def solve_joint(
 
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
-        require_determined(rig, kept.counts)                               # Preprocessing
+        tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
+        require_determined(rig, kept.counts, tied)                         # Preprocessing
 
     with watch("stage1"):
         pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
         blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
-        start = best_start(rig, blocks, pairwise, config, terms)           # x_0
+        start = best_start(rig, blocks, pairwise, config, terms, tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights
         frames = weigh_all_frames(kept.table, blocks, pairwise, start, config, terms)
@@ -70,13 +73,52 @@ def solve_joint(
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
-    if camera_matches is not None:                                         # ours: camera pairs
-        with watch("camera_pairs"):
-            inliers, optimum = refine_with_pairs(inliers, optimum, scales, camera_matches)
-
     counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
-    return Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+    found = Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+    return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
+    """Refine a solution with what its cameras see in common, which is no part of the paper.
+
+    Args:
+        solution: what it has used of other camera matches is left out.
+        matches: with surfaces, taken near the solution; from the correspondences' frames.
+
+    Returns:
+        The same optimum where no pair of cameras has enough in common.
+    """
+    alone, watch = solution.without_pairs(), Stopwatch()
+    with watch("camera_pairs"):
+        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, matches)
+    return replace(
+        alone,
+        inliers=inliers,
+        optimum=optimum,
+        counts=count_common_features(alone.counts, inliers.pairs),
+        timings_s={**solution.timings_s, **watch.seconds},
+        camera_matches=matches,
+        before_pairs=alone.optimum if inliers.pairs else None,
+    )
+
+
+def count_common_features(
+    counts: Mapping[str, Mapping[str, int]], pairs: Sequence[PairTerm]
+) -> dict[str, dict[str, int]]:
+    """The counts, with the features of each camera that is part of a pair."""
+    features: dict[str, int] = {}
+    for pair in pairs:
+        for name in (pair.a, pair.b):
+            features[name] = features.get(name, 0) + len(pair.frame)
+    others = {
+        name: {key: value for key, value in of_camera.items() if key != "common_features"}
+        for name, of_camera in counts.items()
+    }
+    return {
+        name: {**of_camera, "common_features": features[name]} if name in features else of_camera
+        for name, of_camera in others.items()
+    }
 
 
 def count_correspondences(

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 Transforms = dict[str, Array]
 """Per camera, (4, 4) T_camera_lidar."""
 Scales = dict[str, ResidualScale]
+USING_CORRESPONDENCES: tuple[Terms, ...] = ("full", "reprojection")
 
 _COARSE_TOLERANCE = 1e-3  # relative change of the error
 _MAX_RESCALINGS = 10  # mostly 3 are enough
@@ -72,18 +73,18 @@ class Objective:
     @property
     def uses_correspondences(self) -> bool:
         """Whether the terms include the reprojection term."""
-        return self.terms in ("full", "reprojection")
+        return self.terms in USING_CORRESPONDENCES
 
     def graph(self, scales: Scales) -> gtsam.NonlinearFactorGraph:
         """Eq. 5 as a GTSAM graph that can be printed.
 
         Args:
-            scales: of the residuals; only cameras that have one get a reprojection term, and
-                only pairs of them get terms of their own.
+            scales: of the residuals; only cameras that have one get a reprojection term. Without
+                any, there are no terms of pairs.
         """
         blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
         keys = {name: pose_key(self.cameras, name) for name in self.cameras}
-        pairs = [pair for pair in self.pairs if {pair.a, pair.b} <= scales.keys()]
+        pairs = self.pairs if scales else ()
         reprojection = projection_graph(self.cameras, blocks if self.uses_correspondences else {})
         return join(reprojection, self.pose_graph, pair_graph(pairs, keys))
 

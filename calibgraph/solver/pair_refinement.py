@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
 from calibgraph.solver.objective import Objective, Scales
@@ -102,3 +102,26 @@ def fit_pair(
         graph.add(held)
         T = optimize(graph, names, T).T_camera_lidar
     return T
+
+
+def covariance_of_fit(
+    names: tuple[str, str],
+    terms: Sequence[PairTerm],
+    T_camera_lidar: Mapping[str, Array],
+    covariance_a: Array,
+) -> Array:
+    """(12, 12) covariance of A and B after ``fit_pair``, if all features were independent.
+
+    Args:
+        names: A and B.
+        terms: of this pair.
+        T_camera_lidar: (4, 4) of both, as fitted.
+        covariance_a: (6, 6) by which A was held.
+    """
+    hessian = np.zeros((12, 12))
+    hessian[:6, :6] = np.linalg.pinv(covariance_a, hermitian=True)
+    for term in terms:
+        rows = np.r_[tuple(pose_rows(names.index(name)) for name in (term.a, term.b))]
+        scaled = term.with_sigma(term.sigma_px(T_camera_lidar))
+        hessian[np.ix_(rows, rows)] += scaled.sums(T_camera_lidar).hessian
+    return np.asarray(np.linalg.pinv(hessian, hermitian=True))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -30,6 +31,8 @@ class Solution:
         optimum: of the last pass.
         counts: per camera, correspondences left after each filter and gate, and frames.
         timings_s: seconds per stage.
+        camera_matches: what cameras see in common; None if it was not given.
+        before_pairs: the optimum without it; None if no pair of cameras had enough.
     """
 
     rig: Rig
@@ -40,6 +43,8 @@ class Solution:
     optimum: Optimum
     counts: Mapping[str, Mapping[str, int]]
     timings_s: Mapping[str, float]
+    camera_matches: CameraMatches | None = None
+    before_pairs: Optimum | None = None
 
     @property
     def T_camera_lidar(self) -> Transforms:
@@ -65,3 +70,10 @@ class Solution:
     def solved_rig(self) -> Rig:
         """The rig with the estimated extrinsics."""
         return self.rig.moved_to(self.T_camera_lidar)
+
+    def without_pairs(self) -> Solution:
+        """The solution without what cameras see in common."""
+        if self.before_pairs is None:
+            return self
+        alone = replace(self.inliers, pairs=())
+        return replace(self, inliers=alone, optimum=self.before_pairs, before_pairs=None)

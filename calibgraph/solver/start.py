@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.objective import Transforms
@@ -25,12 +25,14 @@ def best_start(
     stage1: Stage1,
     config: Config,
     terms: Terms,
+    tied: Sequence[tuple[str, str]] = (),
 ) -> Transforms:
     """Per camera, (4, 4) T_camera_lidar from which the first pass starts.
 
     The best of Stage 1, the PnP of single frames and the rig's guess, by the mean Cauchy loss of
     all frames' correspondences at half the PnP threshold; with the terms ``stage1``, Stage 1
-    itself. Cameras without correspondences start from a relative pose to one that has them.
+    itself. Cameras without correspondences start from a relative pose to one that has them: a
+    measured one, or that of the guess to a camera that sees the same.
 
     Raises:
         CorrespondenceError: with the terms ``stage1``, if PnP failed in every frame of a camera.
@@ -45,7 +47,15 @@ def best_start(
                 start.setdefault(pair.a, pair.T_a_b @ start[pair.b])
             if pair.a in start:
                 start.setdefault(pair.b, invert(pair.T_a_b) @ start[pair.a])
+        for one, other in (*tied, *((b, a) for a, b in tied)):
+            if one in start:
+                start.setdefault(other, _by_guess(rig, other, one) @ start[one])
     return {name: start[name] for name in rig.cameras}
+
+
+def _by_guess(rig: Rig, to: str, of: str) -> Array:
+    """(4, 4) T_to_of between two cameras by their guesses."""
+    return relative_transform(rig.cameras[to].T_camera_lidar, rig.cameras[of].T_camera_lidar)
 
 
 def _candidates(
@@ -66,12 +76,17 @@ def _candidates(
     return [*stage1, rig.cameras[name].T_camera_lidar, *single]
 
 
-def require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> None:
-    """Check that every camera has correspondences, or relative poses to one that has.
+def require_determined(
+    rig: Rig,
+    counts: Mapping[str, Mapping[str, int]],
+    tied_by_images: Sequence[tuple[str, str]] = (),
+) -> None:
+    """Check that every camera has correspondences, or is tied to one that has.
 
     Args:
         rig: with its relative poses.
         counts: per camera, correspondences left after each filter.
+        tied_by_images: the pairs of cameras that see enough in common.
 
     Raises:
         CorrespondenceError: naming the first camera that has neither.
@@ -80,6 +95,7 @@ def require_determined(rig: Rig, counts: Mapping[str, Mapping[str, int]]) -> Non
     for _ in rig.cameras:
         tied |= {p.a for p in rig.relative_poses if p.b in tied}
         tied |= {p.b for p in rig.relative_poses if p.a in tied}
+        tied |= {name for pair in tied_by_images if tied & set(pair) for name in pair}
     for name, count in counts.items():
         if name not in tied:
             left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)

@@ -26,6 +26,7 @@ from calibgraph.trust.guess import (
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
+from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.rematch_checks import (
     last_round_checks,
     rematch_checks,
@@ -45,6 +46,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     swap_checks,                # are the images of two cameras swapped?
     point_distance_checks,      # are the points in metres?
     estimate_checks,            # residuals, sigmas, relative poses, halves, counts, convergence
+    pair_agreement_checks,      # do two cameras' images agree with the correspondences?
     matcher_checks,             # what the matcher reported: search, learned shares, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?

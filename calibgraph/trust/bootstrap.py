@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import twist_between
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
+Matches = TypeVar("Matches", CameraBlock, PairTerm)
 
 _MAX_TRIES = 20  # draws in turn that leave a camera with too few matches
 
@@ -55,8 +60,11 @@ def _solve_draw(
     """
     for _ in range(_MAX_TRIES):
         drawn = rng.choice(frames, len(frames))
-        blocks = solution.objective.blocks.items()
-        objective = solution.objective.with_blocks({n: _draw(b, drawn) for n, b in blocks})
+        blocks = {name: _draw(b, drawn) for name, b in solution.objective.blocks.items()}
+        pairs = [_draw(pair, drawn) for pair in solution.inliers.pairs]
+        objective = replace(
+            solution.objective, blocks=blocks, pairs=tuple(p for p in pairs if len(p.frame))
+        )
         try:
             inliers = objective.without_outliers(solution.T_camera_lidar, solution.scales)
             rough = inliers.minimize(solution.T_camera_lidar, solution.scales).T_camera_lidar
@@ -68,7 +76,7 @@ def _solve_draw(
     raise CorrespondenceError(f"bootstrap: {reason}; give more frames, or leave --bootstrap out")
 
 
-def _draw(block: CameraBlock, drawn: NDArray[np.int64]) -> CameraBlock:
+def _draw(block: Matches, drawn: NDArray[np.int64]) -> Matches:
     """The matches of some frames; of a frame that was drawn twice, twice."""
     starts = np.searchsorted(block.frame, drawn)
     ends = np.searchsorted(block.frame, drawn, side="right")

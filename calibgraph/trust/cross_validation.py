@@ -62,7 +62,7 @@ def restart_checks(evidence: Evidence) -> Checks:
     """How far from the solution the solves from displaced starts end, at worst."""
     if not evidence.fitted_blocks:
         return {}
-    solution = evidence.solution
+    solution = evidence.of_correspondences.solution
     coarse = solution.objective.coarse(_RESTART_SAMPLE)
     rig = solution.solved_rig
     displaced = [
@@ -104,9 +104,8 @@ def _solve_from(solution: Solution, coarse: Objective, start: Transforms) -> Tra
 
 def competing_solution_checks(evidence: Evidence) -> Checks:
     """Whether the matches that a solution leaves out agree on another extrinsic."""
-    return {
-        name: [check_competing_solution(evidence.solution, name)] for name in evidence.fitted_blocks
-    }
+    solution = evidence.of_correspondences.solution
+    return {name: [check_competing_solution(solution, name)] for name in evidence.fitted_blocks}
 
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:

@@ -68,6 +68,13 @@ class Evidence:
         """Their names, in the rig's order."""
         return tuple(self.solution.T_camera_lidar)
 
+    @cached_property
+    def of_correspondences(self) -> Evidence:
+        """The same of the solution without what cameras see in common."""
+        if self.solution.before_pairs is None:
+            return self
+        return Evidence(self.solution.without_pairs(), self.guess)
+
     @property
     def findings(self) -> MatcherFindings:
         """What the matcher reported."""

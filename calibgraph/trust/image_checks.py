@@ -22,12 +22,14 @@ def image_checks(evidence: RunEvidence) -> Checks:
     """Whether the images agree with a result; nothing if there is no time left for them.
 
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
-    the result of a matcher that does not fail on images gets warnings only.
+    the result of a matcher that does not fail on images gets warnings only. Of a solution with
+    camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
+    is moved, and at the wrong one's place the lens cannot be measured.
     """
     run = evidence.run
     if run.out_of_time:
         return {}
-    rig, seed = run.solution.solved_rig, run.solution.config.seed
+    rig, seed = run.solution.without_pairs().solved_rig, run.solution.config.seed
     try:
         checks = check_images(
             run.dataset, rig, run.correspondences, seed=seed, progress=evidence.progress

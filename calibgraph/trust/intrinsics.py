@@ -66,7 +66,7 @@ class FreedParameter:
 
 def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals, and how much depends on the focal length."""
-    solution = evidence.solution
+    solution = evidence.of_correspondences.solution
 
     def of_camera(name: str) -> list[Check]:
         camera = solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name])

@@ -17,9 +17,12 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_pairs import PairTerm, pair_terms
-from calibgraph.solver.pair_refinement import fit_pair
-from calibgraph.trust.shared_error import PAIR_SIGMA_M, PAIR_SIGMA_RAD
+from calibgraph.solver.pair_refinement import covariance_of_fit, fit_pair
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.shared_error import PAIR_SIGMA_M, PAIR_SIGMA_RAD, shared_covariance
+from calibgraph.trust.thresholds import threshold
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
@@ -51,6 +54,40 @@ class PairAgreement:
     residual_px: float
     least_px: float
     matches: int
+
+
+def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
+    """Whether the correspondences place the cameras relative to each other as the images do."""
+    matches, own = evidence.solution.camera_matches, evidence.of_correspondences
+    if matches is None or evidence.solution.before_pairs is None:
+        return {}
+    solution, covariance = own.solution, _covariance(own)
+    checks: dict[str, list[Check]] = {name: [] for name in own.cameras}
+    for found in pair_agreements(solution.solved_rig, matches, covariance, solution.config):
+        if own.fitted_blocks.keys() >= {found.a, found.b}:
+            for name in (found.a, found.b):
+                checks[name].append(_check_agreement(found))
+    return checks
+
+
+def _covariance(evidence: Evidence) -> Array:
+    """(6 N, 6 N) of a solution; with too few frames, of the error that all frames share."""
+    if evidence.joint_covariance is not None:
+        return evidence.joint_covariance
+    shared = shared_covariance(evidence.findings, evidence.solution.T_camera_lidar)
+    held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
+    return shared if shared.any() else np.diag(np.tile(held, len(evidence.cameras)))
+
+
+def _check_agreement(found: PairAgreement) -> Check:
+    row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
+    status = row.grade(found.sigmas)
+    text = (
+        f"the {name} differs from that by the correspondences by {found.degrees:.2g} deg, "
+        f"{found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
+    )
+    text += "" if status == "PASS" else f": {row.advice}"
+    return row.describe(found.sigmas, status, text, name=name)
 
 
 def pair_agreements(
@@ -92,7 +129,9 @@ def _agreement(
     if joint is not None:
         own = relative_covariance(joint, first, second, poses[1])
         floor = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
-        sigmas = float(np.max(np.abs(twist_between(*poses)) / np.sqrt(np.diag(own) + floor**2)))
+        of_fit = relative_covariance(covariance_of_fit(names, terms, after, held), 0, 1, poses[0])
+        variances = np.diag(own) + np.diag(of_fit) + floor**2
+        sigmas = float(np.max(np.abs(twist_between(*poses)) / np.sqrt(variances)))
     residual, least = (max(term.sigma_px(T) for term in terms) for T in (before, after))
     count = sum(len(term.frame) for term in terms)
     return PairAgreement(a, b, degrees, centimetres, sigmas, residual, least, count)

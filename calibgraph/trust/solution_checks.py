@@ -26,7 +26,8 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
     if estimate.residuals is None:
         text = (
-            f"{estimate.used} usable correspondences, too few: determined by relative_poses alone"
+            f"{estimate.used} usable correspondences, too few: determined by other cameras alone, "
+            "through relative_poses or what they see in common"
         )
         return [Check("correspondences", "WARN", text, estimate.used)]
     return [check for function in ESTIMATE_CHECKS for check in function(estimate)]

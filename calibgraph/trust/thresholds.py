@@ -56,6 +56,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Does a measured relative pose agree with the correspondences?",
               "Sigmas of the measurement and the estimate together.",
               "is it p_a = T_a_b * p_b, are its sigmas right, are two cameras' images swapped?"),
+    Threshold("pair_agreement", "relative pose of two cameras by images", "at most", 1.75, 4.0,
+              "sigma", "Do the images of two cameras place them relative to each other as the "
+              "correspondences do?", "KITTI 00, 05, 08: right 0.2 to 0.6; a camera moved by "
+              "0.5 deg 2.0 to 3.4; a focal length 3 % off 2.8 to 3.8. Four is 0.5 deg or 11 cm.",
+              "one of the two is wrong: check their intrinsics and the guesses, and that their "
+              "images are of one instant and not swapped"),
     Threshold("pull_rotation", "difference of the joint solution from the camera's own", "at most",
               0.15, 1.0, "deg",
               "How far do priors and relative poses pull a camera from its own solution?",

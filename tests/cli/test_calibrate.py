@@ -104,7 +104,8 @@ def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, ca
 def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:
     assert calibrated_sample.code == 0, calibrated_sample.stderr
     assert {path.name for path in calibrated_sample.folder.iterdir()} == {
-        "calibration.yaml", "correspondences.parquet", "overlay_front_left.png",
+        "calibration.yaml", "camera_matches.parquet", "correspondences.parquet",
+        "overlay_front_left.png",
         "overlay_front_right.png", "overlay_left.png", "report.html",
     }  # fmt: skip
     assert len(load_calibration(calibrated_sample.folder).inputs) == 6 * 4

@@ -1,21 +1,21 @@
 from __future__ import annotations
 
+import base64
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-import calibgraph
-from calibgraph.matching.camera_pairs import match_cameras, with_surfaces
+from calibgraph import Calibration
+from calibgraph.report.page_pairs import pair_sections
 from calibgraph.report.pair_matches import (
     RESIDUAL_LIMIT_PX,
     draw_matches,
     residual_colours,
-    write_pair_pictures,
 )
-from calibgraph.solver.camera_pairs import match_errors_px
-from tests.conftest import SAMPLE
+from tests.report.conftest import write_page
 
 
 def test_colours_go_from_green_to_red_and_grey_is_unknown() -> None:
@@ -41,18 +41,34 @@ def test_many_matches_and_none_can_be_drawn() -> None:
     rng = np.random.default_rng(0)
     full = draw_matches(images, rng.uniform(0, 40, (1000, 2, 2)), rng.uniform(0, 5, 1000))
     none = draw_matches(images, np.empty((0, 2, 2)), np.empty(0))
-    assert full.shape == none.shape == (74, 140, 3)
+    assert full.shape == none.shape == (50, 140, 3)
     assert not none[:50].any()
 
 
-def test_every_pair_of_a_frame_gets_a_picture(tmp_path: Path) -> None:
-    data = calibgraph.load_dataset(SAMPLE).select("0:2")
-    truth = calibgraph.load_rig(SAMPLE / "reference.yaml")
-    matches = with_surfaces(match_cameras(data, truth), data, truth)
-    errors = match_errors_px(truth, matches)
-    paths = write_pair_pictures(data.frames[1], truth, matches, errors, tmp_path)
-    assert [path.name for path in paths] == ["pair_front_left_front_right.png"]
-    assert cv2.imread(str(paths[0])).shape[1] > 1000
-    known = np.isfinite(errors)
-    assert 0.2 < known.mean() < 1
-    assert np.median(errors[known]) < 1.5
+def test_every_pair_that_sees_something_in_common_has_a_section(sample_result: Calibration) -> None:
+    (section,) = pair_sections(sample_result)
+    assert section.name == "front_left, front_right"
+    encoded = section.picture.removeprefix("data:image/jpeg;base64,")
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] > 1000
+    assert 0.1 < section.surfaces / section.matches < 1
+    assert float(section.median_px) < 1.5
+    assert section.check is not None and section.check.status == "PASS"
+
+
+def test_without_images_the_numbers_remain(sample_result: Calibration, tmp_path: Path) -> None:
+    gone = tuple(
+        {**entry, "images": {name: str(tmp_path / "gone.png") for name in entry["images"]}}
+        for entry in sample_result.frames
+    )
+    (section,) = pair_sections(replace(sample_result, frames=gone))
+    assert section.picture == "" and section.matches > 100
+    assert pair_sections(replace(sample_result, camera_matches=None)) == []
+
+
+def test_the_page_shows_the_pairs(sample_result: Calibration, tmp_path: Path) -> None:
+    text = write_page(sample_result, tmp_path)
+    assert "Between cameras" in text
+    assert 'alt="Features that front_left, front_right both see"' in text
+    bare = replace(sample_result, camera_matches=None)
+    assert "Between cameras" not in write_page(bare, tmp_path)

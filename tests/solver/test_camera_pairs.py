@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph import (
+    CorrespondenceError,
+    MatcherErrors,
+    Rig,
+    perturb,
+    simulate_correspondences,
+)
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import (
@@ -252,3 +258,24 @@ def test_a_calibration_takes_them_and_its_pair_is_better_known(rig: Rig) -> None
         *(relative_transform(T[b], T[a]) for T in (results[1].T_camera_lidar, rig.T_camera_lidar))
     )
     assert (np.abs(twist) < 4 * sigmas[1]).all()
+
+
+def test_a_camera_without_correspondences_is_placed_by_what_it_sees_in_common(pair: Rig) -> None:
+    """Its guess is 2 deg and 20 cm off, the other's correspondences are good."""
+    table = simulate_correspondences(pair, frames=FRAMES)
+    left = table.select(table.camera_index == table.cameras.index("left"))
+    guess = perturb(pair, rotation_deg=2, translation_m=0.2, seed=5)
+    with pytest.raises(CorrespondenceError, match="'right' has 0 usable correspondences"):
+        solve_joint(guess, left)
+    few = simulated_pairs(pair).select(slice(0, 20))
+    with pytest.raises(CorrespondenceError, match="'right' has 0 usable correspondences"):
+        solve_joint(guess, left, camera_matches=few)
+    result = calibgraph.solve(guess, left, camera_matches=simulated_pairs(pair))
+    degrees, centimetres = pair_error(result.T_camera_lidar, pair)
+    assert degrees < 0.05 and centimetres < 1
+    sigmas = result.sigmas("right")
+    assert sigmas is not None and sigmas[0].max() < 0.2
+    (check,) = [c for c in result.camera_verdicts["right"].checks if c.name == "correspondences"]
+    assert check.status == "WARN" and "see in common" in check.text
+    with pytest.raises(CorrespondenceError, match="'right' has 0 usable correspondences"):
+        solve_joint(guess, left, terms="priors", camera_matches=simulated_pairs(pair))

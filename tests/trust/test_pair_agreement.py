@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibgraph import Rig, perturb
+import calibgraph
+from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.trust.pair_agreement import PairAgreement, pair_agreements
 from factors import pose_sigmas
 from tests.solver.test_camera_pairs import simulated_pairs
+from tests.trust.conftest import named
 
 SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
 COVARIANCE = np.diag(np.tile(SIGMAS**2, 2))
@@ -82,3 +84,37 @@ def test_pairs_without_surfaces_are_left_out(pair: Rig) -> None:
     table = simulated_pairs(pair)
     bare = table.with_planes(np.full_like(table.planes_lidar_per_m, np.nan))
     assert pair_agreements(pair, bare, None, Config()) == ()
+
+
+def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:
+    """A result of correspondences that fit one rig, and of images of another, the true one."""
+    shared = {"systematic_rotation_rad": np.radians(0.09), "systematic_translation_m": 0.02}
+    table = simulate_correspondences(seen, frames=8, errors=MatcherErrors(outlier_share=0.1))
+    table = replace(table, metadata={**table.metadata, **shared})
+    return calibgraph.solve(truth, table, camera_matches=matches)
+
+
+def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
+    right = judged(pair, pair, simulated_pairs(pair))
+    moved = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1).T_camera_lidar["right"]
+    wrong = judged(pair, pair.moved_to({"right": moved}), simulated_pairs(pair))
+    for name in pair.cameras:
+        (passed,) = named(right, name, "by images")
+        assert passed.status == "PASS" and passed.value is not None and passed.value < 1
+        (failed,) = named(wrong, name, "by images")
+        assert failed.status != "PASS"
+        assert "relative pose of left and right by images differs" in failed.text
+
+
+def test_what_the_correspondences_say_alone_is_checked_without_the_pairs(pair: Rig) -> None:
+    """Restarts and lenses are those of the correspondences, although the pairs move the result."""
+    moved = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1).T_camera_lidar["right"]
+    wrong = judged(pair, pair.moved_to({"right": moved}), simulated_pairs(pair))
+    for name in pair.cameras:
+        for words in ("solving again", "residuals over the image"):
+            assert {check.status for check in named(wrong, name, words)} <= {"PASS"}
+
+
+def test_without_camera_matches_there_is_no_check(pair: Rig) -> None:
+    for matches in (None, CameraMatches.empty(tuple(pair.cameras))):
+        assert named(judged(pair, pair, matches), "left", "by images") == []

@@ -1,5 +1,6 @@
 """Camera-camera matches: what the cameras of a rig see in common, on the LiDAR's surfaces."""
 
-from calibgraph.matching.camera_pairs.find import match_cameras, with_surfaces
+from calibgraph.matching.camera_pairs.find import match_cameras, match_some_frames, with_surfaces
+from calibgraph.matching.camera_pairs.overlap import overlapping_pairs
 
-__all__ = ["match_cameras", "with_surfaces"]
+__all__ = ["match_cameras", "match_some_frames", "overlapping_pairs", "with_surfaces"]

@@ -14,7 +14,9 @@ from factors import unproject
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-MAX_SIDE_PX = 2000  # larger images are reduced: bounds the time
+MAX_SIDE_PX = 800
+"""Larger images are reduced. On KITTI, relative poses are as good as with all pixels, in a third of
+the time; on images of 1600 to 1936 px there are as many matches or more."""
 MAX_FEATURES = 4000  # per image
 LOWE_RATIO = 0.8  # of the distances of the best and the second best match, at most
 

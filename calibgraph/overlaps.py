@@ -1,0 +1,60 @@
+"""What cameras see in common, added to the last round's solution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from calibgraph.errors import CalibrationError
+from calibgraph.matching.camera_pairs import match_some_frames, overlapping_pairs, with_surfaces
+from calibgraph.matching.run import MatchingRun
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.progress import Progress
+from calibgraph.solver.joint import add_camera_pairs
+
+_TIMES_SURFACES = 2  # the second changes results by up to 0.003 deg and 0.2 cm, a third by 0.1 cm
+
+
+def tie_cameras(run: MatchingRun, progress: Progress) -> MatchingRun:
+    """Match the cameras with each other, and refine the solution with what they see in common.
+
+    Not the cameras that the matcher did not find: they would spoil the others.
+
+    Args:
+        run: all of its rounds are done.
+        progress: called as the images are matched.
+
+    Returns:
+        The run itself where no two cameras can overlap, there is no time left, the terms do not use
+        the correspondences, or the files, which its matcher may not have needed, cannot be read.
+    """
+    if run.out_of_time or not run.solution.objective.uses_correspondences:
+        return run
+    try:
+        matches = _match_cameras(run, progress)
+        return run if matches is None else _refine(run, matches)
+    except (CalibrationError, OSError):  # the checks on images report it
+        return run
+
+
+def _match_cameras(run: MatchingRun, progress: Progress) -> CameraMatches | None:
+    """The matches of the cameras that can overlap; None if there are none."""
+    with run.watch("match_cameras"):
+        missed = run.correspondences.findings.missed.keys()
+        cloud = run.dataset.frames[0].load_cloud()
+        near = overlapping_pairs(run.solution.solved_rig, cloud)
+        pairs = [pair for pair in near if missed.isdisjoint(pair)]
+        if not pairs:
+            return None
+        return match_some_frames(
+            run.dataset, run.guess, pairs, seed=run.solution.config.seed, progress=progress
+        )
+
+
+def _refine(run: MatchingRun, matches: CameraMatches) -> MatchingRun:
+    """The run with the solution of correspondences and camera matches."""
+    solution = run.solution
+    with run.watch("solve_pairs"):
+        for _ in range(_TIMES_SURFACES):
+            matches = with_surfaces(matches, run.dataset, solution.solved_rig)
+            solution = add_camera_pairs(solution, matches)
+    return replace(run, solution=solution)
