@@ -75,6 +75,8 @@ def _all_differ(camera: NDArray[np.int64], frame: NDArray[np.int64], rows: int) 
 
 def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> NDArray[np.int64]:
     """(g + 1,) where the runs of equal camera and frame begin, and the end."""
+    if not len(frame):
+        return np.zeros(1, dtype=np.int64)
     new = (camera[1:] != camera[:-1]) | (frame[1:] != frame[:-1])
     return np.concatenate([[0], np.flatnonzero(new) + 1, [len(frame)]])
 

@@ -121,7 +121,7 @@ def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> 
     Found are those that explain the majority of the frame's correspondences: no other pose can
     explain more. Three of them do not count, which any pose explains.
     """
-    edges = frame_edges(rows.camera_index, rows.frame) if len(rows) else np.zeros(1, np.int64)
+    edges = frame_edges(rows.camera_index, rows.frame)
     runs = to_runs(edges)
     none = np.zeros(len(runs), dtype=np.bool_)
     start = ransac_pnp(camera, select_evenly(rows, _COMMON_SAMPLE), config)
