@@ -127,7 +127,8 @@ class Evidence:
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        return self._block(self.joint_covariance, camera)
+        joint = None if camera in self.solution.held else self.joint_covariance
+        return self._block(joint, camera)
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
         rows = slice(6 * self.cameras.index(camera), 6 * self.cameras.index(camera) + 6)
@@ -238,6 +239,7 @@ class Evidence:
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
+            held=camera in solution.held,
         )
 
 
