@@ -100,7 +100,11 @@ class Evidence:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
         solution = self.solution
         return scatter_covariance(
-            solution.inliers, solution.T_camera_lidar, solution.scales, self.robust_hessians
+            solution.inliers,
+            solution.T_camera_lidar,
+            solution.scales,
+            self.robust_hessians,
+            held=solution.held,
         )
 
     @cached_property
@@ -269,6 +273,8 @@ def scatter_covariance(
     scales: Scales,
     robust_hessians: Mapping[str, Array] | None = None,
     gate_hessian: Mapping[str, Array] | None = None,
+    *,
+    held: Sequence[str] = (),
 ) -> Array | None:
     """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
     if not inliers.uses_correspondences:
@@ -281,6 +287,7 @@ def scatter_covariance(
         gate_hessian=inliers.gate_hessian if gate_hessian is None else gate_hessian,
         robust_hessians=robust_hessians,
         pairs=inliers.pairs,
+        held=held,
     )
 
 
