@@ -108,9 +108,11 @@ def _solve(
 ) -> Solution:
     """The joint solve; where there is too little to solve from, with a hint about the guess.
 
+    A camera with too few correspondences is placed by what it sees in common with another; if that
+    does not place it either, it is held, and the others are calibrated.
+
     Raises:
-        CorrespondenceError: if a camera has too few correspondences, and what it sees in common
-            with another does not place it.
+        CorrespondenceError: if that is so of all cameras.
     """
     try:
         return solve_joint(*matched, config, terms)
@@ -119,6 +121,8 @@ def _solve(
             matches = match_some_frames(dataset, guess, seed=config.seed)
             matches = with_surfaces(matches, dataset, matched[0])
             return solve_joint(*matched, config, terms, camera_matches=matches)
+        with suppress(CorrespondenceError):
+            return solve_joint(*matched, config, terms, hold=True)
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise
@@ -188,7 +192,7 @@ def _from_displaced_start(
             round_index=index,
             progress=lambda what, done, total: progress("matching again", done, total),
         )
-        solution = solve_joint(estimate, table, config, terms)
+        solution = solve_joint(estimate, table, config, terms, hold=bool(run.solution.held))
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return last
@@ -218,10 +222,11 @@ def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> M
     mixed = replace(concatenate(parts), metadata={**run.correspondences.metadata, **keys})
     second = again.solution.rig.T_camera_lidar
     start = run.solution.rig.moved_to({name: second[name] for name in better})
+    settings = run.solution.config, run.solution.terms
     last = {**run.rounds[-1], **{name: again.summary[name] for name in better}}
     return replace(
         run,
         correspondences=mixed,
-        solution=solve_joint(start, mixed, run.solution.config, run.solution.terms),
+        solution=solve_joint(start, mixed, *settings, hold=bool(run.solution.held)),
         rounds=(*run.rounds[:-1], last),
     )

@@ -37,6 +37,7 @@ def cluster_robust_covariance(
     gate_hessian: Mapping[str, Array] | None = None,
     robust_hessians: Mapping[str, Array] | None = None,
     pairs: Sequence[PairTerm] = (),
+    held: Sequence[str] = (),
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few) H^-1``.
 
@@ -53,6 +54,7 @@ def cluster_robust_covariance(
         gate_hessian: per camera, see ``BlockResiduals.gate_hessian``.
         robust_hessians: per camera, :func:`robust_hessian` there, where it is known already.
         pairs: what cameras see in common, the inliers of the solution.
+        held: cameras that nothing determines: unknown by a radian and a metre.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
@@ -69,13 +71,15 @@ def cluster_robust_covariance(
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += of_camera + (gate_hessian or {}).get(name, 0.0)
     _add_pair_hessians(hessian, pairs, T_camera_lidar)
+    unknown = np.diag(np.repeat([float(name in held) for name in cameras], 6))
+    hessian += unknown
     values, vectors = np.linalg.eigh(hessian)
     if values[0] <= _FREE * values[-1]:
         return None
     inverse = (vectors / values) @ vectors.T
     counts = np.full(len(hessian), float(len(gradients)))
     scatter = with_pseudo_frames(gradients.T @ gradients, hessian, counts)
-    covariance: Array = inverse @ scatter @ inverse
+    covariance: Array = inverse @ scatter @ inverse + unknown
     return covariance
 
 

@@ -31,6 +31,7 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
     camera_matches: CameraMatches | None = None,
+    hold: bool = False,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -44,6 +45,7 @@ def solve_joint(
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
         camera_matches: what cameras see in common, with surfaces; from the correspondences' frames.
+        hold: leave cameras that nothing determines where the rig has them, in place of an error.
 
     Raises:
         FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
@@ -55,7 +57,7 @@ def solve_joint(
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
         tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
-        require_determined(rig, kept.counts, tied)                         # Preprocessing
+        held = require_determined(rig, kept.counts, tied, hold=hold)       # Preprocessing
 
     with watch("stage1"):
         pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
@@ -74,7 +76,10 @@ def solve_joint(
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
     counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
-    found = Solution(rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds)
+    seconds = watch.seconds
+    found = Solution(
+        rig, kept.table, objective, inliers, scales, optimum, counts, seconds, held=held
+    )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
 

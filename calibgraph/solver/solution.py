@@ -33,6 +33,7 @@ class Solution:
         timings_s: seconds per stage.
         camera_matches: what cameras see in common; None if it was not given.
         before_pairs: the optimum without it; None if no pair of cameras had enough.
+        held: cameras that nothing determines; they stay where the rig has them.
     """
 
     rig: Rig
@@ -45,6 +46,7 @@ class Solution:
     timings_s: Mapping[str, float]
     camera_matches: CameraMatches | None = None
     before_pairs: Optimum | None = None
+    held: tuple[str, ...] = ()
 
     @property
     def T_camera_lidar(self) -> Transforms:

@@ -32,7 +32,7 @@ def best_start(
     The best of Stage 1, the PnP of single frames and the rig's guess, by the mean Cauchy loss of
     all frames' correspondences at half the PnP threshold; with the terms ``stage1``, Stage 1
     itself. Cameras without correspondences start from a relative pose to one that has them: a
-    measured one, or that of the guess to a camera that sees the same.
+    measured one, or that of the guess to a camera that sees the same; else from their guess.
 
     Raises:
         CorrespondenceError: with the terms ``stage1``, if PnP failed in every frame of a camera.
@@ -50,7 +50,7 @@ def best_start(
         for one, other in (*tied, *((b, a) for a, b in tied)):
             if one in start:
                 start.setdefault(other, _by_guess(rig, other, one) @ start[one])
-    return {name: start[name] for name in rig.cameras}
+    return {name: start.get(name, camera.T_camera_lidar) for name, camera in rig.cameras.items()}
 
 
 def _by_guess(rig: Rig, to: str, of: str) -> Array:
@@ -80,24 +80,32 @@ def require_determined(
     rig: Rig,
     counts: Mapping[str, Mapping[str, int]],
     tied_by_images: Sequence[tuple[str, str]] = (),
-) -> None:
+    *,
+    hold: bool = False,
+) -> tuple[str, ...]:
     """Check that every camera has correspondences, or is tied to one that has.
 
     Args:
         rig: with its relative poses.
         counts: per camera, correspondences left after each filter.
         tied_by_images: the pairs of cameras that see enough in common.
+        hold: accept cameras that have neither, as long as there are others.
+
+    Returns:
+        The cameras that have neither.
 
     Raises:
-        CorrespondenceError: naming the first camera that has neither.
+        CorrespondenceError: naming the first of them, if they are not accepted.
     """
     tied = {name for name, count in counts.items() if count["capped"] >= MIN_MATCHES}
     for _ in rig.cameras:
         tied |= {p.a for p in rig.relative_poses if p.b in tied}
         tied |= {p.b for p in rig.relative_poses if p.a in tied}
         tied |= {name for pair in tied_by_images if tied & set(pair) for name in pair}
-    for name, count in counts.items():
-        if name not in tied:
+    held = tuple(name for name in counts if name not in tied)
+    if not (hold and tied):
+        for name in held:
+            count = counts[name]
             left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
             raise CorrespondenceError(
                 f"camera {name!r} has {count['capped']} usable correspondences, at least "
@@ -105,6 +113,7 @@ def require_determined(
                 f"(left after each filter: {left}): {_advice(count)}{_advice_for_others(tied)}",
                 camera=name,
             )
+    return held
 
 
 def _advice_for_others(tied: set[str]) -> str:

@@ -57,6 +57,7 @@ class Estimate:
             nothing pulls, or by less than ``pull_sigmas`` of that solution.
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
+        held: whether nothing determines it.
     """
 
     camera: Camera
@@ -70,6 +71,7 @@ class Estimate:
     pull: tuple[float, float] | None
     converged: bool
     terms: Terms
+    held: bool = False
 
     @property
     def sigmas(self) -> Array | None:

@@ -100,7 +100,11 @@ class Evidence:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
         solution = self.solution
         return scatter_covariance(
-            solution.inliers, solution.T_camera_lidar, solution.scales, self.robust_hessians
+            solution.inliers,
+            solution.T_camera_lidar,
+            solution.scales,
+            self.robust_hessians,
+            held=solution.held,
         )
 
     @cached_property
@@ -127,7 +131,8 @@ class Evidence:
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        return self._block(self.joint_covariance, camera)
+        joint = None if camera in self.solution.held else self.joint_covariance
+        return self._block(joint, camera)
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
         rows = slice(6 * self.cameras.index(camera), 6 * self.cameras.index(camera) + 6)
@@ -238,6 +243,7 @@ class Evidence:
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
+            held=camera in solution.held,
         )
 
 
@@ -267,6 +273,8 @@ def scatter_covariance(
     scales: Scales,
     robust_hessians: Mapping[str, Array] | None = None,
     gate_hessian: Mapping[str, Array] | None = None,
+    *,
+    held: Sequence[str] = (),
 ) -> Array | None:
     """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
     if not inliers.uses_correspondences:
@@ -279,6 +287,7 @@ def scatter_covariance(
         gate_hessian=inliers.gate_hessian if gate_hessian is None else gate_hessian,
         robust_hessians=robust_hessians,
         pairs=inliers.pairs,
+        held=held,
     )
 
 

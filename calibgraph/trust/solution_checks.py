@@ -24,6 +24,13 @@ def estimate_checks(evidence: Evidence) -> Checks:
 
 def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
+    if estimate.held:
+        text = (
+            f"{estimate.used} usable correspondences, too few, and nothing ties it to another "
+            "camera: it is left at its guess; check that its images show something sharp, that the "
+            "cloud lies where T_camera_lidar looks, and its name"
+        )
+        return [Check("correspondences", "FAIL", text, estimate.used)]
     if estimate.residuals is None:
         text = (
             f"{estimate.used} usable correspondences, too few: determined by other cameras alone, "

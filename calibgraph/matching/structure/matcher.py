@@ -18,7 +18,7 @@ from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.global_search import Located, locate_cameras
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.pose_refinement import CameraFrames
-from calibgraph.matching.structure.pose_search import SearchRange
+from calibgraph.matching.structure.pose_search import CONFIDENT, SearchRange
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -37,9 +37,9 @@ SYSTEMATIC_TRANSLATION_M = 0.02
 rigs, each from a few places. One place alone is worse; synthetic scenes are better."""
 
 _TRACKING_ROUNDS = (2, 4)
-_ROUND_AFTER_SEARCH, _CONFIDENT = 3, 20.0
-"""The round that follows a search, and the least z-score of all cameras for that. With a sparse
-LiDAR, poses with less were 2 degrees off, and the first rounds corrected them."""
+_ROUND_AFTER_SEARCH = 3
+"""The round that follows a search, if it is confident of all cameras. With a sparse LiDAR, poses of
+lower z-scores were 2 degrees off, and the first rounds corrected them."""
 
 FRAME_WINDOWS = 6_000  # bounds the time of a single frame
 SHARING_FRAMES = 20
@@ -161,7 +161,7 @@ class StructureMatcher:
         }
 
     def _first_round(self, candidates: Mapping[str, Located]) -> int:
-        confident = all(c.accepted and c.z_score >= _CONFIDENT for c in candidates.values())
+        confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
     def _submit_scores(

@@ -17,6 +17,7 @@ from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
 from calibgraph.matching.structure.pose_refinement import (
+    GAIN,
     CameraFrames,
     Candidate,
     approach,
@@ -33,6 +34,12 @@ ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
 """Windows lie in the maps as they are seen from the guess: if it is rolled by more than some 8
 degrees, right places stand out no more."""
 SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
+
+CONFIDENT = 20.0
+"""From this z-score on, no better pose is looked for around: on KITTI 05 and 07, poses 0.8 to 4.6
+degrees or 30 to 160 cm off had 10.8 to 19.4, and of 14 such, 13 led to the right one."""
+DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
+MAX_LOOKS = 3
 
 TURNS_RAD = np.radians([90.0, 180.0, 270.0])  # of the clouds, with which nothing can be found
 
@@ -71,7 +78,7 @@ class PoseSearch:
 
     def near(self, body: Body) -> Candidate:
         """The body about its guess, refined on."""
-        return self._refine_on(self.from_afar(body))
+        return self._settle(self.from_afar(body))
 
     def from_afar(self, body: Body) -> Candidate:
         """The body near a pose that may be off by some degrees."""
@@ -79,7 +86,7 @@ class PoseSearch:
 
     def at(self, body: Body) -> Candidate:
         """The body near a pose that is off by less than a degree."""
-        return self._refine_on(refine(self._frames, body))
+        return self._settle(refine(self._frames, body))
 
     def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
         """The best pose in all of the range; of those that are accepted, the first."""
@@ -159,13 +166,35 @@ class PoseSearch:
         near.sort(key=_by_z_score, reverse=True)
         survivors = near[: 1 if self.out_of_time() else effort * SURVIVORS]
         refined = [refine(self._frames, one.body) for one in survivors]
-        return self._refine_on(max(refined, key=_by_z_score, default=nothing))
+        return self._settle(max(refined, key=_by_z_score, default=nothing))
 
-    def _refine_on(self, candidate: Candidate) -> Candidate:
-        """The candidate refined further, if that may be of use."""
-        if not may_be_accepted(candidate.z_score, len(ROLLS_RAD)):
-            return candidate
-        return refine_on(self._frames, candidate)
+    def _settle(self, candidate: Candidate) -> Candidate:
+        """Refine a candidate further, and look around it for a better one.
+
+        Where few of the windows agree, as with the far ones alone, a pose some degrees and
+        decimetres off can agree far better than by chance.
+        """
+        for _ in range(MAX_LOOKS):
+            if not may_be_accepted(candidate.z_score, len(ROLLS_RAD)) or self.out_of_time():
+                break
+            refined = refine_on(self._frames, candidate)
+            if refined.z_score >= CONFIDENT:
+                return refined
+            around = self._best_around(refined)
+            if around.z_score < GAIN * refined.z_score:
+                return refined
+            candidate = around
+        return candidate
+
+    def _best_around(self, candidate: Candidate) -> Candidate:
+        """The best pose that approaches from poses drawn around a candidate lead to."""
+        box = Box(lead(candidate.body).T_camera_lidar, AROUND_RAD, AROUND_M)
+        unit = np.random.default_rng(self._seed).uniform(-1.0, 1.0, (DRAWS_AROUND, 6))
+        drawn = box.transforms(unit * box.half_widths)
+        near = [approach(self._frames, place(candidate.body, T)) for T in drawn]
+        near.sort(key=_by_z_score, reverse=True)
+        refined = [refine(self._frames, one.body) for one in near[:SURVIVORS]]
+        return max(refined, key=_by_z_score)
 
     def _correlate(self, body: Body, effort: int) -> BodyMaps:
         """The maps of those cameras that the clouds are in view of."""
