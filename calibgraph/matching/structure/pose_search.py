@@ -175,7 +175,8 @@ class PoseSearch:
         decimetres off can agree far better than by chance.
         """
         for _ in range(MAX_LOOKS):
-            if not may_be_accepted(candidate.z_score, len(ROLLS_RAD)) or self.out_of_time():
+            hopeless = not may_be_accepted(candidate.z_score, len(ROLLS_RAD))
+            if hopeless or candidate.z_score >= CONFIDENT or self.out_of_time():
                 break
             refined = refine_on(self._frames, candidate)
             if refined.z_score >= CONFIDENT:
