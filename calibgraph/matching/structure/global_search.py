@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from calibgraph.matching.structure.acceptance import Chance
+from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import CANDIDATES
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
@@ -111,7 +111,6 @@ class Locator:
             self._search_next,
             self._accept_guess,
             self._search_again,
-            self._accept_by_chance,
         )
         while not self._search.out_of_time() and any(step() for step in steps):
             pass
@@ -121,7 +120,7 @@ class Locator:
         """Keep a candidate if it is the best of its body, and locate the body if it is accepted."""
         if name not in self.best or candidate.z_score > self.best[name].z_score:
             self.best[name] = candidate
-        if not self._search.accepts(self._bodies[name], candidate.z_score, tries):
+        if candidate.z_score < least_z_score(tries):
             return False
         self.located[name] = candidate
         return True
@@ -201,22 +200,12 @@ class Locator:
         self._search_for(again[0], effort=RETRY_EFFORT)
         return True
 
-    def _accept_by_chance(self) -> bool:
-        """Accept the best pose of a body by what chance brings about on this scene."""
-        for name in self._missing():
-            body, best = self._bodies[name], self.best[name]
-            if self._search.measure_chance(body, best.z_score):
-                near = _is_same_pose(self._near[name].body, best.body)
-                if self._consider(name, best, ALONE if near else TRIES[self._searches[name]]):
-                    return True
-        return False
-
     def _missing(self) -> list[str]:
         return [name for name in self._bodies if name not in self.located]
 
     def _search_for(self, name: str, effort: int) -> None:
         tries = TRIES[self._searches[name] + 1]
-        z_score, least = self.best[name].z_score, Chance().least_z_score(tries)
+        z_score, least = self.best[name].z_score, least_z_score(tries)
         before = f" (best z-score {z_score:.1f}, {least:.1f} needed)" if z_score > 0 else ""
         self._report(f"searching: {name}{before}")
         self._searches[name] += 1

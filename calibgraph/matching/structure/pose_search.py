@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.acceptance import Chance, may_be_accepted
+from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place, place_member
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
@@ -41,7 +41,7 @@ degrees or 30 to 160 cm off had 10.8 to 19.4, and of 14 such, 13 led to the righ
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
 MAX_LOOKS = 3
 
-TURNS_RAD = np.radians([90.0, 180.0, 270.0])  # of the clouds, with which nothing can be found
+PROMISING = 10.6  # more is tried about a pose from this z-score on: local optima had 10.8 and more
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,6 @@ class PoseSearch:
     ) -> None:
         self.rig, self.guess, self.out_of_time = rig, rig.T_camera_lidar, out_of_time
         self._frames, self._range, self._seed = frames, search_range, seed
-        self._chances: dict[str, Chance] = {}
 
     @cached_property
     def _common(self) -> CommonFeatures:
@@ -93,7 +92,7 @@ class PoseSearch:
         best = Candidate(body, -math.inf)
         for roll in ROLLS_RAD:
             best = max(best, self._best_of(body, roll, effort), key=_by_z_score)
-            if self.accepts(body, best.z_score, tries) or self.out_of_time():
+            if best.z_score >= least_z_score(tries) or self.out_of_time():
                 break
         return best
 
@@ -112,39 +111,6 @@ class PoseSearch:
         old = lead(body).T_camera_lidar
         relative = relative_transform(old, self.guess[by])
         return place(body, relative @ camera.T_camera_lidar)
-
-    def accepts(self, body: Body, z_score: float, tries: float) -> bool:
-        """Whether a z-score is too high to have come about by chance.
-
-        Args:
-            body: the one that was searched for.
-            z_score: at its best pose.
-            tries: see :meth:`Chance.least_z_score`.
-        """
-        chance = self._chances.get(next(iter(body)), Chance())
-        return z_score >= chance.least_z_score(tries)
-
-    def measure_chance(self, body: Body, z_score: float) -> bool:
-        """Measure what chance brings about on this scene, by searches with nothing to find.
-
-        Returns:
-            Whether it was measured: once, and only if the z-score may be accepted afterwards.
-        """
-        name = next(iter(body))
-        if name in self._chances or not may_be_accepted(z_score, len(ROLLS_RAD)):
-            return False
-        chance = Chance()
-        for angle in TURNS_RAD:
-            chance = chance.with_seen(self._search_turned(body, angle))
-        self._chances[name] = chance
-        return True
-
-    def _search_turned(self, body: Body, angle_rad: float) -> float:
-        """The best z-score in clouds that are turned about the vertical."""
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
-        turned = place(body, lead(body).T_camera_lidar @ turn)
-        return self._best_of(turned, 0.0, effort=1).z_score
 
     def _best_of(self, body: Body, roll_rad: float, effort: int) -> Candidate:
         """The best pose all over the range about a body's guess, with maps for one roll.
@@ -175,8 +141,7 @@ class PoseSearch:
         decimetres off can agree far better than by chance.
         """
         for _ in range(MAX_LOOKS):
-            hopeless = not may_be_accepted(candidate.z_score, len(ROLLS_RAD))
-            if hopeless or candidate.z_score >= CONFIDENT or self.out_of_time():
+            if not PROMISING <= candidate.z_score < CONFIDENT or self.out_of_time():
                 break
             refined = refine_on(self._frames, candidate)
             if refined.z_score >= CONFIDENT:

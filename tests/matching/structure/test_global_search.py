@@ -13,7 +13,7 @@ import pytest
 import calibgraph
 from calibgraph import RelativePose, Rig, StructureMatcher
 from calibgraph.matching.structure import acceptance, global_search, pose_search
-from calibgraph.matching.structure.acceptance import Chance
+from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
@@ -24,8 +24,8 @@ from tests.matching.structure.data import never
 
 NAMES = ("front_left", "front_right")
 BOTH = (NAMES, NAMES[::-1])
-MANY, AGAIN = (Chance().least_z_score(TRIES[searches]) for searches in (1, 2))
-ALONE = Chance().least_z_score(global_search.ALONE)
+MANY, AGAIN = (least_z_score(TRIES[searches]) for searches in (1, 2))
+ALONE = least_z_score(global_search.ALONE)
 
 
 def off(T_camera_lidar: np.ndarray, metres: float = 1.0) -> np.ndarray:
@@ -42,7 +42,6 @@ class MadeUp(PoseSearch):
         z_scores: T_camera_lidar of a lead, and its z-score.
         searched: what the searches for a camera find, in turn; the last one again and again.
         sees: per (other camera, camera): where the other, at its first pose, sees the camera.
-        chance: best z-score where nothing can be found.
     """
 
     def __init__(
@@ -51,13 +50,10 @@ class MadeUp(PoseSearch):
         z_scores: Iterable[tuple[np.ndarray, float]],
         searched: Mapping[str, list[np.ndarray]] | None = None,
         sees: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]] | None = None,
-        chance: float = 5.0,
     ) -> None:
         super().__init__(rig, {}, SearchRange(0.3, 1.5), 0, never)
         self.z_scores, self.found, self.sees = list(z_scores), dict(searched or {}), sees or {}
-        self.chance = chance
         self.searches: list[str] = []
-        self.turned: list[str] = []
 
     def at(self, body: Body) -> Candidate:
         T = lead(body).T_camera_lidar
@@ -79,10 +75,6 @@ class MadeUp(PoseSearch):
         of_other, of_this = self.sees[by, name]
         relative = of_this @ np.linalg.inv(of_other)
         return place(body, relative @ lead(other).T_camera_lidar)
-
-    def _search_turned(self, body: Body, angle_rad: float) -> float:
-        self.turned.append(next(iter(body)))
-        return self.chance
 
 
 def locate(search: PoseSearch) -> dict[str, Located]:
@@ -114,32 +106,13 @@ def test_a_lower_z_score_is_accepted_at_the_guess_if_a_search_found_no_better(
     one: Rig, near: float, elsewhere: float, taken: str, searches: int
 ) -> None:
     guess = one.T_camera_lidar["left"]
-    search = MadeUp(
-        one, [(guess, near), (off(guess), elsewhere)], {"left": [off(guess)]}, chance=12
-    )
+    search = MadeUp(one, [(guess, near), (off(guess), elsewhere)], {"left": [off(guess)]})
     found = locate(search)["left"]
     assert len(search.searches) == searches
     assert found.accepted == (taken != "none")
     if found.accepted:
         T = guess if taken == "near" else off(guess)
         np.testing.assert_allclose(found.camera.T_camera_lidar, T, atol=1e-9)
-
-
-@pytest.mark.parametrize(("chance", "accepted"), [(4.0, True), (9.0, False)])
-def test_what_chance_brings_about_on_the_scene_decides_last(
-    one: Rig, chance: float, accepted: bool
-) -> None:
-    guess = one.T_camera_lidar["left"]
-    search = MadeUp(one, [(off(guess), 13.0)], {"left": [off(guess)]}, chance=chance)
-    assert locate(search)["left"].accepted == accepted
-    assert search.searches == ["left", "left"]  # before chance is measured
-    assert len(search.turned) == 3
-
-
-def test_a_hopeless_z_score_is_rejected_without_measuring_chance(one: Rig) -> None:
-    search = MadeUp(one, [])
-    assert not locate(search)["left"].accepted
-    assert search.turned == []
 
 
 def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) -> None:
@@ -195,7 +168,6 @@ def test_a_camera_that_agrees_with_nothing_where_it_is_seen_is_not_located(two: 
         two,
         [(first, 34.0), (wrong, MANY + 2), (second, ALONE - 1)],
         sees={NAMES: (first, second)},
-        chance=12,
     )
     search.guess = {NAMES[0]: first, NAMES[1]: wrong}
     found = locate(search)
@@ -237,12 +209,8 @@ def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.Mon
     assert "left" in start.findings.missed
 
 
-def test_chance_moves_with_what_is_seen_and_fewer_tries_need_less() -> None:
+def test_fewer_tries_need_less() -> None:
     assert ALONE < MANY < AGAIN < math.inf
-    low, high = (Chance((z,) * 3).least_z_score(3) for z in (4.0, 10.0))
-    assert high - low > 4  # three searches outweigh the prior
-    assert low < MANY < high
-    assert Chance((5.7 + 0.92 * 0.577,) * 3).least_z_score(3) < MANY  # more certain of the same
 
 
 def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None:
@@ -251,10 +219,5 @@ def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None
     tries, scenes, rate = 3, 400_000, acceptance.FALSE_ACCEPTANCE
     locations = rng.normal(acceptance.PRIOR_LOCATION, acceptance.PRIOR_SIGMA, scenes)
     best = rng.gumbel(locations + acceptance.SCALE * math.log(tries), acceptance.SCALE)
-    share = np.mean(best >= Chance().least_z_score(tries))
+    share = np.mean(best >= least_z_score(tries))
     assert 0.5 * rate < share < 1.1 * rate
-    seen = rng.gumbel(locations[:, None], acceptance.SCALE, (scenes, 3))
-    zero, one, two = (Chance((z,) * 3).least_z_score(tries) for z in (0.0, 1.0, 2.0))
-    assert two - one == pytest.approx(one - zero)  # linear in the mean of what is seen
-    share = np.mean(best >= zero + (one - zero) * seen.mean(axis=1))
-    assert 0.7 * rate < share < 1.1 * rate
