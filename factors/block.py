@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import check_shape, join_roots, read_only, rows_of_root
+from factors.block_arrays import RobustBlock, check_shape, join_roots, rows_of_root
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.kernel import (
     accumulate_alone,
@@ -43,7 +43,7 @@ _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy co
 
 
 @dataclass(frozen=True, eq=False)
-class ProjectionBlock:
+class ProjectionBlock(RobustBlock):
     """Correspondences of one camera, as a structure of arrays. Immutable: its arrays are read-only.
 
     Attributes:
@@ -80,34 +80,25 @@ class ProjectionBlock:
         if self.sqrt_information is not None:
             check_shape("sqrt_information", self.sqrt_information, (n, 3))
         loss_id(self.loss)
-        _check_positive(scale=self.scale, sigma=self.sigma)
+        self._check_scale()
         columns = np.empty((5, n))
         columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
         self._initialize(columns, *rows_of_root(self.sqrt_information))
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        columns = read_only(columns)
-        root = None if root is None else read_only(root)
-        whitening = np.empty((0, columns.shape[1])) if root is None else root[:rows]
-        object.__setattr__(self, "_columns", columns)
-        object.__setattr__(self, "_whitening", whitening)
         edges = np.append(np.arange(0, columns.shape[1], _CHUNK), columns.shape[1])
-        object.__setattr__(self, "_chunks", to_runs(edges))
-        object.__setattr__(self, "points_lidar_m", columns[:3].T)
-        object.__setattr__(self, "pixels_px", columns[3:].T)
-        object.__setattr__(self, "sqrt_information", None if root is None else root.T)
+        self._replace(
+            _columns=columns,
+            _whitening=np.empty((0, columns.shape[1])) if root is None else root[:rows],
+            _chunks=to_runs(edges),
+            points_lidar_m=columns[:3].T,
+            pixels_px=columns[3:].T,
+            sqrt_information=None if root is None else root.T,
+        )
 
     def __len__(self) -> int:
         return len(self.pixels_px)
-
-    def rescale(self, *, scale: float, sigma: float = 1.0) -> ProjectionBlock:
-        """The same correspondences, not copied, with another scale of the loss, and sigma."""
-        _check_positive(scale=scale, sigma=sigma)
-        other = copy.copy(self)  # not checked again: its correspondences are those of a good block
-        object.__setattr__(other, "scale", scale)
-        object.__setattr__(other, "sigma", sigma)
-        return other
 
     def rewhiten(self, sqrt_information: Array | None) -> ProjectionBlock:
         """The same correspondences, not copied, with other (n, 3) whitening matrices, or none."""
@@ -270,9 +261,3 @@ def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     return np.ascontiguousarray(T_lidar_camera.inverse().matrix())
-
-
-def _check_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise ValueError(f"the robust {name} must be positive, found {value}")

@@ -1,13 +1,45 @@
-"""The arrays of a block of correspondences: checked, read-only, and whitening by columns."""
+"""What blocks of correspondences share: their loss's scale, and arrays that cannot be written."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+class RobustBlock:
+    """A frozen block of residuals with one robust loss.
+
+    Attributes:
+        scale: norm of a whitened residual, divided by sigma, at which the loss bends.
+        sigma: what all whitened residuals are divided by.
+    """
+
+    scale: float
+    sigma: float
+
+    def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
+        """The same correspondences, not copied, with another scale of the loss, and sigma."""
+        other = copy.copy(self)  # not checked again: its correspondences are those of a good block
+        other._replace(scale=scale, sigma=sigma)
+        other._check_scale()
+        return other
+
+    def _check_scale(self) -> None:
+        for name in ("scale", "sigma"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, found {getattr(self, name)}")
+
+    def _replace(self, **values: Any) -> None:
+        """Set attributes of a block that is being made; arrays as views that are read-only."""
+        for name, value in values.items():
+            array = isinstance(value, np.ndarray)
+            object.__setattr__(self, name, read_only(value) if array else value)
 
 
 def read_only(array: Array) -> Array:

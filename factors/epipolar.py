@@ -24,6 +24,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.block_arrays import RobustBlock
 from factors.block_sums import BlockSums, unpack_sums
 from factors.compiled import compiled
 from factors.lens import Lens
@@ -36,7 +37,7 @@ _COLUMNS = 18  # of a feature: f_a, F_a by columns, f_b, F_b by columns
 
 
 @dataclass(frozen=True, eq=False)
-class EpipolarBlock:
+class EpipolarBlock(RobustBlock):
     """Features that two cameras see, with what their epipolar residuals need. Immutable.
 
     Attributes:
@@ -64,7 +65,7 @@ class EpipolarBlock:
     def __post_init__(self) -> None:
         n = len(self.pixels_a_px)
         loss_id(self.loss)
-        _require_positive(self.scale, self.sigma)
+        self._check_scale()
         parts = []
         for name, lens in (("pixels_a_px", self.lens_a), ("pixels_b_px", self.lens_b)):
             pixels = getattr(self, name)
@@ -76,31 +77,20 @@ class EpipolarBlock:
                 raise ValueError(f"{name}[{row}] has no ray: {pixels[row]}")
             spreads = ray_spreads(lens, rays).transpose(0, 2, 1)
             parts += [rays, spreads.reshape(n, 6)]
-        self._set(np.concatenate(parts, axis=1), self.pixels_a_px, self.pixels_b_px)
-
-    def _set(self, rays: Array, pixels_a_px: Array, pixels_b_px: Array) -> None:
-        """Set the arrays of a block that is being made, read-only."""
-        arrays = {"_rays": rays, "pixels_a_px": pixels_a_px, "pixels_b_px": pixels_b_px}
-        for name, array in arrays.items():
-            view = np.ascontiguousarray(array).view()
-            view.flags.writeable = False
-            object.__setattr__(self, name, view)
+        self._replace(
+            _rays=np.concatenate(parts, axis=1),
+            pixels_a_px=np.ascontiguousarray(self.pixels_a_px),
+            pixels_b_px=np.ascontiguousarray(self.pixels_b_px),
+        )
 
     def __len__(self) -> int:
         return len(self._rays)
 
-    def rescale(self, *, scale: float, sigma: float = 1.0) -> EpipolarBlock:
-        """The same features, not copied, with another scale of the loss, and sigma."""
-        _require_positive(scale, sigma)
-        other = copy.copy(self)
-        object.__setattr__(other, "scale", scale)
-        object.__setattr__(other, "sigma", sigma)
-        return other
-
     def select(self, rows: NDArray[Any]) -> EpipolarBlock:
         """The block with only some features: a mask or an index array."""
         other = copy.copy(self)
-        other._set(self._rays[rows], self.pixels_a_px[rows], self.pixels_b_px[rows])
+        names = "_rays", "pixels_a_px", "pixels_b_px"
+        other._replace(**{name: getattr(self, name)[rows] for name in names})
         return other
 
     def sums(self, T_a_b: gtsam.Pose3) -> BlockSums:
@@ -226,8 +216,3 @@ def _residuals(R, t, rays):  # type: ignore[no-untyped-def]
     for k in range(len(rays)):
         out[k] = _sampson(R, t, rays[k], jacobian, scratch)
     return out
-
-
-def _require_positive(scale: float, sigma: float) -> None:
-    if not (scale > 0 and sigma > 0):
-        raise ValueError(f"scale and sigma must be positive, found {scale} and {sigma}")

@@ -16,6 +16,8 @@ square root has 13 rows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,22 +50,15 @@ def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomF
     """
     last: tuple[bytes, tuple[Array, Array]] | None = None
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def residual(*poses: gtsam.Pose3) -> tuple[Array, Array]:
         nonlocal last
-        poses = values.atPose3(key_a), values.atPose3(key_b)
         place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
         if found is None or found[0] != place:
             last = found = (place, _error_and_jacobian(block, *poses))
-        residual, jacobian = found[1]
-        if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian[:, :6])
-            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
-        return residual
+        return found[1]
 
     rows = 13 if isinstance(block, SurfaceBlock) else 7
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), [key_a, key_b], error)
+    return _factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
 
 
 def _error_and_jacobian(
@@ -118,19 +113,14 @@ def pair_projection_factor(
     pixel = np.asarray(pixel_b_px, dtype=np.float64)
     whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        T_a_b, by_a, by_b = _relative(values, key_a, key_b)
-        residual, jacobian = projection_residual(lens_b, T_a_b, point, pixel)
-        if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian @ by_a)
-            jacobians[1] = np.asfortranarray(jacobian @ by_b)
-        return residual
+    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+        T_a_b = T_lidar_a.between(T_lidar_b)
+        error, jacobian = projection_residual(lens_b, T_a_b, point, pixel)
+        return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
 
     base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
     noise = robust_noise(base, loss=loss, scale=scale)
-    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+    return _factor_on_two_poses(noise, key_a, key_b, residual)
 
 
 def surface_factor(
@@ -160,18 +150,11 @@ def surface_factor(
         np.asarray(value, dtype=np.float64) for value in (ray_a, plane_lidar_per_m, pixel_b_px)
     )
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        poses = values.atPose3(key_a), values.atPose3(key_b)
-        residual, jacobian = surface_residual(poses, lens_b, ray, plane, pixel)
-        if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian[:, :6])
-            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
-        return residual
+    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+        return surface_residual((T_lidar_a, T_lidar_b), lens_b, ray, plane, pixel)
 
     noise = robust_noise(gtsam.noiseModel.Unit.Create(2), loss=loss, scale=scale)
-    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+    return _factor_on_two_poses(noise, key_a, key_b, residual)
 
 
 def epipolar_factor(
@@ -195,22 +178,30 @@ def epipolar_factor(
     """
     pixel_a, pixel_b = (np.asarray(pixel, dtype=np.float64) for pixel in pixels_px)
 
+    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+        T_a_b = T_lidar_a.between(T_lidar_b)
+        error, jacobian = epipolar_residual(T_a_b, lenses, (pixel_a, pixel_b))
+        return np.array([error]), jacobian[None] @ pair_chain(T_lidar_a, T_lidar_b)
+
+    noise = robust_noise(gtsam.noiseModel.Unit.Create(1), loss=loss, scale=scale)
+    return _factor_on_two_poses(noise, key_a, key_b, residual)
+
+
+def _factor_on_two_poses(
+    noise: gtsam.noiseModel.Base,
+    key_a: int,
+    key_b: int,
+    residual: Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]],
+) -> gtsam.CustomFactor:
+    """A factor of (m,) residuals with (m, 12) Jacobians, in the tangents of both poses."""
+
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
-        T_a_b, by_a, by_b = _relative(values, key_a, key_b)
-        residual, jacobian = epipolar_residual(T_a_b, lenses, (pixel_a, pixel_b))
+        found, jacobian = residual(values.atPose3(key_a), values.atPose3(key_b))
         if jacobians is not None:
-            jacobians[0] = np.asfortranarray((jacobian @ by_a)[None])
-            jacobians[1] = np.asfortranarray((jacobian @ by_b)[None])
-        return np.array([residual])
+            jacobians[0] = np.asfortranarray(jacobian[:, :6])
+            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
+        return found
 
-    noise = robust_noise(gtsam.noiseModel.Unit.Create(1), loss=loss, scale=scale)
     return gtsam.CustomFactor(noise, [key_a, key_b], error)
-
-
-def _relative(values: gtsam.Values, key_a: int, key_b: int) -> tuple[gtsam.Pose3, Array, Array]:
-    """T_a_b, and the (6, 6) derivatives of its tangent by those of both variables."""
-    by_a, by_b = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
-    T_a_b = values.atPose3(key_a).between(values.atPose3(key_b), by_a, by_b)
-    return T_a_b, by_a, by_b

@@ -22,6 +22,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.block_arrays import RobustBlock
 from factors.block_sums import BlockSums
 from factors.compiled import compiled
 from factors.lens import Lens, is_projectable, project_one
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceBlock:
+class SurfaceBlock(RobustBlock):
     """Features of camera A with their surfaces, and their pixels in camera B. Immutable.
 
     Attributes:
@@ -59,39 +60,22 @@ class SurfaceBlock:
     def __post_init__(self) -> None:
         n = len(self.rays_a)
         loss_id(self.loss)
-        if not (self.scale > 0 and self.sigma > 0):
-            raise ValueError(f"scale and sigma must be positive: {self.scale}, {self.sigma}")
+        self._check_scale()
         for name, width in _WIDTHS.items():
             array = getattr(self, name)
             if array.shape != (n, width) or not np.isfinite(array).all():
                 raise ValueError(
                     f"{name}: expected {(n, width)} finite values, found {array.shape}"
                 )
-        self._set(**{name: getattr(self, name) for name in _WIDTHS})
-
-    def _set(self, **arrays: Array) -> None:
-        """Set the arrays of a block that is being made, read-only."""
-        for name, array in arrays.items():
-            view = np.ascontiguousarray(array, dtype=np.float64).view()
-            view.flags.writeable = False
-            object.__setattr__(self, name, view)
+            self._replace(**{name: np.ascontiguousarray(array, dtype=np.float64)})
 
     def __len__(self) -> int:
         return len(self.rays_a)
 
-    def rescale(self, *, scale: float, sigma: float = 1.0) -> SurfaceBlock:
-        """The same features, not copied, with another scale of the loss, and sigma."""
-        if not (scale > 0 and sigma > 0):
-            raise ValueError(f"scale and sigma must be positive: {scale}, {sigma}")
-        other = copy.copy(self)
-        object.__setattr__(other, "scale", scale)
-        object.__setattr__(other, "sigma", sigma)
-        return other
-
     def select(self, rows: NDArray[Any]) -> SurfaceBlock:
         """The block with only some features: a mask or an index array."""
         other = copy.copy(self)
-        other._set(**{name: getattr(self, name)[rows] for name in _WIDTHS})
+        other._replace(**{name: getattr(self, name)[rows] for name in _WIDTHS})
         return other
 
     def sums(self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
