@@ -166,7 +166,7 @@ class Calibration:
     def pair_covariance(self) -> dict[str, Array]:
         """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
 
-        Empty with too few frames.
+        Without the pairs of cameras that have no error bar; empty with too few frames.
         """
         if self.joint_covariance is None:
             return {}
@@ -176,6 +176,7 @@ class Calibration:
                 self.joint_covariance, i, j, relative_transform(T[b], T[a])
             )
             for (i, a), (j, b) in combinations(enumerate(T), 2)
+            if self.covariance[a] is not None and self.covariance[b] is not None
         }
 
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:

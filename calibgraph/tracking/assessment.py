@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
-from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR, pose_hessian, with_pseudo_frames
+from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR, with_pseudo_frames
+from calibgraph.solver.curvature import pose_hessian
+from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
-from calibgraph.tracking.window import pose_priors
+from calibgraph.tracking.window import kept_pairs, pose_priors
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
@@ -40,7 +42,20 @@ class Assessment:
     verdicts: dict[str, Verdict]
 
 
-def joint_covariance(state: State, sums: Posterior, prior: Array) -> Array:
+@dataclass(frozen=True, eq=False)
+class PriorHessians:
+    """Hessians of the terms without correspondences, (6 n, 6 n).
+
+    Attributes:
+        whole: of priors and measured relative poses.
+        measured: of the measured relative poses, which is also the covariance of their gradients.
+    """
+
+    whole: Array
+    measured: Array
+
+
+def joint_covariance(state: State, sums: Posterior, prior: PriorHessians) -> Array:
     """(6 n, 6 n) cluster-robust covariance; NaN for cameras with too few frames.
 
     While a camera has few frames, its scatter is shrunk towards that of all its frames so far.
@@ -51,9 +66,9 @@ def joint_covariance(state: State, sums: Posterior, prior: Array) -> Array:
     ])  # fmt: skip
     usual = np.sqrt(share * sums.frames / np.maximum(state.total_frames, 1.0))
     scatter = _scaled(sums.scatter, np.sqrt(1 - share)) + _scaled(state.total, usual)
-    hessian = block_diagonal(sums.hessian) + prior
+    hessian = block_diagonal(sums.hessian) + prior.whole
     scatter = with_pseudo_frames(state.widen(scatter), hessian, np.repeat(sums.frames, 6))
-    covariance = replace(sums, scatter=scatter).covariance(prior)
+    covariance = replace(sums, scatter=scatter + prior.measured).covariance(prior.whole)
     rotation, translation = state.systematic_sigmas
     shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
     covariance += np.diag(np.tile(shared**2, len(state.cameras)))
@@ -68,14 +83,14 @@ def _scaled(scatter: Array, factors: Array) -> Array:
     return scatter * np.outer(each, each)
 
 
-def assess(state: State, sums: Posterior, halves: Halves, prior: Array) -> Assessment:
+def assess(state: State, sums: Posterior, halves: Halves, prior: PriorHessians) -> Assessment:
     """Assess the present estimates.
 
     Args:
         state: the tracker's.
         sums: over its summaries and live frames.
         halves: the same sums, of every other epoch.
-        prior: (6 n, 6 n) Hessian of priors and relative poses.
+        prior: of priors and relative poses.
     """
     covariance = joint_covariance(state, sums, prior)
     conflicts = _conflicts(state, sums, covariance)
@@ -190,13 +205,16 @@ def _conflicts(state: State, sums: Posterior, covariance: Array) -> list[Conflic
     return conflicts
 
 
-def prior_hessian(state: State) -> Array:
-    """(6 n, 6 n) Hessian of priors and relative poses, without correspondences."""
+def prior_hessians(state: State) -> PriorHessians:
+    """Hessians without correspondences."""
     T = {
         name: to_T_camera_lidar(p)
         for name, p in zip(state.names, state.T_lidar_camera, strict=True)
     }
-    return pose_hessian(pose_priors(state), state.names, T)
+    measured = relative_pose_graph(state.names, kept_pairs(state))
+    return PriorHessians(
+        pose_hessian(pose_priors(state), state.names, T), pose_hessian(measured, state.names, T)
+    )
 
 
 def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:
@@ -221,7 +239,7 @@ def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
     halves = Halves.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, prior_hessian(state))
+    assessment = assess(state, sums, halves, prior_hessians(state))
     estimates = zip(state.names, state.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_block import BlockResiduals
-from calibgraph.solver.covariance import robust_hessian
+from calibgraph.solver.curvature import robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import STRENGTHS, gain_of_walk, step_between
 from calibgraph.tracking.live_frames import Epoch, LiveFrame

@@ -24,7 +24,7 @@ from calibgraph.tracking.absorption import (
     set_aside,
     with_open_frame,
 )
-from calibgraph.tracking.assessment import Assessment, assess, prior_hessian, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, prior_hessians, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import number_and_stamp, with_findings_per_frame
@@ -155,7 +155,7 @@ class IncrementalCalibrator:
         """Assess the estimates: the sums over closed epochs are at hand."""
         state = self._state
         sums, halves = with_open_epoch(self._closed, state), self._closed_halves
-        return assess(state, sums, halves.add(state.epochs[-1].frames), self._prior_hessian)
+        return assess(state, sums, halves.add(state.epochs[-1].frames), self._priors)
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
@@ -202,7 +202,7 @@ class IncrementalCalibrator:
     def _rebuild(self) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
         self._window = Window(self._state)
-        self._prior_hessian = prior_hessian(self._state)
+        self._priors = prior_hessians(self._state)
         self._copy_estimates()
         self._closed = closed_posterior(self._state)
         self._closed_halves = Halves.of_closed_epochs(self._state)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.rig import RelativePose
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
@@ -155,11 +156,15 @@ class Window:
         return graph
 
 
+def kept_pairs(state: State) -> tuple[RelativePose, ...]:
+    """The relative poses that no move has invalidated."""
+    pairs = enumerate(state.rig.relative_poses)
+    return tuple(pair for place, pair in pairs if place not in state.dropped_pairs)
+
+
 def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
     """Priors about the references, and the relative poses that no move has invalidated."""
-    pairs = enumerate(state.rig.relative_poses)
-    kept = tuple(pair for place, pair in pairs if place not in state.dropped_pairs)
-    rig = state.rig.model_copy(update={"relative_poses": kept})
+    rig = state.rig.model_copy(update={"relative_poses": kept_pairs(state)})
     T_hat = {
         name: to_T_camera_lidar(reference)
         for name, reference in zip(state.names, state.references, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -19,12 +19,13 @@ from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.covariance import (
+    cameras_with_few_frames,
     cluster_robust_covariance,
     data_sigmas,
-    hessians_of_blocks,
 )
+from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
 from calibgraph.solver.factor_graph import relative_pose_graph
-from calibgraph.solver.objective import Objective, Scales, Transforms
+from calibgraph.solver.objective import Transforms
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
@@ -96,16 +97,29 @@ class Evidence:
         }
 
     @cached_property
+    def curvature(self) -> Curvature:
+        """Of all terms at the solution."""
+        solution = self.solution
+        return curvature_at(
+            solution.inliers, solution.T_camera_lidar, self.robust_hessians, solution.held
+        )
+
+    @cached_property
     def scatter(self) -> Array | None:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
         solution = self.solution
-        return scatter_covariance(
+        return cluster_robust_covariance(
             solution.inliers,
             solution.T_camera_lidar,
             solution.scales,
-            self.robust_hessians,
-            held=solution.held,
+            self.curvature,
+            solution.held,
         )
+
+    @cached_property
+    def without_error_bar(self) -> frozenset[str]:
+        """Cameras of which the scatter tells nothing: held, or with too few frames of their own."""
+        return frozenset((*self.solution.held, *cameras_with_few_frames(self.solution.inliers)))
 
     @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
@@ -123,7 +137,9 @@ class Evidence:
             return None
         solution = self.solution
         pairs = solution.inliers.pairs
-        return self.scatter + shared_covariance(self.findings, solution.T_camera_lidar, pairs)
+        return self.scatter + shared_covariance(
+            self.findings, solution.T_camera_lidar, self.curvature, pairs
+        )
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
@@ -131,7 +147,7 @@ class Evidence:
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        joint = None if camera in self.solution.held else self.joint_covariance
+        joint = None if camera in self.without_error_bar else self.joint_covariance
         return self._block(joint, camera)
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
@@ -191,11 +207,17 @@ class Evidence:
         free = solution.inliers.data_only()
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
-        scatter = scatter_covariance(
-            free, T_camera_lidar, solution.scales, gate_hessian=solution.inliers.gate_hessian
+        blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
+        curvature = curvature_at(
+            replace(free, gated=solution.inliers.gated),
+            T_camera_lidar,
+            hessians_of_blocks(blocks, T_camera_lidar),
         )
-        shared = shared_covariance(self.findings, T_camera_lidar, free.pairs)
-        return DataOnly(T_camera_lidar, None if scatter is None else scatter + shared)
+        scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
+        if scatter is None:
+            return DataOnly(T_camera_lidar, None)
+        shared = shared_covariance(self.findings, T_camera_lidar, curvature, free.pairs)
+        return DataOnly(T_camera_lidar, scatter + shared)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
@@ -265,30 +287,6 @@ class RunEvidence:
     def solution(self) -> Evidence:
         """Of the solution of the last round."""
         return Evidence(self.run.solution, self.run.guess)
-
-
-def scatter_covariance(
-    inliers: Objective,
-    T_camera_lidar: Transforms,
-    scales: Scales,
-    robust_hessians: Mapping[str, Array] | None = None,
-    gate_hessian: Mapping[str, Array] | None = None,
-    *,
-    held: Sequence[str] = (),
-) -> Array | None:
-    """(6 N, 6 N); None where the terms do not use the correspondences, or frames are too few."""
-    if not inliers.uses_correspondences:
-        return None
-    return cluster_robust_covariance(
-        {name: block.with_scale(scales[name]) for name, block in inliers.blocks.items()},
-        {name: block.frame for name, block in inliers.blocks.items()},
-        inliers.pose_graph,
-        T_camera_lidar,
-        gate_hessian=inliers.gate_hessian if gate_hessian is None else gate_hessian,
-        robust_hessians=robust_hessians,
-        pairs=inliers.pairs,
-        held=held,
-    )
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:

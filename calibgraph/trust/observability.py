@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.covariance import pose_hessian
+from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, relative_transform
 from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
+from calibgraph.solver.curvature import Curvature
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
@@ -23,23 +24,27 @@ the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which a
 def shared_covariance(
     findings: MatcherFindings,
     T_camera_lidar: Mapping[str, Array],
+    curvature: Curvature | None = None,
     pairs: Sequence[PairTerm] = (),
 ) -> Array:
     """(6 N, 6 N) covariance of the error that all frames share.
 
-    Cameras tied by their images have the matcher's error in common, as one rigid body, and between
-    them that of a relative pose from images; others have an error each.
+    The matcher displaces the correspondences of cameras that are tied by their images as one rigid
+    body, and those of others each by itself. What it does to the solution follows by the curvature:
+    also between tied cameras, since a camera that is displaced has wrong ranges for the features in
+    common. Between them there is the error of a relative pose from images besides.
 
     Args:
         findings: the matcher's error.
         T_camera_lidar: the solution, all cameras.
+        curvature: there; None if it was solved from the correspondences alone.
         pairs: what cameras see in common, as used in the solution.
     """
     rotation_rad, translation_m = findings.systematic_sigmas
     of_matcher = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
     of_pair = np.diag(pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M) ** 2)
     cameras = list(T_camera_lidar)
-    joint = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    joint, between = (np.zeros((6 * len(cameras), 6 * len(cameras))) for _ in range(2))
     for body in tied_cameras(cameras, pairs):
         adjoints = _from_first(body, T_camera_lidar)
         for one in body:
@@ -48,8 +53,8 @@ def shared_covariance(
                 columns = pose_rows(cameras.index(two))
                 joint[rows, columns] = adjoints[one] @ of_matcher @ adjoints[two].T
             if len(body) > 1:  # half in each of two cameras
-                joint[rows, rows] += of_pair / 2
-    return joint
+                between[rows, rows] += of_pair / 2
+    return between + (joint if curvature is None else curvature.response(joint))
 
 
 def _from_first(body: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> dict[str, Array]:

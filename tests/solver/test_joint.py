@@ -248,7 +248,8 @@ def test_an_error_that_all_frames_share_is_in_the_error_bar(pair: Rig) -> None:
     metadata = {"systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.02}
     plain, honest = (solve(pair, t) for t in (table, replace(table, metadata=metadata)))
     added = honest.covariance["left"] - plain.covariance["left"]
-    np.testing.assert_allclose(added, np.diag([1e-6] * 3 + [4e-4] * 3), atol=1e-15)
+    expected = np.diag([1e-6] * 3 + [4e-4] * 3)  # the weak priors take some millionths of it off
+    np.testing.assert_allclose(added, expected, rtol=1e-5, atol=5e-9)
     for wrong in (-1.0, "much", np.inf):
         with pytest.raises(CorrespondenceError, match="systematic_translation_m"):
             solve(pair, replace(table, metadata={"systematic_translation_m": wrong}))

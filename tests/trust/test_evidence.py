@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from calibgraph import Rig, solve
+from calibgraph import Correspondences, RelativePose, Rig, concatenate, solve
+from calibgraph.model.geometry import relative_transform
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.evidence import Evidence
 from tests.trust.conftest import simulated
+
+
+def tied(rig: Rig, *, rotation_deg: float, translation_m: float) -> Rig:
+    """With a measured relative pose of right and left."""
+    T = rig.T_camera_lidar
+    measured = RelativePose(
+        a="right",
+        b="left",
+        T_a_b=relative_transform(T["right"], T["left"]),
+        rotation_sigma_rad=np.radians(rotation_deg),
+        translation_sigma_m=translation_m,
+    )
+    return rig.model_copy(update={"relative_poses": (measured,)})
+
+
+def with_frames_of_right(table: Correspondences, frames: int) -> Correspondences:
+    """All of left's correspondences, and those of right in the first frames."""
+    right = table.of_camera("right")
+    return concatenate([table.of_camera("left"), right.select(right.frame < frames)])
 
 
 def test_the_covariance_has_full_rank_with_fewer_frames_than_numbers(mixed_rig: Rig) -> None:
@@ -19,3 +42,47 @@ def test_too_few_frames_give_no_error_bar(pair: Rig) -> None:
     assert result.covariance == {"left": None, "right": None}
     assert not result.pair_covariance and result.sigmas("left->right") is None
     assert any("too few to give an error bar" in reason for reason in result.verdict.reasons)
+
+
+def test_the_sigmas_of_a_relative_pose_are_in_the_error_bar(pair: Rig) -> None:
+    """Of a camera without correspondences, they are nearly all of it."""
+    table = simulated(pair, frames=10).of_camera("left")
+    result = solve(tied(pair, rotation_deg=2.9, translation_m=0.3), table)
+    sigmas = result.sigmas("right")
+    assert sigmas is not None
+    assert sigmas[0] == pytest.approx([2.9] * 3, rel=0.01)
+    assert sigmas[1] == pytest.approx([30] * 3, rel=0.1)
+    of_left = result.sigmas("left")
+    assert of_left is not None and of_left[0].max() < 0.1
+
+
+def test_frames_are_counted_per_camera(pair: Rig) -> None:
+    """A camera with one frame has no error bar, nor has its pair; the other camera has its own."""
+    table = simulated(pair, frames=10)
+    result = solve(pair, with_frames_of_right(table, 1))
+    assert result.covariance["right"] is None and result.sigmas("left->right") is None
+    assert result.camera_verdicts["right"].status != "PASS"
+    expected = solve(pair, table).covariance["left"]
+    np.testing.assert_allclose(result.covariance["left"], expected, rtol=1e-3, atol=1e-9)
+
+
+def test_a_camera_with_few_frames_has_a_wider_error_bar_than_one_with_many(pair: Rig) -> None:
+    result = solve(pair, with_frames_of_right(simulated(pair, frames=40), 6))
+    left, right = (result.sigmas(name) for name in ("left", "right"))
+    assert left is not None and right is not None
+    assert (right[0] > 1.5 * left[0]).all()
+
+
+def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_with_its_pair(
+    pair: Rig,
+) -> None:
+    rig = tied(pair, rotation_deg=0.01, translation_m=0.001)
+    table = simulated(pair, frames=10).of_camera("left")
+    findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
+    table = Correspondences(**{**vars(table), "metadata": findings})
+    evidence = Evidence(solve_joint(rig, table), guess=rig)
+    covariance = evidence.joint_covariance
+    assert covariance is not None
+    sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
+    assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
+    assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)

@@ -30,7 +30,8 @@ def test_without_pairs_every_camera_has_an_error_of_its_own(mixed_rig: Rig) -> N
 
 def test_tied_cameras_share_it_and_their_pair_does_not_have_it(pair: Rig) -> None:
     T = pair.T_camera_lidar
-    joint = shared_covariance(FINDINGS, T, pair_terms(pair, simulated_pairs(pair), Config()))
+    terms = pair_terms(pair, simulated_pairs(pair), Config())
+    joint = shared_covariance(FINDINGS, T, pairs=terms)
     relative = relative_covariance(joint, 0, 1, relative_transform(T["right"], T["left"]))
     own = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
     # Half of the pair's variance is in the left camera, half a metre away, which adds to it.

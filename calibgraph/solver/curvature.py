@@ -1,0 +1,160 @@
+"""Second derivatives of the cost at a solution: of the correspondences, and of all terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.parallel import map_on_cores
+from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.solver.factor_graph import relative_pose_graph, to_values
+from calibgraph.solver.objective import Objective, Transforms
+from factors import ProjectionBlock, unit_diagonal
+
+Array = NDArray[np.float64]
+
+_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
+_STEP = 1e-5  # rad and m: of the central differences of the gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Second derivatives of the robust cost at a solution, (6 N, 6 N), in its tangent.
+
+    Attributes:
+        of_correspondences: of each camera's own.
+        measured: of the measured relative poses.
+        whole: of all terms, with 1 for what nothing determines (``held`` cameras).
+    """
+
+    of_correspondences: Array
+    measured: Array
+    whole: Array
+
+    @cached_property
+    def inverse(self) -> Array | None:
+        """None where a direction is not determined."""
+        scaled, units = unit_diagonal(self.whole)
+        values, vectors = np.linalg.eigh(scaled)
+        if values[0] <= _SINGULAR * values[-1]:
+            return None
+        inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
+        return inverse
+
+    def sandwich(self, scatter: Array) -> Array:
+        """``H^-1 S H^-1`` for a positive semidefinite S, which it is as well, in spite of rounding.
+
+        Raises:
+            ValueError: if a direction is not determined.
+        """
+        if self.inverse is None:
+            raise ValueError("a direction of the solution is not determined")
+        values, vectors = np.linalg.eigh(scatter)
+        root = self.inverse @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        covariance: Array = root @ root.T
+        return covariance
+
+    def response(self, covariance: Array) -> Array:
+        """(6 N, 6 N) covariance of the solution if each camera's correspondences are displaced.
+
+        Args:
+            covariance: (6 N, 6 N) of the displacements, each that of its camera's own solution.
+
+        Raises:
+            ValueError: if a direction is not determined.
+        """
+        return self.sandwich(self.of_correspondences @ covariance @ self.of_correspondences)
+
+
+def curvature_at(
+    inliers: Objective,
+    T_camera_lidar: Transforms,
+    robust_hessians: Mapping[str, Array],
+    held: Sequence[str] = (),
+) -> Curvature:
+    """The curvature of an objective's terms.
+
+    Args:
+        inliers: after the gate, whose own curvature is part of it.
+        T_camera_lidar: its minimum.
+        robust_hessians: per camera, (6, 6) of its correspondences there.
+        held: cameras that nothing determines.
+    """
+    cameras, gates = list(T_camera_lidar), inliers.gate_hessian
+    own = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    for name, hessian in robust_hessians.items():
+        rows = pose_rows(cameras.index(name))
+        own[rows, rows] = hessian + gates.get(name, 0.0)
+    measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
+    whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
+    add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
+    whole += unknown([name in held for name in cameras])
+    return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
+
+
+def unknown(chosen: Sequence[bool]) -> Array:
+    """(6 N, 6 N) diagonal, 1 for the chosen cameras."""
+    return np.diag(np.repeat(np.array(chosen, dtype=np.float64), 6))
+
+
+def hessians_of_blocks(
+    blocks: Mapping[str, ProjectionBlock], T_camera_lidar: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Per camera with correspondences, its :func:`robust_hessian`, (6, 6)."""
+    poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in blocks]
+    hessians = map_on_cores(robust_hessian, [*blocks.values()], poses)
+    return dict(zip(blocks, hessians, strict=True))
+
+
+def add_pair_hessians(
+    hessian: Array, pairs: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
+) -> None:
+    """Add the part of camera pairs to the joint Hessian, (6 N, 6 N)."""
+    for pair in pairs:
+        rows = rows_of_pair(list(T_camera_lidar), pair)
+        hessian[np.ix_(rows, rows)] += pair.sums(T_camera_lidar).hessian
+
+
+def rows_of_pair(cameras: Sequence[str], pair: PairTerm) -> NDArray[np.intp]:
+    """(12,) rows of A's pose, then of B's."""
+    first = [6 * cameras.index(name) for name in (pair.a, pair.b)]
+    return np.add.outer(first, np.arange(6)).ravel()
+
+
+def pose_hessian(
+    graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
+) -> Array:
+    """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
+    values = to_values(cameras, T_camera_lidar)
+    hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    keys = list(values.keys())
+    for index in range(graph.size()):
+        factor = graph.at(index).linearize(values)
+        A = factor.jacobian()[0]
+        rows = np.concatenate([6 * keys.index(key) + np.arange(6) for key in list(factor.keys())])
+        hessian[np.ix_(rows, rows)] += A.T @ A
+    return hessian
+
+
+def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array:
+    """(6, 6) derivative of the gradient of half the robust cost, by central differences.
+
+    Where the robust cost is not convex, the reweighted Hessian, which is positive semidefinite.
+
+    Args:
+        block: correspondences of one camera.
+        T_lidar_camera: where; the Hessian is in its tangent.
+    """
+    steps = np.vstack([np.eye(6), -np.eye(6)]) * _STEP
+    gradients = block.gradients_at_each([T_lidar_camera.retract(step) for step in steps])
+    hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
+    hessian = (hessian + hessian.T) / 2
+    if np.linalg.eigvalsh(hessian)[0] > 0:
+        return hessian
+    return block.sums(T_lidar_camera).hessian
