@@ -93,6 +93,7 @@ class Locator:
         self._bodies = {next(iter(body)): body for body in rigid_bodies(search.rig)}
         self._searches = dict.fromkeys(self._bodies, 0)
         self._proposers: list[Candidate] = []  # that have proposed
+        self._moves: set[tuple[str, str]] = set()  # a body, and the one by which it was moved
         self._near: dict[str, Candidate] = {}
         self.best: dict[str, Candidate] = {}
         self.located: dict[str, Candidate] = {}
@@ -160,16 +161,22 @@ class Locator:
         seen_one = self._search.seen_by(two.body, one.body)
         moved_one = None if seen_one is None else self._search.at(seen_one)
         if moved_one and moved_one.z_score + two.z_score > one.z_score + moved_two.z_score:
-            self._replace(one, moved_one)
+            self._replace(one, moved_one, by=two)
         else:
-            self._replace(two, moved_two)
+            self._replace(two, moved_two, by=one)
 
-    def _replace(self, old: Candidate, new: Candidate) -> None:
-        """Move a body; if it is not accepted there, against one that is, it is not located."""
-        name = next(iter(old.body))
-        del self.located[name], self.best[name]
-        self._searches[name] = SEARCHES
-        self._consider(name, new, ALONE)
+    def _replace(self, old: Candidate, new: Candidate, by: Candidate) -> None:
+        """Move a body to where another one sees it.
+
+        It is not located if it is not accepted there, against one that is; nor if it was moved by
+        the same one before, since then no two poses of theirs agree.
+        """
+        name, mover = next(iter(old.body)), next(iter(by.body))
+        del self.located[name]
+        self._searches[name], self.best[name] = SEARCHES, new
+        if (name, mover) not in self._moves:
+            self._moves.add((name, mover))
+            self._consider(name, new, ALONE)
 
     def _search_next(self) -> bool:
         """Search for the most promising body that has not been searched for."""

@@ -161,6 +161,24 @@ def test_an_accepted_camera_moves_to_where_a_better_founded_one_sees_it(two: Rig
         np.testing.assert_allclose(found[NAMES[1]].camera.T_camera_lidar, second, atol=1e-9)
 
 
+class NeverAgreeing(MadeUp):
+    """Each camera always sees the other one metre from where that is."""
+
+    def seen_by(self, other: Body, body: Body) -> Body | None:
+        return place(body, off(lead(body).T_camera_lidar))
+
+    def at(self, body: Body) -> Candidate:
+        return Candidate(body, 30.0)
+
+
+def test_cameras_that_never_agree_are_moved_once_each_and_the_search_ends(two: Rig) -> None:
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    search = NeverAgreeing(two, [(first, 34.0), (second, 33.0)])
+    search.guess = {NAMES[0]: first, NAMES[1]: second}
+    found = locate(search)
+    assert [found[name].accepted for name in NAMES].count(True) == 1
+
+
 def test_a_camera_that_agrees_with_nothing_where_it_is_seen_is_not_located(two: Rig) -> None:
     first, second = (two.T_camera_lidar[name] for name in NAMES)
     wrong = off(second, 0.8)
