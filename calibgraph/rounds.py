@@ -21,6 +21,7 @@ from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
+from calibgraph.matching.standstill import same_places
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
@@ -28,6 +29,7 @@ from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.repeats import SAME_PLACE
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
@@ -62,9 +64,11 @@ def match_in_rounds(
     if full.stage1 == "rig":  # frame weights need a pose per frame, which only PnP gives
         config = config.changed(stage1="rig", learnt_weights=False)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
+    with watch("places"):
+        places = _same_places(data, guess)
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
-    estimate, found = start.rig, start.findings.to_metadata()
+    estimate, found = start.rig, start.findings.to_metadata() | places
     for index in range(start.first_round, full.rounds):
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=progress)
@@ -89,6 +93,15 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
     return (data if most_frames is None else data.spread_out(most_frames)), guess
+
+
+def _same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
+    """Which frames are of one place, as metadata of a table; empty if all are of their own."""
+    try:
+        places = same_places(data, rig)
+    except (CalibrationError, OSError):  # the checks on images report it
+        return {}
+    return {SAME_PLACE: places} if places else {}
 
 
 def _deadline(seconds: float | None) -> Callable[[], bool]:
@@ -182,6 +195,8 @@ def _from_displaced_start(
     config, terms = run.solution.config, run.solution.terms
     rig = run.solution.solved_rig
     estimate = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=config.seed)
+    before = run.correspondences.metadata
+    places = {key: before[key] for key in (SAME_PLACE,) if key in before}
     last = None
     for index in dict.fromkeys(rounds):
         if out_of_time():
@@ -192,6 +207,7 @@ def _from_displaced_start(
             round_index=index,
             progress=lambda what, done, total: progress("matching again", done, total),
         )
+        table = replace(table, metadata={**table.metadata, **places})
         solution = solve_joint(estimate, table, config, terms, hold=bool(run.solution.held))
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig

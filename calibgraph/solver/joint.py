@@ -16,7 +16,8 @@ from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
-from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.preprocess import Preprocessed, preprocess
+from calibgraph.solver.repeats import number_by_place
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined
@@ -75,7 +76,7 @@ def solve_joint(
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
-    counts = count_correspondences(kept.counts, objective, inliers, pairwise, frames.outlier_frames)
+    counts = count_correspondences(kept, objective, inliers, pairwise, frames.outlier_frames)
     seconds = watch.seconds
     found = Solution(
         rig, kept.table, objective, inliers, scales, optimum, counts, seconds, held=held
@@ -95,8 +96,10 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         The same optimum where no pair of cameras has enough in common.
     """
     alone, watch = solution.without_pairs(), Stopwatch()
+    frame = number_by_place(solution.correspondences.metadata, matches.frame)
+    by_place = replace(matches, frame=frame)
     with watch("camera_pairs"):
-        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, matches)
+        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_place)
     return replace(
         alone,
         inliers=inliers,
@@ -127,15 +130,18 @@ def count_common_features(
 
 
 def count_correspondences(
-    filters: Mapping[str, Mapping[str, int]],
+    kept: Preprocessed,
     objective: Objective,
     inliers: Objective,
     pairwise: Stage1,
     outlier_frames: Mapping[str, int],
 ) -> dict[str, dict[str, int]]:
-    """Per camera: correspondences left after each filter and the gate, and its frames."""
+    """Per camera: correspondences left after each filter and the gate, and its frames.
+
+    Frames that repeat another one are counted apart, and in none of the other numbers.
+    """
     counts = {}
-    for name, before in filters.items():
+    for name, before in kept.counts.items():
         given, used = (part.blocks.get(name) for part in (objective, inliers))
         outliers = outlier_frames.get(name, 0)
         counts[name] = {
@@ -143,6 +149,7 @@ def count_correspondences(
             "used": 0 if used is None else len(used.frame),
             "frames": (0 if given is None else given.frames) + outliers,
             "outlier_frames": outliers,
+            "repeated_frames": kept.repeated_frames[name],
             "frames_used": 0 if used is None else used.frames,
             "frames_without_pnp": pairwise[name].failed_frames if name in pairwise else 0,
         }

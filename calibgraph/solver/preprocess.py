@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.rig import Rig
 from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
+from calibgraph.solver.repeats import number_repeats
 
 Array = NDArray[np.float64]
 
@@ -31,10 +32,12 @@ class Preprocessed:
     Attributes:
         table: the kept correspondences.
         counts: per camera, how many are left after each of FILTERS.
+        repeated_frames: per camera, how many frames count as part of another one.
     """
 
     table: Correspondences
     counts: dict[str, dict[str, int]]
+    repeated_frames: dict[str, int]
 
 
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
@@ -70,6 +73,7 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     order = frame_order(camera, table.frame)
     if order is not None:
         table, camera = table.select(order), camera[order]
+    table, camera, repeated = _count_repeats_once(rig, table, camera, config)
     rows = _within_cap(table, camera, config)
     if rows is not None:
         table, camera = table.select(rows), camera[rows]
@@ -78,7 +82,41 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
         name: dict(zip(FILTERS, column, strict=True))
         for name, column in zip(rig.cameras, counts.T.tolist(), strict=True)
     }
-    return Preprocessed(table, named)
+    return Preprocessed(table, named, repeated)
+
+
+def _count_repeats_once(
+    rig: Rig, table: Correspondences, camera: NDArray[np.int64], config: Config
+) -> tuple[Correspondences, NDArray[np.int64], dict[str, int]]:
+    """Frames that repeat another one become part of it: the best match of each cell is kept.
+
+    Args:
+        rig: for the sizes of the images.
+        table: sorted by camera and frame.
+        camera: (n,) of its rows.
+        config: the grid.
+
+    Returns:
+        The table, so sorted, the cameras of its rows, and per camera how many frames are repeats.
+    """
+    frame, before = number_repeats(table, camera), _frames_by_camera(rig, table, camera)
+    if not np.array_equal(frame, table.frame):
+        table, order = replace(table, frame=frame), frame_order(camera, frame)
+        if order is not None:
+            table, camera = table.select(order), camera[order]
+        best = best_in_cell(rig, table, camera, config)
+        table, camera = table.select(best), camera[best]
+    after = _frames_by_camera(rig, table, camera)
+    return table, camera, {name: before[name] - after[name] for name in rig.cameras}
+
+
+def _frames_by_camera(
+    rig: Rig, table: Correspondences, camera: NDArray[np.int64]
+) -> dict[str, int]:
+    """Per camera, its number of frames; of a table sorted by camera and frame."""
+    first = frame_edges(camera, table.frame)[:-1]
+    frames = np.bincount(camera[first], minlength=len(rig.cameras))
+    return dict(zip(rig.cameras, frames.tolist(), strict=True))
 
 
 def _filter(

@@ -32,6 +32,7 @@ from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
+from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import try_to_start
 from calibgraph.tracking.state import State
@@ -111,11 +112,11 @@ class IncrementalCalibrator:
         """
         table = with_findings_per_frame(table)
         number, stamp = number_and_stamp(table, frame, self._state)
-        blocks = self._blocks_by_camera(table)
+        blocks = self._blocks_by_camera(new := without_repeats(self._state, table))
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
             self._begin_frame(number, stamp, table)
-            return self._take(table, blocks)
+            return self._take(new, blocks)
         except BaseException as error:  # of any kind: nothing of the frame must remain
             self._resume(start)
             for earlier, its_table in since:

@@ -39,6 +39,7 @@ from calibgraph.trust.solution_checks import (
     estimate_checks,
     outlier_frame_checks,
     prior_share_checks,
+    repeated_frame_checks,
 )
 
 SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
@@ -50,6 +51,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     matcher_checks,             # what the matcher reported: search, learned shares, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?
+    repeated_frame_checks,      # how many are of one place, or copies?
     assumed_spread_checks,      # does the configured loss scale suit the residuals?
     held_out_checks,            # does it explain frames that it was not fitted to?
     intrinsics_checks,          # would another lens explain the residuals?

@@ -127,9 +127,10 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
-    log_focal, radial, centre = found.lens
-    focal = math.expm1(log_focal)
+    log_focal, radial, centre, log_aspect = found.lens
+    focal, aspect = math.expm1(log_focal), math.expm1(log_aspect)
     longer = "longer" if focal > 0 else "shorter"
+    larger = "larger" if aspect > 0 else "smaller"
     return (
         _check_lens(
             threshold("focal_length"), focal, found.lens_sigmas[0],
@@ -144,6 +145,11 @@ def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
             threshold("principal_point"), centre, found.lens_sigmas[2],
             f"a principal point {centre:+.1%} of a focal length from the rig's: check cx, cy, and "
             "whether the images were cropped",
+        ),
+        _check_lens(
+            threshold("aspect_ratio"), aspect, found.lens_sigmas[3],
+            f"a ratio fx / fy {abs(aspect):.1%} {larger}: check fx and fy, and whether the images "
+            "were scaled",
         ),
     )  # fmt: skip
 

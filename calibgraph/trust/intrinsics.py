@@ -1,4 +1,4 @@
-"""Wrong intrinsics leave a pattern in the residuals: focal length, principal point, distortion.
+"""Wrong intrinsics leave a pattern in the residuals: of focal lengths, principal point, distortion.
 
 Each is a field of displacements over the image. It is estimated together with the extrinsic; the
 check is how far the camera moves when it is set free, and with which significance.
@@ -28,8 +28,12 @@ _LIMITS = {
     "focal length": (limit("focal_sigmas"), limit("focal_fail")),
     "principal point": (limit("centre_sigmas"), limit("centre_fail")),
     "distortion": (limit("distortion_sigmas"), limit("distortion_fail")),
+    "aspect ratio": (limit("focal_sigmas"), limit("shape_fail")),
+    "skew": (limit("focal_sigmas"), limit("shape_fail")),
 }
 """Per lens parameter: from how many sigmas on it counts, and the largest value that cannot fail."""
+
+_SHAPES = ("aspect ratio", "skew")
 
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
@@ -39,9 +43,10 @@ class FreedParameter:
     """The estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: "focal length", "principal point" or "distortion".
+        name: "focal length", "principal point", "distortion", "aspect ratio" or "skew".
         values: (k,) estimates: relative change of the focal length; shift of the principal point
-            [px]; relative radial displacement at one focal length from the centre.
+            [px]; relative radial displacement at one focal length from the centre; relative change
+            of fx / fy; change of the skew, in parts of fx.
         sigmas: (k,) their standard deviations, frames as clusters.
         moved_deg: how far the camera turns.
         moved_cm: how far the camera's centre moves.
@@ -57,6 +62,11 @@ class FreedParameter:
     def largest(self) -> float:
         """The largest of the values."""
         return float(np.abs(self.values).max())
+
+    @property
+    def is_misshapen(self) -> bool:
+        """Whether pixels would not be square, by more than lenses are."""
+        return self.name in _SHAPES and self.largest > limit("shape_warn")
 
     @property
     def significance(self) -> float:
@@ -94,7 +104,13 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
         table,
         lambda predicted: np.concatenate([*displacement_fields(camera, predicted).values()], 2),
     )
-    unknowns = {"focal length": (0,), "principal point": (1, 2), "distortion": (3,)}
+    unknowns = {
+        "focal length": (0,),
+        "principal point": (1, 2),
+        "distortion": (3,),
+        "aspect ratio": (4,),
+        "skew": (5,),
+    }
     checks = [
         _check_freed(_free(name, fit, camera))
         for name, numbers in unknowns.items()
@@ -116,6 +132,8 @@ def displacement_fields(camera: Camera, pixels_px: Array) -> dict[str, Array]:
         "focal length": off[:, :, None],
         "principal point": centre,
         "distortion": (off * radius**2)[:, :, None],
+        "aspect ratio": (off * [0.5, -0.5])[:, :, None],
+        "skew": np.stack([off[:, 1] * k.fx / k.fy, zeros], axis=1)[:, :, None],
     }
 
 
@@ -129,15 +147,16 @@ def _check_freed(freed: FreedParameter) -> Check:
     """How far a significant lens parameter moves the camera.
 
     A value as small as intrinsics are known by is at most a warning; so is a principal point, which
-    is hard to distinguish from a rotation.
+    is hard to distinguish from a rotation. An aspect ratio or skew as no lens has it is one also if
+    set free it moves the camera little: matches from rounds have followed it.
     """
     min_sigmas, fail_size = _LIMITS[freed.name]
     significant = freed.significance > min_sigmas
     degrees, centimetres = (freed.moved_deg, freed.moved_cm) if significant else (0.0, 0.0)
     rotation, translation = threshold("lens_rotation"), threshold("lens_translation")
     statuses = {rotation.grade(degrees), translation.grade(centimetres)}
-    warn = statuses != {"PASS"}
-    fail = "FAIL" in statuses and freed.largest > fail_size
+    warn = statuses != {"PASS"} or (significant and freed.is_misshapen)
+    fail = freed.largest > fail_size and ("FAIL" in statuses or (warn and freed.is_misshapen))
     text = (
         f"residuals over the image: {_describe(freed)} ({freed.significance:.2g} sigma) would move "
         f"the camera by {freed.moved_deg:.2g} deg, {freed.moved_cm:.2g} cm"
@@ -166,4 +185,9 @@ def _describe(freed: FreedParameter) -> str:
         return f"a focal length {abs(freed.values[0]):.2%} {longer}"
     if freed.name == "principal point":
         return f"a principal point off by ({freed.values[0]:.3g}, {freed.values[1]:.3g}) px"
+    if freed.name == "aspect ratio":
+        larger = "larger" if freed.values[0] > 0 else "smaller"
+        return f"a ratio fx / fy {abs(freed.values[0]):.2%} {larger}"
+    if freed.name == "skew":
+        return f"a skew of {freed.values[0]:.2g} fx"
     return f"radial distortion of {freed.values[0]:.2g} more"

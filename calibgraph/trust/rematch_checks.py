@@ -30,7 +30,7 @@ def last_round_checks(evidence: RunEvidence) -> Checks:
 
 
 def repeated_cloud_checks(evidence: RunEvidence) -> Checks:
-    """Whether two frames have the same cloud: they are not independent."""
+    """Whether two frames have the same cloud: a recording's fault, or copies."""
     checks = check_repeated_clouds(evidence.run.dataset, evidence.hashes)
     return {name: checks for name in evidence.solution.cameras}
 
@@ -47,8 +47,8 @@ def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[C
         digest = hashes[str(frame.cloud_path)]
         if digest in names:
             text = (
-                f"frames {names[digest]} and {frame.name} have the same cloud, and count as if "
-                "independent; remove one"
+                f"frames {names[digest]} and {frame.name} have the same cloud; remove one, or give "
+                "each image the cloud of its own time"
             )
             return [Check("repeated frames", "WARN", text)]
         names[digest] = frame.name

@@ -161,6 +161,17 @@ def outlier_frame_checks(evidence: Evidence) -> Checks:
     }
 
 
+def repeated_frame_checks(evidence: Evidence) -> Checks:
+    """How many frames count as part of another one, where there are any."""
+    checks = {}
+    for name, counts in evidence.solution.counts.items():
+        repeated = counts.get("repeated_frames", 0)
+        if repeated:
+            share = repeated / (repeated + counts["frames"])
+            checks[name] = [threshold("repeated_frames").check(share)]
+    return checks
+
+
 def assumed_spread_checks(evidence: Evidence) -> Checks:
     """The residuals' spread over the one that a configured loss scale stands for."""
     loss_scale_px = evidence.solution.config.loss_scale_px

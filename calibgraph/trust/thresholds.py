@@ -101,6 +101,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("outlier_frames", "share of outlier frames", "at most", 0.35, 0.9, "share",
               "How many frames lie apart from where frames are densest?", _COUNTED,
               "a minority of the frames decides; check what differs between them"),
+    Threshold("repeated_frames", "share of frames that repeat another one", "at most", 0.5,
+              math.inf, "share", "How many frames are of the same place, or of the same content?",
+              _CHOSEN, "the vehicle stood, or frames are copies: they count as one frame each; "
+              "take frames while it drives"),
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?", _COUNTED,
               "the matches are worse than loss_scale_px (delta) assumes"),
@@ -170,6 +174,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Does another principal point fit the images better, by how many focal lengths?",
               f"{_RECORDED}: right up to 0.013; wrong by 20 px: 0.026 and 0.04. It is the angle "
               "in radians that it turns a result by."),
+    Threshold("aspect_ratio", "ratio of fx and fy", "at most", 0.015, 0.06, "",
+              "Does another ratio fx / fy fit the images better, by which relative change?",
+              "KITTI 00, 05, 06, raw 0005: right up to 0.4 %, fy wrong by 3 to 4 % 1.8 to 4.2 %; "
+              "but on 08, a straight street, up to 5.6 % though right."),
     Threshold("score_gain", "score gain of the best extrinsic nearby", "at most", 1.0, 3.0, "sigma",
               "Does an extrinsic nearby fit the images better, by how many standard deviations of "
               "chance agreement?", f"{_RECORDED}: right up to 0.65; one 0.35 deg off 1.0; local "
@@ -218,6 +226,9 @@ LIMITS: tuple[Limit, ...] = (
     Limit("distortion_sigmas", 5.0, "sigma", "A distortion set free counts beyond this."),
     Limit("focal_fail", 0.01, "", "A smaller relative change of the focal length is at most WARN: "
           "intrinsics are not known better."),
+    Limit("shape_warn", 0.01, "", "A larger change of fx / fy, or skew, is a warning though it "
+          "moves the camera little. Right intrinsics on KITTI: up to 0.95 %."),
+    Limit("shape_fail", 0.03, "", "A smaller change of fx / fy, or skew, is at most WARN."),
     Limit("centre_fail", math.inf, "px", "A principal point set free is at most WARN: it is hard "
           "to distinguish from a rotation."),
     Limit("distortion_fail", 0.02, "", "A smaller radial displacement at one focal length from "

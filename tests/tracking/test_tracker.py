@@ -335,3 +335,25 @@ def test_a_change_at_any_live_epoch_can_be_followed(pair: Rig, live_epochs: int)
     state = tracker._state
     for epoch in state.epochs[:-1]:  # the last one is open, and empty here
         handle_small_step(state, DetectedStep(epoch.frames[0].number, frozenset([0])))
+
+
+def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig) -> None:
+    """The same matches under new frame numbers: before, the error bar shrank to nothing."""
+    tables = drive(lambda _: pair, 12)
+    tracker, updates = tracked(pair, tables)
+    before = updates[-1].covariance["left"]
+    assert before is not None
+    for number in range(12, 80):
+        again = replace(tables[-1], frame=np.full(len(tables[-1]), number, dtype=np.int64))
+        update = tracker.update(again)
+    after = update.covariance["left"]
+    assert after is not None
+    assert (np.diag(after) > 0.9 * np.diag(before)).all()  # 68 new frames would leave a sixth
+    events = [event.kind for event in tracker.update(moved_on(tables[-1], 80)).events]
+    assert "back" in events
+
+
+def moved_on(table: Correspondences, number: int) -> Correspondences:
+    """The same matches a hundredth of a pixel further: another frame."""
+    frame = np.full(len(table), number, dtype=np.int64)
+    return replace(table, frame=frame, pixels_px=table.pixels_px + 0.01)

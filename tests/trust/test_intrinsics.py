@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from calibgraph import Camera, Correspondences, Rig, solve
@@ -15,7 +17,7 @@ def with_lens(rig: Rig, distortion: tuple[float, ...] = (), **changes: float) ->
         k = camera.intrinsics_px
         lens = {
             "fx": k.fx * changes.get("focal", 1.0),
-            "fy": k.fy * changes.get("focal", 1.0),
+            "fy": k.fy * changes.get("focal", 1.0) * changes.get("fy", 1.0),
             "cx": k.cx + changes.get("cx", 0.0),
             "cy": k.cy,
         }
@@ -28,7 +30,7 @@ def test_right_intrinsics_pass(mixed_rig: Rig) -> None:
     result = solve(mixed_rig, simulated(mixed_rig))
     for name in mixed_rig.cameras:
         checks = named(result, name, "residuals over the image")
-        assert [check.status for check in checks] == ["PASS"] * 3
+        assert [check.status for check in checks] == ["PASS"] * 5
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.03])
@@ -41,6 +43,24 @@ def test_a_wrong_focal_length_fails_and_is_measured(pair: Rig, factor: float) ->
     percent = float(check.text.split("a focal length ")[1].split("%")[0])
     # A tenth of it goes into the pose where the gate cuts: the loss is robust.
     assert percent == pytest.approx(100 * abs(1 / factor - 1), rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [0.96, 1.04])
+def test_a_wrong_fy_alone_is_no_pass_and_is_named(pair: Rig, factor: float) -> None:
+    result = solve(with_lens(pair, fy=factor), simulated(pair))
+    (check,) = named(result, "left", "a ratio fx / fy")
+    assert check.status != "PASS"
+    assert ("larger" if factor > 1 else "smaller") in check.text
+
+
+def test_a_skew_is_no_pass_and_is_measured(pair: Rig) -> None:
+    table = simulated(pair)
+    cy = pair.cameras["left"].intrinsics_px.cy
+    sheared = table.pixels_px + np.outer(table.pixels_px[:, 1] - cy, [0.03, 0.0])
+    result = solve(pair, replace(table, pixels_px=sheared))
+    (check,) = named(result, "left", "a skew of")
+    assert check.status != "PASS"
+    assert float(check.text.split("a skew of ")[1].split()[0]) == pytest.approx(0.03, rel=0.25)
 
 
 def test_images_undistorted_twice_fail(pair: Rig) -> None:

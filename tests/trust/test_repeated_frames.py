@@ -2,10 +2,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 import calibgraph
+from calibgraph import CorrespondenceError, Correspondences, Rig, concatenate, solve
 from calibgraph.files import sha256
 from calibgraph.trust.rematch_checks import check_repeated_clouds
 from tests.conftest import SAMPLE
+from tests.trust.conftest import simulated
 
 
 def test_frames_with_the_same_cloud_are_reported() -> None:
@@ -16,3 +21,45 @@ def test_frames_with_the_same_cloud_are_reported() -> None:
     (check,) = check_repeated_clouds(data, hashes)
     assert check.status == "WARN" and "000000 and copy have the same cloud" in check.text
     assert check_repeated_clouds(replace(data, frames=data.frames[:2]), hashes) == []
+
+
+def copies(table: Correspondences, number: int) -> Correspondences:
+    """A table of one frame, and copies of it under other numbers."""
+    frames = [np.full(len(table), k, dtype=np.int64) for k in range(number)]
+    return concatenate([replace(table, frame=frame) for frame in frames])
+
+
+def test_copies_of_a_frame_count_as_one_frame(pair: Rig) -> None:
+    one = simulated(pair, frames=1)
+    result, alone = solve(pair, copies(one, 12)), solve(pair, one)
+    assert result.covariance == {"left": None, "right": None}
+    assert result.verdict.status != "PASS"
+    assert result.counts["left"]["frames"] == 1
+    assert result.counts["left"]["repeated_frames"] == 11
+    for name, T in alone.T_camera_lidar.items():
+        np.testing.assert_allclose(result.T_camera_lidar[name], T, atol=1e-9)
+    reasons = " ".join(check.text for check in result.camera_verdicts["left"].checks)
+    assert "they count as one frame each" in reasons
+
+
+def test_copies_do_not_narrow_the_error_bar(pair: Rig) -> None:
+    table = simulated(pair, frames=8)
+    last = table.select(table.frame == 7)
+    more = copies(last, 20).select(slice(len(last), None))
+    more = replace(more, frame=more.frame + 7)
+    with_copies, plain = (solve(pair, t) for t in (concatenate([table, more]), table))
+    for name in pair.cameras:
+        np.testing.assert_allclose(
+            with_copies.covariance[name], plain.covariance[name], rtol=1e-6, atol=1e-15
+        )
+
+
+def test_frames_of_one_place_count_as_one_frame(pair: Rig) -> None:
+    """Named in the metadata, as by ``calibrate`` where the vehicle stands."""
+    table = simulated(pair, frames=10)
+    standing = replace(table, metadata={**table.metadata, "same_place": [[2, 3, 4], [7, 9]]})
+    result = solve(pair, standing)
+    assert result.counts["left"]["frames"] == 7 and result.counts["left"]["repeated_frames"] == 3
+    wrong = replace(table, metadata={**table.metadata, "same_place": [[2, "3"]]})
+    with pytest.raises(CorrespondenceError, match="same_place"):
+        solve(pair, wrong)
