@@ -57,7 +57,7 @@ def ros_pose_covariance(covariance: Array, T_camera_lidar: Array) -> Array:
     Returns:
         Of the position [m], then of the rotation [rad] about fixed axes, both in LiDAR axes.
     """
-    # T_lidar_camera exp(-xi): the position moves by -R v, the axes turn by -R w, R = R_lidar_camera.
+    # T_lidar_camera exp(-xi): the position moves by -R v, the axes turn by -R w.
     jacobian = np.zeros((6, 6))
     jacobian[:3, 3:] = jacobian[3:, :3] = -T_camera_lidar[:3, :3].T
     turned: Array = jacobian @ covariance @ jacobian.T
