@@ -33,4 +33,4 @@ def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:
     while "--" in lines:
         lines = lines.replace("--", "- -")
     body = ElementTree.tostring(root, encoding="unicode")
-    return f'<?xml version="1.0" encoding="utf-8"?>\n<!--\n{lines}\n-->\n{body}\n'
+    return f'<?xml version="1.0"?>\n<!--\n{lines}\n-->\n{body}\n'

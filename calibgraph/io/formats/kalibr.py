@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -123,13 +124,18 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
             for key, camera in chain.cameras.items()
             if camera.T_cam_lidar is not None
         },
-        relative_poses=tuple(
-            RelativeCamera(names[key], names[before], chain.cameras[key].T_cn_cnm1)
-            for before, key in zip(keys, keys[1:], strict=False)
-            if chain.cameras[key].T_cn_cnm1 is not None
-            and chain.cameras[key].calibgraph.T_cn_cnm1 != _DERIVED
-        ),
+        relative_poses=tuple(_relative_poses(keys, chain, names)),
     )
+
+
+def _relative_poses(
+    keys: list[str], chain: _Camchain, names: dict[str, str]
+) -> Iterator[RelativeCamera]:
+    """Each camera to the one before it, unless that was computed from their extrinsics."""
+    for before, key in zip(keys, keys[1:], strict=False):
+        camera = chain.cameras[key]
+        if camera.T_cn_cnm1 is not None and camera.calibgraph.T_cn_cnm1 != _DERIVED:
+            yield RelativeCamera(names[key], names[before], camera.T_cn_cnm1)
 
 
 def _number(key: str) -> int:

@@ -34,7 +34,8 @@ def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
 
 def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
     """(4, 4) of a translation and roll, pitch, yaw about fixed axes."""
-    return _pose(xyz_m, gtsam.Rot3.RzRyRx(*rpy_rad).matrix())
+    roll, pitch, yaw = rpy_rad
+    return _pose(xyz_m, gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix())
 
 
 def _pose(xyz_m: Sequence[float], R: Array) -> Array:
