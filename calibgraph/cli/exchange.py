@@ -156,7 +156,8 @@ def import_(
     rig.save(out)
     for sentence in describe_rig(rig):
         print_plain(terminal(), sentence)
-    print_plain(terminal(), f"{out}: {len(rig.cameras)} cameras; check the sentences above")
+    cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
+    print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
 
 
 def _parse_name(text: str) -> tuple[str, Path]:

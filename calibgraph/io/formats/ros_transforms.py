@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 from pydantic import BaseModel
 
+from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
@@ -141,7 +142,10 @@ def read_tf2(content: dict[str, Any], path: Path) -> Part:
         FileError: if it is malformed.
     """
     message = checked_model(_Message, content, path)
-    return Part(path, links=tuple(_link(stamped) for stamped in message.transforms))
+    try:
+        return Part(path, links=tuple(_link(stamped) for stamped in message.transforms))
+    except ValueError as error:
+        raise FileError(path, str(error)) from error
 
 
 def _link(stamped: _Stamped) -> FrameLink:

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.rig import ROUNDING
+
 Array = NDArray[np.float64]
 
 
@@ -24,11 +26,14 @@ def roll_pitch_yaw(T: Array) -> list[float]:
 
 
 def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
-    """(4, 4) of a translation and a quaternion, which is normalised.
+    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits.
 
     Raises:
-        ValueError: if the quaternion is zero.
+        ValueError: if the quaternion has another length.
     """
+    length = float(np.linalg.norm(xyzw))
+    if not abs(length - 1.0) <= ROUNDING:
+        raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
     return _pose(xyz_m, Rotation.from_quat(xyzw).as_matrix())
 
 

@@ -84,6 +84,6 @@ def _pair(pair: RelativePose) -> str:
     turned = angle_deg(pair.T_a_b[:3, :3])
     sigma_deg = math.degrees(pair.rotation_sigma_rad)
     return (
-        f"{pair.b} {place}, in its camera's axes, turned by {turned:.1f} deg against it "
-        f"(known to {sigma_deg:.2g} deg and {100 * pair.translation_sigma_m:.2g} cm)"
+        f"{pair.b} {place}, in the axes of {pair.a}, turned by {turned:.1f} deg against it "
+        f"(1 sigma: {sigma_deg:.2g} deg, {100 * pair.translation_sigma_m:.2g} cm)"
     )

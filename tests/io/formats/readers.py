@@ -172,7 +172,7 @@ def koide(path: Path) -> Poses:
 def opencv(path: Path) -> Poses:
     """By OpenCV."""
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    cameras = [file.getNode(key) for key in file.root().keys()]
+    cameras = [file.getNode(key) for key in file.root().keys()]  # noqa: SIM118 - no dict
     return {c.getNode("name").string(): c.getNode("T_camera_lidar").mat() for c in cameras}
 
 
@@ -210,6 +210,5 @@ def worked_points(text: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     triple = r"\(([-\d.]+), ([-\d.]+), ([-\d.]+)\) m"
     found = re.findall(rf"([\w./-]+): p_lidar = {triple} -> p_camera = {triple}", text)
     return {
-        row[0]: (np.array(row[1:4], dtype=float), np.array(row[4:7], dtype=float))
-        for row in found
+        row[0]: (np.array(row[1:4], dtype=float), np.array(row[4:7], dtype=float)) for row in found
     }

@@ -114,7 +114,9 @@ def test_strange_names_stay_one_word_and_well_formed(tmp_path: Path) -> None:
     assert (joint.parent, joint.child) == ("top_lidar", frame)
     (node,) = ElementTree.parse(tmp_path / "ros2-launch").getroot()
     assert (node.get("args") or "").split()[-3:] == ["top_lidar", "--child-frame-id", frame]
-    assert yaml.safe_load((tmp_path / "tf2").read_text())["transforms"][0]["child_frame_id"] == frame
+    assert (
+        yaml.safe_load((tmp_path / "tf2").read_text())["transforms"][0]["child_frame_id"] == frame
+    )
     assert len(yaml.safe_load((tmp_path / "autoware").read_text())["sensor_kit_base_link"]) == 2
     assert list(READERS["opencv"](tmp_path / "opencv")) == list(rig.cameras)
     assert list(READERS["json"](tmp_path / "json")) == list(rig.cameras)
