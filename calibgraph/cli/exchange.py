@@ -110,6 +110,13 @@ def import_(
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OLD=NEW",
+            help="Another name of a camera, as its folder in the dataset; may be repeated.",
+        ),
+    ] = None,
     lidar_frame: Annotated[
         str | None,
         typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
@@ -147,8 +154,9 @@ def import_(
         rig = import_rig(
             [path for _, path in named],
             names={path: name for name, path in named if name},
+            rename=_parse_names("--rename", rename),
             lidar_frame=lidar_frame,
-            camera_frames=dict(_parse_frame(text) for text in camera_frame or ()),
+            camera_frames=_parse_names("--camera-frame", camera_frame),
             size_px=None if size is None else _parse_size(size),
             relative_sigma_deg=relative_sigma_deg,
             relative_sigma_cm=relative_sigma_cm,
@@ -166,14 +174,25 @@ def _parse_name(text: str) -> tuple[str, Path]:
     return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
 
 
-def _parse_frame(text: str) -> tuple[str, str]:
-    name, equals, frame = text.partition("=")
-    if not equals:
-        raise ValueError(f"--camera-frame {text!r}: give NAME=FRAME")
-    return name, frame
+def _parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
+    """The pairs of a repeated option A=B.
+
+    Raises:
+        ValueError: if there is no ``=``.
+    """
+    for text in texts or ():
+        if "=" not in text:
+            raise ValueError(f"{option} {text!r}: give two names with = between them")
+    pairs = (text.partition("=") for text in texts or ())
+    return {name: value for name, _, value in pairs}
 
 
 def _parse_size(text: str) -> tuple[int, int]:
+    """Width and height.
+
+    Raises:
+        ValueError: if they are not.
+    """
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise ValueError(f"--size {text!r}: give WIDTHxHEIGHT, as 1920x1200")

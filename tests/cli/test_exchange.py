@@ -107,13 +107,27 @@ def test_options_of_import_reach_the_rig(call: Call, tmp_path: Path) -> None:
     assert load_rig(tmp_path / "koide.yaml").cameras["front"].width_px == 1646
 
 
+def test_cameras_of_a_camchain_are_renamed_everywhere(call: Call, tmp_path: Path) -> None:
+    (chain,) = write(tmp_path, chain__yaml=KALIBR)
+    code, _, err = call(
+        "import", chain, "--rename", "cam0=left", "--rename", "cam1=right", "--out",
+        tmp_path / "rig.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert list(rig.cameras) == ["left", "right"]
+    assert [(pair.a, pair.b) for pair in rig.relative_poses] == [("right", "left")]
+
+
 def test_wrong_imports_are_one_line(call: Call, tmp_path: Path) -> None:
     info, chain = write(tmp_path, info__yaml=CAMERA_INFO, chain__yaml=KALIBR)
     out = tmp_path / "rig.yaml"
     cases: dict[str, tuple[object, ...]] = {
         "no file has its T_camera_lidar": (info, "--out", out),
         "--size '9': give WIDTHxHEIGHT": (chain, "--size", "9", "--out", out),
-        "--camera-frame 'a': give NAME=FRAME": (chain, "--camera-frame", "a", "--out", out),
+        "--camera-frame 'a': give two names": (chain, "--camera-frame", "a", "--out", out),
+        "no camera 'front' to rename": (chain, "--rename", "front=a", "--out", out),
+        "two cameras one name": (chain, "--rename", "cam0=cam1", "--out", out),
         "is read by this command": (chain, "--out", chain),
         "no such file": (tmp_path / "nothing.yaml", "--out", out),
         "must end in .yaml": (chain, "--out", tmp_path / "rig.txt"),

@@ -64,7 +64,7 @@ def export_calibration(
     T_base_lidar: Array | None = None,
     even_if_failed: bool = False,
 ) -> tuple[Path, ...]:
-    """Write a calibration for another program; every file states its direction with a point.
+    """Write a calibration for another program, with its direction and a worked point.
 
     Args:
         source: a result or a rig, or the path of one.
@@ -72,9 +72,9 @@ def export_calibration(
         format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
         cameras: names of those to write; all if None.
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
-        camera_frame: frame id of a camera's optical frame, with ``{camera}`` for its name.
-        T_base_lidar: (4, 4) where the LiDAR is mounted: in ``sensor_kit_base_link`` (autoware) or
-            in ego (nuscenes), of which the LiDAR is the origin if None.
+        camera_frame: id of optical frames, with ``{camera}`` for the camera's name.
+        T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware) or ego
+            (nuscenes); the identity if None.
         even_if_failed: whether to write cameras whose verdict is FAIL.
 
     Returns:
@@ -85,11 +85,7 @@ def export_calibration(
             the file cannot be written.
         ValueError: if an argument is wrong.
     """
-    path = Path(path)
-    if format not in WRITERS:
-        raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
-    if T_base_lidar is not None and format not in _WITH_BASE:
-        raise ValueError(f"the LiDAR's pose is for the formats {' and '.join(_WITH_BASE)} only")
+    _require_known(format, with_base=T_base_lidar is not None)
     prepared = prepare_export(
         _loaded(source) if isinstance(source, (str, Path)) else source,
         cameras=cameras,
@@ -102,7 +98,19 @@ def export_calibration(
             f"the verdict of {', '.join(prepared.cameras)} is FAIL, nothing was written; see the "
             "result's report, or export it all the same with --even-if-failed"
         )
-    return _write(prepared, path, format)
+    return _write(prepared, Path(path), format)
+
+
+def _require_known(format: str, *, with_base: bool) -> None:
+    """Check the format, and that it has a base frame if one is given.
+
+    Raises:
+        ValueError: if not.
+    """
+    if format not in WRITERS:
+        raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
+    if with_base and format not in _WITH_BASE:
+        raise ValueError(f"the LiDAR's pose is for the formats {' and '.join(_WITH_BASE)} only")
 
 
 def _loaded(path: Path | str) -> Calibration | Rig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,3 +51,15 @@ class Part:
     T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
     relative_poses: tuple[RelativeCamera, ...] = ()
     links: tuple[FrameLink, ...] = ()
+
+    def rename(self, names: Mapping[str, str]) -> Part:
+        """The same with other names of some cameras; frames keep theirs."""
+        return replace(
+            self,
+            lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
+            T_camera_lidar={names.get(name, name): T for name, T in self.T_camera_lidar.items()},
+            relative_poses=tuple(
+                replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
+                for pair in self.relative_poses
+            ),
+        )

@@ -31,6 +31,7 @@ def import_rig(
     files: Iterable[Path | str],
     *,
     names: Mapping[Path | str, str] | None = None,
+    rename: Mapping[str, str] | None = None,
     lidar_frame: str | None = None,
     camera_frames: Mapping[str, str] | None = None,
     size_px: tuple[int, int] | None = None,
@@ -40,9 +41,9 @@ def import_rig(
     """Build a rig from files of other programs, which together hold lenses and extrinsics.
 
     Args:
-        files: Kalibr camchain, ROS camera_info, OpenCV YAML, URDF, COLMAP cameras.txt, koide3's
-            calib.json, Autoware's sensor kit, tf2's TFMessage, KITTI's calib.txt, rig files.
+        files: of the kinds in ``calibgraph.io.formats.names.IMPORT_FORMATS``.
         names: camera names for files of a single camera, by file.
+        rename: new names of cameras, by those in the files.
         lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
         camera_frames: per camera, its frame, where the names differ.
         size_px: width and height of images whose file has none.
@@ -52,32 +53,48 @@ def import_rig(
     Raises:
         CalibrationError: if a file is malformed, a lens is none of ours, or something is missing.
     """
-    chosen = {Path(file): name for file, name in (names or {}).items()}
-    parts = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
-    if not lenses:
-        raise CalibrationError(
-            f"{', '.join(str(part.path) for part in parts)}: no lens; add the file with the "
-            "intrinsics (camera_info, camchain, ...)"
-        )
     tree = FrameTree(link for part in parts for link in part.links)
     missing = [name for name in lenses if name not in T_camera_lidar]
     T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    content = {
-        "lidar": lidar_frame or "lidar",
-        "cameras": {
-            name: _camera(name, lens, T_camera_lidar.get(name), size_px, tree)
-            for name, lens in lenses.items()
-        },
-        "relative_poses": [
-            _relative_pose(pair, math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
-            for pair in pairs
-        ],
+    sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
+    cameras = {
+        name: _camera(name, lens, T_camera_lidar.get(name), size_px, tree)
+        for name, lens in lenses.items()
     }
+    relative = [_relative_pose(pair, *sigmas) for pair in pairs]
+    content = {"lidar": lidar_frame or "lidar", "cameras": cameras, "relative_poses": relative}
     return checked_model(Rig, content, parts[0].path)
+
+
+def _read_all(
+    files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
+) -> list[Part]:
+    """The parts, of which one has a lens at least.
+
+    Raises:
+        CalibrationError: if a file is malformed, or none has a lens.
+    """
+    chosen = {Path(file): name for file, name in names.items()}
+    read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    known = {name for part in read for name in (*part.lenses, *part.T_camera_lidar)}
+    if not any(part.lenses for part in read):
+        raise CalibrationError(
+            f"{', '.join(str(part.path) for part in read)}: no lens; add the file with the "
+            "intrinsics (camera_info, camchain, ...)"
+        )
+    for name in rename.keys() - known:
+        raise CalibrationError(
+            f"no camera {name!r} to rename; the files have {', '.join(sorted(known))}"
+        )
+    after = {rename.get(name, name) for name in known}
+    if len(after) < len(known):
+        raise CalibrationError("--rename gives two cameras one name; give each its own")
+    return [part.rename(rename) for part in read]
 
 
 def _merged(
