@@ -56,4 +56,5 @@ def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> P
     coefficients = fitted_coefficients(info.distortion_coefficients.data, model, path)
     size = (info.image_width, info.image_height)
     lens = CameraLens(model, size, (fx, fy, cx, cy), coefficients)
-    return Part(path, lenses={name or info.camera_name or path.stem: lens})
+    given = info.camera_name.strip("/").replace("/", "_")  # narrow_stereo/left: no folder's name
+    return Part(path, lenses={name or given or path.stem: lens})

@@ -81,8 +81,7 @@ def export_calibration(
         The files: one, and for ``kitti``, which has no comments, a text file beside it.
 
     Raises:
-        CalibrationError: if the verdict is FAIL, the format cannot hold a lens or an extrinsic, or
-            the file cannot be written.
+        CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
         ValueError: if an argument is wrong.
     """
     _require_known(format, with_base=T_base_lidar is not None)
@@ -93,12 +92,22 @@ def export_calibration(
         camera_frame=camera_frame,
         T_base_lidar=None if T_base_lidar is None else rigid_transform(T_base_lidar),
     )
-    if prepared.verdict == "FAIL" and not even_if_failed:
+    if not even_if_failed:
+        _require_not_failed(prepared)
+    return _write(prepared, Path(path), format)
+
+
+def _require_not_failed(export: RigExport) -> None:
+    """Check the verdict.
+
+    Raises:
+        CalibrationError: if it is FAIL.
+    """
+    if export.verdict == "FAIL":
         raise CalibrationError(
-            f"the verdict of {', '.join(prepared.cameras)} is FAIL, nothing was written; see the "
+            f"the verdict of {', '.join(export.cameras)} is FAIL, nothing was written; see the "
             "result's report, or export it all the same with --even-if-failed"
         )
-    return _write(prepared, Path(path), format)
 
 
 def _require_known(format: str, *, with_base: bool) -> None:

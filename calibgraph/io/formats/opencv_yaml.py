@@ -99,6 +99,8 @@ def read_opencv(path: Path, name: str) -> Part:
         raise FileError(path, f"holds no camera matrix; expected one of the keys {keys}")
     found = {key: checked_model(_Camera, _renamed(value), path) for key, value in cameras.items()}
     named = {camera.name or key: camera for key, camera in found.items()}
+    if len(named) < len(found):
+        raise FileError(path, "gives two cameras one name; give each its own")
     return Part(
         path,
         lenses={key: _lens(camera, path) for key, camera in named.items()},

@@ -13,6 +13,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import invert, point_in_lidar, ros_pose_covariance
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.verdict import rig_verdict
 
 Array = NDArray[np.float64]
 
@@ -132,15 +133,15 @@ def prepare_export(
             raise ValueError(f"camera {name!r}: the rig has {', '.join(rig.cameras)}")
     frames = {name: frame_id(camera_frame.replace("{camera}", name)) for name in names}
     lidar = frame_id(rig.lidar if lidar_frame is None else lidar_frame)
-    if len({lidar, *frames.values()}) <= len(frames):
+    if len({lidar, *frames.values()} - {""}) <= len(frames):
         raise ValueError(
-            f"frames {', '.join([lidar, *frames.values()])}: two are the same; --camera-frame "
-            "holds {camera}"
+            f"frames {[lidar, *frames.values()]}: two are the same, or one is empty; "
+            "--camera-frame holds {camera}"
         )
     return RigExport(
         rig=rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in names}}),
         covariance=_covariances(result, names),
-        verdict="" if result is None else result.verdict.status,
+        verdict="" if result is None else _verdict(result, names),
         lidar_frame=lidar,
         optical_frames=frames,
         T_base_lidar=T_base_lidar,
@@ -150,6 +151,11 @@ def prepare_export(
 def frame_id(name: str) -> str:
     """A name as ROS frame id: other characters than letters, digits, _ / . - become _."""
     return re.sub(r"[^\w/.-]", "_", name)
+
+
+def _verdict(result: Calibration, names: Iterable[str]) -> str:
+    """The worst of the cameras that are written."""
+    return rig_verdict({name: result.camera_verdicts[name] for name in names}).status
 
 
 def _covariances(result: Calibration | None, names: Iterable[str]) -> dict[str, Array]:

@@ -47,7 +47,7 @@ def import_rig(
         lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
         camera_frames: per camera, its frame, where the names differ.
         size_px: width and height of images whose file has none.
-        relative_sigma_deg: standard deviation per axis of relative poses whose file has none.
+        relative_sigma_deg: 1 sigma per axis of relative poses whose file has none.
         relative_sigma_cm: likewise of their translation.
 
     Raises:
@@ -57,17 +57,16 @@ def import_rig(
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     tree = FrameTree(link for part in parts for link in part.links)
-    missing = [name for name in lenses if name not in T_camera_lidar]
+    missing = lenses.keys() - T_camera_lidar.keys()
     T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
     sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
     cameras = {
-        name: _camera(name, lens, T_camera_lidar.get(name), size_px, tree)
-        for name, lens in lenses.items()
+        n: _camera(n, lens, T_camera_lidar.get(n), size_px, tree) for n, lens in lenses.items()
     }
-    relative = [_relative_pose(pair, *sigmas) for pair in pairs]
-    content = {"lidar": lidar_frame or "lidar", "cameras": cameras, "relative_poses": relative}
+    content: dict[str, Any] = {"lidar": lidar_frame or "lidar", "cameras": cameras}
+    content["relative_poses"] = [_relative_pose(pair, *sigmas) for pair in pairs]
     return checked_model(Rig, content, parts[0].path)
 
 

@@ -133,6 +133,19 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         import_rig(files, lidar_frame="radar")
 
 
+def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
+    body = OPENCV.partition("---\n")[2]
+    camera = "name: front\n" + body
+    nested = "".join(
+        f"{key}:\n" + "".join(f"   {line}\n" for line in camera.splitlines()) for key in "ab"
+    )
+    (path,) = write(tmp_path, rig__yml="%YAML:1.0\n---\n" + nested)
+    assert "gives two cameras one name" in message_of(path)
+    renamed = KALIBR.replace("cam1:", "cam1:\n  calibgraph: {camera: cam0}")
+    (path,) = write(tmp_path, chain__yaml=renamed)
+    assert "two cameras have one name" in message_of(path)
+
+
 def test_unknown_and_unexpanded_files_are_named(tmp_path: Path) -> None:
     macro = URDF.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
         "<link name=\"base_link\"/>", '<xacro:property name="x" value="1"/>'

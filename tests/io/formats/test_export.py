@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -99,6 +100,8 @@ def test_names_of_frames_can_be_chosen(tmp_path: Path) -> None:
     assert {t["header"]["frame_id"] for t in transforms} == {"velodyne"}
     with pytest.raises(ValueError, match="two are the same"):
         export_calibration(make_pair(), path, "tf2", camera_frame="camera")
+    with pytest.raises(ValueError, match="one is empty"):
+        export_calibration(make_pair(), path, "tf2", lidar_frame="")
 
 
 def test_strange_names_stay_one_word_and_well_formed(tmp_path: Path) -> None:
@@ -185,6 +188,21 @@ def test_a_failed_result_is_exported_on_request_only(failed: Calibration, tmp_pa
     export_calibration(failed, path, "kalibr", even_if_failed=True)
     assert "verdict FAIL" in path.read_text()
     assert "covariance" not in yaml.safe_load(path.read_text())["cam0"]["calibgraph"]
+
+
+def test_the_verdict_is_that_of_the_cameras_that_are_written(
+    solved: Calibration, failed: Calibration, tmp_path: Path
+) -> None:
+    verdicts = {**solved.camera_verdicts, "right": failed.camera_verdicts["right"]}
+    mixed = replace(solved, camera_verdicts=verdicts)
+    with pytest.raises(CalibrationError, match="verdict of left, right is FAIL"):
+        export_calibration(mixed, tmp_path / "a.json", "json")
+    export_calibration(mixed, tmp_path / "a.json", "json", cameras=["left"])
+    assert json.loads((tmp_path / "a.json").read_text())["verdict"] != "FAIL"
+    export_calibration(mixed, tmp_path / "a.json", "json", even_if_failed=True)
+    cameras = json.loads((tmp_path / "a.json").read_text())["cameras"]
+    assert cameras["left"]["covariance"] is not None
+    assert cameras["right"]["covariance"] is None
 
 
 def test_a_result_is_exported_from_its_folder(solved: Calibration, tmp_path: Path) -> None:

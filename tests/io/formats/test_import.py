@@ -127,6 +127,15 @@ def test_a_camera_link_and_its_optical_frame_are_the_same_camera(tmp_path: Path)
         np.testing.assert_allclose(rig.T_camera_lidar["front"], FRONT, atol=1e-12)
 
 
+def test_names_of_cameras_can_be_folders(tmp_path: Path) -> None:
+    """ROS names cameras by namespaces, and files are often copies with the same name inside."""
+    info = CAMERA_INFO.replace("camera_name: front", "camera_name: stereo/left")
+    one, two, kit = write(tmp_path, one__yaml=info, two__yaml=info, kit__yaml=SENSOR_KIT)
+    frames = {"stereo_left": "front/camera_link", "right": "front/camera_link"}
+    rig = import_rig([one, two, kit], names={two: "right"}, camera_frames=frames)
+    assert list(rig.cameras) == ["stereo_left", "right"]
+
+
 def test_a_camchain_gives_lenses_a_guess_and_relative_poses(tmp_path: Path) -> None:
     rig = import_rig(write(tmp_path, camchain__yaml=KALIBR), relative_sigma_deg=0.2)
     left, right = rig.cameras.values()
