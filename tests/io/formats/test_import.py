@@ -16,9 +16,11 @@ from calibgraph import (
     describe_rig,
     export_calibration,
     import_rig,
+    load_rig,
 )
-from tests.conftest import KANNALA, RADTAN5, RADTAN8, make_camera
+from tests.conftest import KANNALA, RADTAN5, RADTAN8, make_camera, stereo_relative_pose
 from tests.io.formats.conftest import rig_for, varied_rig
+from tests.io.test_kitti import written_kitti
 
 # A camera that looks along the LiDAR's x axis, 0.4 m ahead, 0.1 m left, 0.2 m below:
 # x = -left, y = -up, z = ahead of the point, less the same of the camera.
@@ -260,12 +262,36 @@ def test_distorted_lenses_survive_the_way_there_and_back(mixed_rig: Rig, tmp_pat
         )
 
 
-def test_rig_files_and_results_keep_their_relative_poses(
+def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
+    chain = KALIBR.replace("T_cam_lidar", "T_cam_imu")
+    files = write(tmp_path, chain__yaml=chain, car__urdf=URDF)
+    rig = import_rig(files, camera_frames={"cam0": "front_link"})
+    expected = import_rig(write(tmp_path, whole__yaml=KALIBR))
+    for name, T in expected.T_camera_lidar.items():
+        np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-12)
+
+
+def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
+    folder = written_kitti(tmp_path / "00", frames=1)
+    for path in (folder, folder / "calib.txt"):
+        rig = import_rig([path])
+        expected = load_rig(folder)
+        assert list(rig.cameras) == ["image_2", "image_3"]
+        for name, T in expected.T_camera_lidar.items():
+            np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-15)
+
+
+def test_results_and_rig_files_are_imported_with_their_relative_poses(
     solved: Calibration, tmp_path: Path
 ) -> None:
     solved.save(tmp_path / "result")
     rig = import_rig([tmp_path / "result" / "calibration.yaml"])
     np.testing.assert_allclose(rig.T_camera_lidar["left"], solved.T_camera_lidar["left"])
+    tied = Rig(cameras=rig.cameras, relative_poses=(stereo_relative_pose(rig),))
+    tied.save(tmp_path / "rig.yaml")
+    (pair,) = import_rig([tmp_path / "rig.yaml"]).relative_poses
+    assert (pair.rotation_sigma_rad, pair.translation_sigma_m) == (1e-3, 2e-3)
+    np.testing.assert_allclose(pair.T_a_b, tied.relative_poses[0].T_a_b, atol=1e-15)
 
 
 @pytest.mark.parametrize(
