@@ -57,7 +57,7 @@ def import_rig(
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     tree = FrameTree(link for part in parts for link in part.links)
-    missing = lenses.keys() - T_camera_lidar.keys()
+    missing = sorted(lenses.keys() - T_camera_lidar.keys())
     T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
@@ -86,7 +86,7 @@ def _read_all(
             f"{', '.join(str(part.path) for part in read)}: no lens; add the file with the "
             "intrinsics (camera_info, camchain, ...)"
         )
-    for name in rename.keys() - known:
+    for name in sorted(rename.keys() - known):
         raise CalibrationError(
             f"no camera {name!r} to rename; the files have {', '.join(sorted(known))}"
         )

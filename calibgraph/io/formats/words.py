@@ -18,7 +18,7 @@ _CAMERA_SIDES = (("right", "left"), ("below", "above"), ("ahead", "behind"))
 _LEAST_M = 0.005
 _LEAST_DEG = 0.5
 _LEAST_ROLL_DEG = 5.0  # below, a camera hangs straight
-_UPRIGHT = 0.95  # of sin(elevation): beyond, left and right mean nothing
+_UPRIGHT = 0.95  # of sin(elevation), 72 deg: beyond, left and right mean little
 
 
 def describe_rig(rig: Rig) -> list[str]:
@@ -35,16 +35,17 @@ def _place(T_camera_lidar: Array) -> str:
 def _direction(T_camera_lidar: Array) -> str:
     """The axis of the LiDAR frame nearest to the optical axis, and the angles from it."""
     _, down, axis = T_camera_lidar[:3, :3]
-    index = int(np.argmax(np.abs(axis)))
-    sign = "+" if axis[index] > 0 else "-"
-    words = f"along LiDAR {sign}{'xyz'[index]}"
-    if abs(axis[2]) > _UPRIGHT or index == 2:  # noqa: PLR2004 - the axis z
-        off = math.degrees(math.acos(min(1.0, abs(float(axis[index])))))
+    if abs(axis[2]) > _UPRIGHT:
+        off = math.degrees(math.acos(min(1.0, abs(float(axis[2])))))
+        words = f"along LiDAR {'+' if axis[2] > 0 else '-'}z"
         return words + (f", {off:.0f} deg off it" if off >= _LEAST_DEG else "")
+    index = int(np.argmax(np.abs(axis[:2])))
+    sign = "+" if axis[index] > 0 else "-"
     heading = math.degrees(math.atan2(axis[1], axis[0]))
     nearest = {"+x": 0.0, "+y": 90.0, "-x": 180.0, "-y": -90.0}[f"{sign}{'xy'[index]}"]
     turned = (heading - nearest + 180.0) % 360.0 - 180.0
     raised = math.degrees(math.asin(axis[2]))
+    words = f"along LiDAR {sign}{'xy'[index]}"
     parts = [_turn(turned, "to the left", "to the right"), _turn(raised, "up", "down")]
     parts.append(_roll(axis, down))
     return ", ".join([words, *(part for part in parts if part)])

@@ -307,13 +307,15 @@ def test_sentences_are_what_the_rig_was_made_of(name: str, said: str) -> None:
 
 
 def test_up_and_down_and_the_axis_z_are_in_the_sentences() -> None:
-    pitched = np.eye(4)
-    angle = np.radians(20)
-    pitched[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     camera = make_camera()
-    # p' = Rx(20 deg) p: a point on the old axis appears above, so the camera looks down.
-    down = Rig(cameras={"a": camera.moved_to(pitched @ camera.T_camera_lidar)})
-    assert describe_rig(down) == ["a looks along LiDAR +x, 20 deg down, sits at the LiDAR"]
+    for degrees in (20, 50):
+        angle = np.radians(degrees)
+        pitched = np.eye(4)
+        pitched[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        # p' = Rx(angle) p: a point on the old axis appears above, so the camera looks down.
+        down = Rig(cameras={"a": camera.moved_to(pitched @ camera.T_camera_lidar)})
+        said = f"a looks along LiDAR +x, {degrees} deg down, sits at the LiDAR"
+        assert describe_rig(down) == [said]
     floor = Rig(cameras={"a": camera.moved_to(np.diag([1.0, -1, -1, 1]))})
     assert describe_rig(floor) == ["a looks along LiDAR -z, sits at the LiDAR"]
 
