@@ -11,6 +11,9 @@ from .io.correspondence_tables import load_correspondences as load_correspondenc
 from .io.dataset import Dataset as Dataset
 from .io.dataset import Frame as Frame
 from .io.dataset import load_dataset as load_dataset
+from .io.formats.export import export_calibration as export_calibration
+from .io.formats.rig_import import import_rig as import_rig
+from .io.formats.words import describe_rig as describe_rig
 from .io.rigs import load_rig as load_rig
 from .matching.camera_pairs import match_cameras as match_cameras
 from .matching.camera_pairs import with_surfaces as with_surfaces

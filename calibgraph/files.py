@@ -138,7 +138,15 @@ def read_yaml(path: Path) -> dict[str, Any]:
     require_file(path)
     if path.stat().st_size > MAX_YAML_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
-    text = read_text(path)
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, path: Path) -> dict[str, Any]:
+    """The mapping in the text of a YAML file.
+
+    Raises:
+        FileError: if it is not YAML, not a mapping, or too deep or large when written out.
+    """
     if _bracket_depth(text) > MAX_YAML_DEPTH:
         raise FileError(path, _TOO_DEEP)
     try:
@@ -193,8 +201,12 @@ def _expanded_size(value: Any, sizes: dict[int, int]) -> int:
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
     """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line."""
-    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True)
-    write_text(path, text)
+    write_text(path, yaml_text(content))
+
+
+def yaml_text(content: dict[str, Any]) -> str:
+    """A mapping as YAML, as :func:`write_yaml` writes it."""
+    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True))
 
 
 def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
@@ -246,6 +258,10 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
             seen.add(key if isinstance(key, (str, int)) else id(key_node))
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
+
+
+# OpenCV's matrices: mappings with the keys rows, cols, dt and data.
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
 
 
 class _Dumper(yaml.SafeDumper):

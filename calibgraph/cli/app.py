@@ -17,6 +17,7 @@ import typer
 
 from calibgraph.cli.benchmark import bench, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
@@ -59,9 +60,10 @@ def _options(
 
 
 for _command in (
-    calibrate, match, solve, report, evaluate, perturb, simulate, weights, train, tune, track
+    calibrate, match, solve, report, evaluate, perturb, export, import_, simulate, weights, train,
+    tune, track,
 ):  # fmt: skip
-    app.command()(_command)
+    app.command(_command.__name__.rstrip("_"))(_command)
 app.add_typer(bench, name="bench")
 
 

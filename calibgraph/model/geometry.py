@@ -40,6 +40,30 @@ def to_T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     return T_camera_lidar
 
 
+T_OPTICAL_LINK: Array = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""From ROS's camera link (x forward, y left, z up) to the optical frame of the same camera."""
+T_OPTICAL_LINK.setflags(write=False)
+
+
+def ros_pose_covariance(covariance: Array, T_camera_lidar: Array) -> Array:
+    """(6, 6) covariance of the camera's pose in the LiDAR frame, as ``PoseWithCovariance`` has it.
+
+    Args:
+        covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, rotation first.
+        T_camera_lidar: (4, 4) the estimate.
+
+    Returns:
+        Of the position [m], then of the rotation [rad] about fixed axes, both in LiDAR axes.
+    """
+    # T_lidar_camera exp(-xi): the position moves by -R v, the axes turn by -R w.
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, 3:] = jacobian[3:, :3] = -T_camera_lidar[:3, :3].T
+    turned: Array = jacobian @ covariance @ jacobian.T
+    return turned
+
+
 def camera_center(T_camera_lidar: Array) -> Array:
     """(3,) the camera's centre in the LiDAR frame [m]."""
     center: Array = -T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3]

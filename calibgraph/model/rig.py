@@ -86,7 +86,7 @@ def _checked_name(name: str) -> str:
     return name
 
 
-_MODELS_OF_OTHERS: dict[str, LensModel] = {
+MODELS_OF_OTHERS: dict[str, LensModel] = {
     "plumb_bob": "pinhole",
     "radtan": "pinhole",
     "rational_polynomial": "pinhole",
@@ -94,6 +94,7 @@ _MODELS_OF_OTHERS: dict[str, LensModel] = {
     "equi": "fisheye",
     "kannala_brandt": "fisheye",
 }
+"""What ROS, Kalibr and others call the lens models."""
 
 
 def _checked_model(name: Any) -> Any:
@@ -102,7 +103,7 @@ def _checked_model(name: Any) -> Any:
     Raises:
         ValueError: if it is the name that ROS or Kalibr give to one of ours.
     """
-    ours = _MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
+    ours = MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
     if ours is not None:
         raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")
     return name

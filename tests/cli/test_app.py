@@ -144,8 +144,8 @@ def test_help_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "calibrate", "match", "solve", "report", "evaluate", "perturb", "simulate", "weights",
-        "train", "bench", "tune", "track",
+        "calibrate", "match", "solve", "report", "evaluate", "perturb", "export", "import",
+        "simulate", "weights", "train", "bench", "tune", "track",
     ):  # fmt: skip
         assert command in done.stdout
 

@@ -21,10 +21,12 @@ from calibgraph.model.geometry import (
     relative_covariance,
     relative_transform,
     retract_all,
+    ros_pose_covariance,
     to_T_camera_lidar,
     to_T_lidar_camera,
     twist_between,
 )
+from tests.conftest import make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
@@ -165,3 +167,26 @@ def test_many_poses_move_as_gtsam_moves_each(size: float) -> None:
             to_T_lidar_camera(T[0]).localCoordinates(to_T_lidar_camera(found)),
             atol=1e-12,
         )
+
+
+def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:
+    """By finite differences of the pose in the LiDAR frame, over each direction of xi."""
+    T = make_camera((0.3, 0.2, -0.1), yaw_deg=35).T_camera_lidar
+    step = 1e-6
+    jacobian = np.empty((6, 6))
+    for k in range(6):
+        poses = []
+        for sign in (1, -1):
+            xi = np.zeros(6)
+            xi[k] = sign * step
+            poses.append(np.linalg.inv(gtsam.Pose3.Expmap(xi).matrix() @ T))
+        plus, minus = poses
+        turn = (plus[:3, :3] @ minus[:3, :3].T) / (2 * step)
+        axis = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        jacobian[:3, k] = (plus[:3, 3] - minus[:3, 3]) / (2 * step)
+        jacobian[3:, k] = 0.5 * np.array(axis)
+    root = np.random.default_rng(3).normal(size=(6, 6))
+    covariance = root @ root.T
+    expected = jacobian @ covariance @ jacobian.T
+    # Central differences: rounding 1e-16 / 1e-6, of values up to about 10.
+    np.testing.assert_allclose(ros_pose_covariance(covariance, T), expected, atol=1e-7)

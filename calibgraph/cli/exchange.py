@@ -1,0 +1,199 @@
+"""The commands for the formats of others: export, import."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_LIST = "list"
+
+
+def _list_formats(format: str) -> str:
+    """Print the formats for ``--format list``, before other arguments are required."""
+    if format == _LIST:
+        width = max(map(len, EXPORT_FORMATS))
+        for name, meaning in EXPORT_FORMATS.items():
+            print(f"{name:{width}}  {meaning}")
+        raise typer.Exit
+    return format
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="RESULT|RIG", help="Result (its folder or file), or a rig.")
+    ],
+    format: Annotated[
+        str,
+        typer.Option(
+            metavar="FORMAT",
+            callback=_list_formats,
+            is_eager=True,
+            help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
+    ] = None,
+    lidar_frame: Annotated[
+        str | None,
+        typer.Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
+    ] = None,
+    camera_frame: Annotated[
+        str, typer.Option(metavar="TEXT", help="Frame id of optical frames; {camera} is the name.")
+    ] = "{camera}_optical_frame",
+    lidar_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar='"X Y Z ROLL PITCH YAW"',
+            help="Of autoware and nuscenes: where the LiDAR is mounted, in sensor_kit_base_link or "
+            "ego, metres and radians as in URDF. (default: at its origin)",
+        ),
+    ] = None,
+    even_if_failed: Annotated[
+        bool, typer.Option("--even-if-failed", help="Export although the verdict is FAIL.")
+    ] = False,
+) -> None:
+    """Write a calibration in the format of another program, with its direction as a comment."""
+    from calibgraph.io.formats.export import export_calibration
+
+    with checked_arguments():
+        written = export_calibration(
+            source,
+            out,
+            format,
+            cameras=camera or None,
+            lidar_frame=lidar_frame,
+            camera_frame=camera_frame,
+            T_base_lidar=None if lidar_pose is None else _parse_pose(lidar_pose),
+            even_if_failed=even_if_failed,
+        )
+    for path in written:
+        print_plain(terminal(), f"{path}: written ({format})")
+
+
+def _parse_pose(text: str) -> NDArray[np.float64]:
+    """The (4, 4) of six numbers.
+
+    Raises:
+        ValueError: if they are not six.
+    """
+    from calibgraph.io.formats.rotations import pose_of_angles
+
+    try:
+        x, y, z, roll, pitch, yaw = (float(word) for word in text.replace(",", " ").split())
+    except ValueError as error:
+        raise ValueError(
+            f"--lidar-pose {text!r}: give six numbers, X Y Z ROLL PITCH YAW"
+        ) from error
+    return pose_of_angles((x, y, z), (roll, pitch, yaw))
+
+
+def import_(
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE...",
+            help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OLD=NEW",
+            help="Another name of a camera, as its folder in the dataset; may be repeated.",
+        ),
+    ] = None,
+    lidar_frame: Annotated[
+        str | None,
+        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
+    ] = None,
+    camera_frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FRAME",
+            help="Frame of a camera, where the names differ; may be repeated. A frame with "
+            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
+    ] = None,
+    relative_sigma_deg: Annotated[
+        float, typer.Option(min=0.001, help="Of relative poses (T_cn_cnm1): 1 sigma per axis.")
+    ] = 0.1,
+    relative_sigma_cm: Annotated[
+        float, typer.Option(min=0.001, help="Likewise, of their translation.")
+    ] = 0.5,
+) -> None:
+    """Build a rig file from files of others, and print where each camera looks and sits."""
+    from calibgraph.files import require_place_for_file
+    from calibgraph.io.formats.rig_import import import_rig
+    from calibgraph.io.formats.words import describe_rig
+    from calibgraph.io.rigs import require_replaceable_rig
+
+    require_place_for_file(out, ".yaml", ".yml")
+    named = [_parse_name(text) for text in files]
+    for _, path in named:
+        require_replaceable_rig(out, read=path)
+    with checked_arguments():
+        rig = import_rig(
+            [path for _, path in named],
+            names={path: name for name, path in named if name},
+            rename=_parse_names("--rename", rename),
+            lidar_frame=lidar_frame,
+            camera_frames=_parse_names("--camera-frame", camera_frame),
+            size_px=None if size is None else _parse_size(size),
+            relative_sigma_deg=relative_sigma_deg,
+            relative_sigma_cm=relative_sigma_cm,
+        )
+    rig.save(out)
+    for sentence in describe_rig(rig):
+        print_plain(terminal(), sentence)
+    cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
+    print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
+
+
+def _parse_name(text: str) -> tuple[str, Path]:
+    """The camera's name, if there is one before ``=``, and the file."""
+    name, equals, file = text.partition("=")
+    return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
+
+
+def _parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
+    """The pairs of a repeated option A=B.
+
+    Raises:
+        ValueError: if there is no ``=``.
+    """
+    for text in texts or ():
+        if "=" not in text:
+            raise ValueError(f"{option} {text!r}: give two names with = between them")
+    pairs = (text.partition("=") for text in texts or ())
+    return {name: value for name, _, value in pairs}
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    """Width and height.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None:
+        raise ValueError(f"--size {text!r}: give WIDTHxHEIGHT, as 1920x1200")
+    return int(match[1]), int(match[2])

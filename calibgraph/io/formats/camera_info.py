@@ -1,0 +1,60 @@
+"""ROS camera_info YAML, as camera_calibration writes it: one lens, no extrinsic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from calibgraph.files import checked_model
+from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients, lens_model
+from calibgraph.io.formats.part import Part
+from calibgraph.model.rig import Finite, Positive, Size
+
+_Nine = tuple[
+    Positive, Finite, Finite, Finite, Positive, Finite, Finite, Finite, Finite
+]  # fmt: skip
+
+
+class _Matrix(BaseModel):
+    data: _Nine
+
+
+class _Coefficients(BaseModel):
+    data: tuple[Finite, ...] = ()
+
+
+class _CameraInfo(BaseModel):
+    image_width: Size
+    image_height: Size
+    camera_name: str = ""
+    camera_matrix: _Matrix
+    distortion_model: str
+    distortion_coefficients: _Coefficients = _Coefficients()
+
+
+def is_camera_info(content: dict[str, Any]) -> bool:
+    """Whether the content of a YAML file is a camera_info."""
+    return "camera_matrix" in content and "image_width" in content
+
+
+def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
+    """The lens of the images as recorded (K and D, not the rectified P).
+
+    Args:
+        content: of the file.
+        path: of the file.
+        name: of the camera, instead of the file's ``camera_name``, or its stem if it has none.
+
+    Raises:
+        FileError: if it is malformed, or the lens is none of ours.
+    """
+    info = checked_model(_CameraInfo, content, path)
+    fx, _, cx, _, fy, cy, *_ = info.camera_matrix.data
+    model = lens_model(info.distortion_model, path)
+    coefficients = fitted_coefficients(info.distortion_coefficients.data, model, path)
+    size = (info.image_width, info.image_height)
+    lens = CameraLens(model, size, (fx, fy, cx, cy), coefficients)
+    given = info.camera_name.strip("/").replace("/", "_")  # narrow_stereo/left: no folder's name
+    return Part(path, lenses={name or given or path.stem: lens})

@@ -1,0 +1,162 @@
+"""Write a result or a rig in the format of another program."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.files import read_yaml, require_place_for_file, write_bytes, write_text
+from calibgraph.io.calibrations import is_calibration, load_calibration
+from calibgraph.io.formats.autoware import write_autoware
+from calibgraph.io.formats.comments import commented
+from calibgraph.io.formats.kalibr import write_kalibr
+from calibgraph.io.formats.kitti_calib import kitti_statement, write_kitti
+from calibgraph.io.formats.koide import write_koide
+from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats.nuscenes import write_nuscenes
+from calibgraph.io.formats.opencv_yaml import write_opencv
+from calibgraph.io.formats.plain import write_json, write_npz
+from calibgraph.io.formats.rig_export import CAMERA_FRAME, Array, RigExport, prepare_export
+from calibgraph.io.formats.ros_transforms import (
+    write_ros1,
+    write_ros2,
+    write_ros2_launch,
+    write_tf2,
+)
+from calibgraph.io.formats.urdf import write_urdf
+from calibgraph.io.kitti import CALIBRATION_NAME
+from calibgraph.io.rigs import load_rig, rig_file
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.rig import Rig, rigid_transform
+
+WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
+    "kalibr": write_kalibr,
+    "ros1": write_ros1,
+    "ros2": write_ros2,
+    "ros2-launch": write_ros2_launch,
+    "tf2": write_tf2,
+    "urdf": write_urdf,
+    "autoware": write_autoware,
+    "kitti": write_kitti,
+    "nuscenes": write_nuscenes,
+    "koide": write_koide,
+    "opencv": write_opencv,
+    "npz": write_npz,
+    "json": write_json,
+}
+_WITH_BASE = ("autoware", "nuscenes")
+_WITHOUT_COMMENTS = "kitti"
+_MARK = re.compile(rb"calibgraph[ _]export")
+_MARK_BYTES = 2**16
+
+
+def export_calibration(
+    source: Calibration | Rig | Path | str,
+    path: Path | str,
+    format: str,
+    *,
+    cameras: Iterable[str] | None = None,
+    lidar_frame: str | None = None,
+    camera_frame: str = CAMERA_FRAME,
+    T_base_lidar: Array | None = None,
+    even_if_failed: bool = False,
+) -> tuple[Path, ...]:
+    """Write a calibration for another program, with its direction and a worked point.
+
+    Args:
+        source: a result or a rig, or the path of one.
+        path: the file to write. Only a file that was exported before is replaced.
+        format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
+        cameras: names of those to write; all if None.
+        lidar_frame: frame id of the LiDAR; the rig's name of it if None.
+        camera_frame: id of optical frames, with ``{camera}`` for the camera's name.
+        T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware) or ego
+            (nuscenes); the identity if None.
+        even_if_failed: whether to write cameras whose verdict is FAIL.
+
+    Returns:
+        The files: one, and for ``kitti``, which has no comments, a text file beside it.
+
+    Raises:
+        CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
+        ValueError: if an argument is wrong.
+    """
+    _require_known(format, with_base=T_base_lidar is not None)
+    prepared = prepare_export(
+        _loaded(source) if isinstance(source, (str, Path)) else source,
+        cameras=cameras,
+        lidar_frame=lidar_frame,
+        camera_frame=camera_frame,
+        T_base_lidar=None if T_base_lidar is None else rigid_transform(T_base_lidar),
+    )
+    if not even_if_failed:
+        _require_not_failed(prepared)
+    return _write(prepared, Path(path), format)
+
+
+def _require_not_failed(export: RigExport) -> None:
+    """Check the verdict.
+
+    Raises:
+        CalibrationError: if it is FAIL.
+    """
+    if export.verdict == "FAIL":
+        raise CalibrationError(
+            f"the verdict of {', '.join(export.cameras)} is FAIL, nothing was written; see the "
+            "result's report, or export it all the same with --even-if-failed"
+        )
+
+
+def _require_known(format: str, *, with_base: bool) -> None:
+    """Check the format, and that it has a base frame if one is given.
+
+    Raises:
+        ValueError: if not.
+    """
+    if format not in WRITERS:
+        raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
+    if with_base and format not in _WITH_BASE:
+        raise ValueError(f"the LiDAR's pose is for the formats {' and '.join(_WITH_BASE)} only")
+
+
+def _loaded(path: Path | str) -> Calibration | Rig:
+    """A result with its verdict, or a rig."""
+    file = rig_file(path)
+    if file.name != CALIBRATION_NAME and is_calibration(read_yaml(file)):
+        return load_calibration(file)
+    return load_rig(file)
+
+
+def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
+    """Write all files or, if one may not be replaced, none."""
+    beside = path.with_name(f"{path.stem}.direction.txt")
+    files: dict[Path, str | bytes] = {path: WRITERS[format](export)}
+    if format == _WITHOUT_COMMENTS:
+        files[beside] = commented(kitti_statement(export))
+    for file in files:
+        _require_replaceable(file)
+    for file, content in files.items():
+        if isinstance(content, bytes):
+            write_bytes(file, content)
+        else:
+            write_text(file, content)
+    return tuple(files)
+
+
+def _require_replaceable(path: Path) -> None:
+    """Check that a file can be written, and that one that is there was exported before.
+
+    Raises:
+        FileError: if not.
+    """
+    require_place_for_file(path)
+    if path.exists():
+        with path.open("rb") as file:
+            if not _MARK.search(file.read(_MARK_BYTES)):
+                raise FileError(
+                    path, "is no file that calibgraph exported, and would be replaced; choose "
+                    "another --out"
+                )  # fmt: skip

@@ -1,0 +1,111 @@
+"""calib.json of koide3's direct_visual_lidar_calibration: one camera, T_lidar_camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from calibgraph.errors import FileError
+from calibgraph.files import checked_model, read_text
+from calibgraph.io.formats.comments import stated_json
+from calibgraph.io.formats.lenses import (
+    CameraLens,
+    carried_coefficients,
+    fitted_coefficients,
+    lens_model,
+)
+from calibgraph.io.formats.part import Part
+from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.formats.rotations import pose_of_quaternion, quaternion_xyzw
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Finite, Positive
+
+_MAX_BYTES = 8 * 2**20
+
+
+def write_koide(export: RigExport) -> str:
+    """The camera, and its pose under ``results``."""
+    name, camera = export.only_camera("koide3's calib.json")
+    T = export.T_lidar_camera(name)
+    k = camera.intrinsics_px
+    if camera.model == "fisheye":
+        model, coefficients = "fisheye", list(camera.distortion)
+    else:
+        what = "koide3's plumb_bob"
+        model, coefficients = "plumb_bob", carried_coefficients(name, camera, 5, what)
+    statement = export.statement(
+        "T_lidar_camera: [x, y, z, qx, qy, qz, qw] maps camera to LiDAR coordinates: "
+        "p_lidar = T_lidar_camera * p_camera, the inverse of T_camera_lidar"
+    )
+    content = {
+        "camera": {
+            "camera_model": model,
+            "intrinsics": [k.fx, k.fy, k.cx, k.cy],
+            "distortion_coeffs": coefficients,
+        },
+        "meta": {"camera": name},
+        "results": {"T_lidar_camera": [*T[:3, 3].tolist(), *quaternion_xyzw(T)]},
+    }
+    return stated_json(statement, content)
+
+
+class _Camera(BaseModel):
+    camera_model: str
+    intrinsics: tuple[Finite, ...]
+    distortion_coeffs: tuple[Finite, ...] = ()
+
+
+class _Focal(BaseModel):
+    intrinsics: tuple[Positive, Positive, Finite, Finite]
+
+
+_Pose = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]
+
+
+class _Results(BaseModel):
+    T_lidar_camera: _Pose | None = None
+    init_T_lidar_camera: _Pose | None = None
+    init_T_lidar_camera_auto: _Pose | None = None
+
+
+class _Calibration(BaseModel):
+    camera: _Camera
+    meta: dict[str, Any] = {}
+    results: _Results = _Results()
+
+
+def read_koide(path: Path, name: str) -> Part:
+    """The lens and the result, or else an initial guess; without image size.
+
+    Args:
+        path: of calib.json.
+        name: of the camera, unless the file was written here.
+
+    Raises:
+        FileError: if the file is malformed, or the lens is none of ours.
+    """
+    found = checked_model(_Calibration, _content(path), path)
+    model = lens_model(found.camera.camera_model, path)
+    focal = checked_model(_Focal, found.camera.model_dump(), path)
+    coefficients = fitted_coefficients(found.camera.distortion_coeffs, model, path)
+    name = str(found.meta.get("camera", name))
+    r = found.results
+    pose = r.T_lidar_camera or r.init_T_lidar_camera or r.init_T_lidar_camera_auto
+    try:
+        T = {} if pose is None else {name: invert(pose_of_quaternion(pose[:3], pose[3:]))}
+    except ValueError as error:
+        raise FileError(path, f"T_lidar_camera: {error}") from error
+    return Part(path, {name: CameraLens(model, None, focal.intrinsics, coefficients)}, T)
+
+
+def _content(path: Path) -> Any:
+    text = read_text(path)
+    if len(text) > _MAX_BYTES:
+        raise FileError(path, f"{len(text)} characters are too many for a calib.json")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileError(path, f"is not valid JSON: {error}") from error

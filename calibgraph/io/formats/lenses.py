@@ -1,0 +1,103 @@
+"""Lens models under the names of others; what a format cannot carry is refused, not rounded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.model.rig import MODELS_OF_OTHERS, Camera
+from factors import LensModel
+from factors.lens import ORDERS
+
+_COUNTS: dict[LensModel, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+
+
+@dataclass(frozen=True)
+class CameraLens:
+    """A lens as a file of others has it.
+
+    Attributes:
+        model: the name here.
+        size_px: width and height; None if the file has none.
+        intrinsics_px: fx, fy, cx, cy; (0, 0) is the centre of the top-left pixel.
+        distortion: in OpenCV's order.
+    """
+
+    model: LensModel
+    size_px: tuple[int, int] | None
+    intrinsics_px: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
+
+
+def lens_model(name: str, path: Path) -> LensModel:
+    """The model here of a name in a file of others.
+
+    Raises:
+        FileError: if calibgraph has no such lens.
+    """
+    key = name.strip().lower().replace("-", "_").replace(" ", "_")
+    if key in ("pinhole", "none", ""):
+        return "pinhole"
+    found: LensModel | None = "fisheye" if key == "fisheye" else MODELS_OF_OTHERS.get(key)
+    if found is None:
+        raise FileError(
+            path,
+            f"lens model {name!r} is none of calibgraph's: pinhole (plumb_bob, radtan, "
+            "rational_polynomial) and fisheye (equidistant, Kannala-Brandt); calibrate the "
+            "intrinsics with one of these",
+        )
+    return found
+
+
+def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -> tuple[float, ...]:
+    """Distortion coefficients in a number that the model has: zeros at the end come and go.
+
+    Raises:
+        FileError: if there are more coefficients than the model has.
+    """
+    kept = tuple(float(value) for value in np.trim_zeros(np.array(values, dtype=float), "b"))
+    if model == "pinhole" and not kept:
+        return ()
+    for count in _COUNTS[model]:
+        if count >= len(kept):
+            return kept + (0.0,) * (count - len(kept))
+    raise FileError(
+        path,
+        f"{len(values)} distortion coefficients, of which {len(kept)} count; the lens model "
+        f"{model} here has {ORDERS[model]}",
+    )
+
+
+def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> list[float]:
+    """A pinhole's coefficients, ``most`` of them, in OpenCV's order.
+
+    Raises:
+        CalibrationError: if there are further ones that are not zero.
+    """
+    padded = [*camera.distortion, *[0.0] * most]
+    if any(padded[most:]):
+        raise CalibrationError(
+            f"camera {name!r}: {what} holds {most or 'no'} distortion coefficients, this lens has "
+            f"{camera.distortion}; choose another --format (opencv, json)",
+            camera=name,
+        )
+    return padded[:most]
+
+
+def require_undistorted(name: str, camera: Camera, what: str) -> None:
+    """Check that a camera is a pinhole without distortion.
+
+    Raises:
+        CalibrationError: if not.
+    """
+    if camera.model != "pinhole":
+        raise CalibrationError(
+            f"camera {name!r}: {what} cannot hold a {camera.model} lens; choose another --format, "
+            "or undistort the images and calibrate these",
+            camera=name,
+        )
+    carried_coefficients(name, camera, 0, what)

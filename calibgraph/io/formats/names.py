@@ -1,0 +1,30 @@
+"""The formats by name; imports nothing, so that the help of the command line answers at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+EXPORT_FORMATS: Final[Mapping[str, str]] = {
+    "kalibr": "Kalibr-style camchain YAML with T_cam_lidar and T_cn_cnm1",
+    "ros1": "lines static_transform_publisher for ROS 1, LiDAR -> optical frames",
+    "ros2": "lines static_transform_publisher for ROS 2, LiDAR -> optical frames",
+    "ros2-launch": "ROS 2 launch file (.launch.xml) of static_transform_publisher nodes",
+    "tf2": "tf2_msgs/TFMessage as YAML, for /tf_static",
+    "urdf": "URDF with one fixed joint per camera, LiDAR -> optical frames",
+    "autoware": "Autoware's sensor_kit_calibration.yaml: camera_link, not optical",
+    "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
+    "nuscenes": "nuScenes' calibrated_sensor.json: sensor -> ego, quaternions w x y z",
+    "koide": "koide3's calib.json (direct_visual_lidar_calibration): one camera, T_lidar_camera",
+    "opencv": "OpenCV FileStorage YAML: matrices, distortion, T_camera_lidar",
+    "npz": "NumPy archive: T_camera_lidar, T_lidar_camera, lenses, covariance",
+    "json": "plain JSON: T_camera_lidar, T_lidar_camera, lenses, covariance",
+}
+"""What ``calibgraph export --format`` writes."""
+
+IMPORT_FORMATS: Final = (
+    "Kalibr camchain, ROS camera_info, OpenCV FileStorage, Autoware sensor kit, tf2 TFMessage "
+    "(.yaml), URDF (.urdf, .xml), COLMAP cameras.txt, koide3 calib.json, KITTI calib.txt in its "
+    "sequence, a rig file or result of calibgraph"
+)
+"""What ``calibgraph import`` reads."""

@@ -1,0 +1,65 @@
+"""What one file of others holds about a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.io.formats.lenses import CameraLens
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeCamera:
+    """A (4, 4) T_a_b between two cameras, in optical axes; its sigmas if the file has them."""
+
+    a: str
+    b: str
+    T_a_b: Array
+    rotation_sigma_rad: float | None = None
+    translation_sigma_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLink:
+    """The (4, 4) pose of a child frame in its parent, as in TF and URDF."""
+
+    parent: str
+    child: str
+    T_parent_child: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Lenses, extrinsics and frames of one file; any of them may be missing.
+
+    Attributes:
+        path: of the file.
+        lenses: by camera.
+        T_camera_lidar: (4, 4) by camera.
+        relative_poses: between cameras, measured independently of T_camera_lidar.
+        links: frames in their parents.
+    """
+
+    path: Path
+    lenses: Mapping[str, CameraLens] = field(default_factory=dict)
+    T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
+    relative_poses: tuple[RelativeCamera, ...] = ()
+    links: tuple[FrameLink, ...] = ()
+
+    def rename(self, names: Mapping[str, str]) -> Part:
+        """The same with other names of some cameras; frames keep theirs."""
+        return replace(
+            self,
+            lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
+            T_camera_lidar={names.get(name, name): T for name, T in self.T_camera_lidar.items()},
+            relative_poses=tuple(
+                replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
+                for pair in self.relative_poses
+            ),
+        )

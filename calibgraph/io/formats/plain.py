@@ -1,0 +1,58 @@
+"""Plain JSON and NumPy archives: both directions of the extrinsic, lenses, covariance."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from calibgraph.io.formats.comments import stated_json
+from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.model.calibration import FRAMES_SENTENCE
+
+_DIRECTION = (
+    f"T_camera_lidar maps LiDAR to camera coordinates: {FRAMES_SENTENCE}",
+    "T_lidar_camera is its inverse, the pose of the camera in the LiDAR frame",
+    COVARIANCE_SENTENCE,
+)
+
+
+def write_json(export: RigExport) -> str:
+    """Per camera: lens, both directions of the extrinsic, covariance or null."""
+    content = {
+        "verdict": export.verdict or None,
+        "lidar_frame": export.lidar_frame,
+        "cameras": {name: _content(export, name) for name in export.cameras},
+    }
+    return stated_json(export.statement(*_DIRECTION), content)
+
+
+def _content(export: RigExport, name: str) -> dict[str, Any]:
+    camera, covariance = export.cameras[name], export.ros_covariance(name)
+    return {
+        **camera.model_dump(),
+        "optical_frame": export.optical_frames[name],
+        "T_lidar_camera": export.T_lidar_camera(name).tolist(),
+        "covariance": None if covariance is None else covariance.ravel().tolist(),
+    }
+
+
+def write_npz(export: RigExport) -> bytes:
+    """Arrays over the n cameras; the covariance is NaN where there is none."""
+    cameras = list(export.cameras.values())
+    covariances = [export.ros_covariance(name) for name in export.cameras]
+    file = io.BytesIO()
+    np.savez(
+        file,
+        calibgraph_export=np.array(export.statement(*_DIRECTION)),
+        cameras=np.array(list(export.cameras)),
+        T_camera_lidar=np.array([camera.T_camera_lidar for camera in cameras]),
+        T_lidar_camera=np.array([export.T_lidar_camera(name) for name in export.cameras]),
+        camera_matrix_px=np.array([camera.matrix_px for camera in cameras]),
+        size_px=np.array([(camera.width_px, camera.height_px) for camera in cameras]),
+        model=np.array([camera.model for camera in cameras]),
+        distortion=np.array([[*c.distortion, *[0.0] * 8][:8] for c in cameras]),
+        covariance=np.array([np.full((6, 6), np.nan) if c is None else c for c in covariances]),
+    )
+    return file.getvalue()

@@ -1,0 +1,86 @@
+"""One file of another program, in the format that its name or content shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibgraph.errors import FileError
+from calibgraph.files import parse_yaml, read_text, require_file
+from calibgraph.io.formats.autoware import is_autoware, read_autoware
+from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
+from calibgraph.io.formats.colmap import read_colmap
+from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
+from calibgraph.io.formats.koide import read_koide
+from calibgraph.io.formats.lenses import CameraLens
+from calibgraph.io.formats.names import IMPORT_FORMATS
+from calibgraph.io.formats.opencv_yaml import is_opencv, read_opencv
+from calibgraph.io.formats.part import Part, RelativeCamera
+from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2
+from calibgraph.io.formats.urdf import read_urdf
+from calibgraph.io.kitti import CALIBRATION_NAME
+from calibgraph.io.rigs import load_rig
+from calibgraph.model.rig import Camera, Rig
+
+_MAX_BYTES = 32 * 2**20
+
+
+def read_part(path: Path, name: str | None) -> Part:
+    """What a file holds about a rig.
+
+    Args:
+        path: of the file, or of a KITTI sequence or a result's folder.
+        name: of the camera, if the file is of a single one; None for the file's own name of it.
+
+    Raises:
+        FileError: if the format is unknown, or the file malformed.
+    """
+    if path.is_dir() or path.name == CALIBRATION_NAME:
+        return _part_of_rig(load_rig(path), path)
+    suffix = require_file(path).suffix.lower()
+    if path.stat().st_size > _MAX_BYTES:
+        raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
+    if suffix in (".urdf", ".xml", ".xacro"):
+        return read_urdf(path)
+    if suffix == ".json":
+        return read_koide(path, name or path.stem)
+    if suffix == ".txt":
+        return read_colmap(path)
+    if suffix in (".yaml", ".yml"):
+        return _read_yaml(path, name)
+    raise FileError(path, f"its format is not known; known are {IMPORT_FORMATS}")
+
+
+def _read_yaml(path: Path, name: str | None) -> Part:
+    text = read_text(path)
+    if is_opencv(text):
+        return read_opencv(path, name or path.stem)
+    content = parse_yaml(text, path)
+    if "format" in content:
+        return _part_of_rig(load_rig(path), path)
+    if is_camera_info(content):
+        return read_camera_info(content, path, name)
+    for matches, read in (
+        (is_kalibr, read_kalibr), (is_tf2, read_tf2), (is_autoware, read_autoware)
+    ):  # fmt: skip
+        if matches(content):
+            return read(content, path)
+    keys = ", ".join(str(key) for key in list(content)[:5])
+    raise FileError(path, f"its keys ({keys}) are of no known format; known are {IMPORT_FORMATS}")
+
+
+def _part_of_rig(rig: Rig, path: Path) -> Part:
+    return Part(
+        path,
+        lenses={name: _lens(camera) for name, camera in rig.cameras.items()},
+        T_camera_lidar=rig.T_camera_lidar,
+        relative_poses=tuple(
+            RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
+            for p in rig.relative_poses
+        ),
+    )
+
+
+def _lens(camera: Camera) -> CameraLens:
+    k = camera.intrinsics_px
+    size = (camera.width_px, camera.height_px)
+    return CameraLens(camera.model, size, (k.fx, k.fy, k.cx, k.cy), camera.distortion)

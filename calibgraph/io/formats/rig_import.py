@@ -1,0 +1,195 @@
+"""A rig from the files of other programs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from calibgraph.errors import CalibrationError, FileError, RigError
+from calibgraph.files import checked_model
+from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
+from calibgraph.io.formats.lenses import CameraLens
+from calibgraph.io.formats.part import Array, Part, RelativeCamera
+from calibgraph.io.formats.read_part import read_part
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Rig
+
+Value = TypeVar("Value")
+
+RELATIVE_SIGMA_DEG = 0.1
+RELATIVE_SIGMA_CM = 0.5
+"""Assumed of relative poses whose file has none: a stereo calibration with a board, generously."""
+
+_SAME = 1e-6  # of transforms that two files give: they may be rounded
+
+
+def import_rig(
+    files: Iterable[Path | str],
+    *,
+    names: Mapping[Path | str, str] | None = None,
+    rename: Mapping[str, str] | None = None,
+    lidar_frame: str | None = None,
+    camera_frames: Mapping[str, str] | None = None,
+    size_px: tuple[int, int] | None = None,
+    relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
+    relative_sigma_cm: float = RELATIVE_SIGMA_CM,
+) -> Rig:
+    """Build a rig from files of other programs, which together hold lenses and extrinsics.
+
+    Args:
+        files: of the kinds in ``calibgraph.io.formats.names.IMPORT_FORMATS``.
+        names: camera names for files of a single camera, by file.
+        rename: new names of cameras, by those in the files.
+        lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
+        camera_frames: per camera, its frame, where the names differ.
+        size_px: width and height of images whose file has none.
+        relative_sigma_deg: 1 sigma per axis of relative poses whose file has none.
+        relative_sigma_cm: likewise of their translation.
+
+    Raises:
+        CalibrationError: if a file is malformed, a lens is none of ours, or something is missing.
+    """
+    parts = _read_all(files, names or {}, rename or {})
+    lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
+    T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
+    tree = FrameTree(link for part in parts for link in part.links)
+    missing = sorted(lenses.keys() - T_camera_lidar.keys())
+    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
+    pairs = [pair for part in parts for pair in part.relative_poses]
+    T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
+    sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
+    cameras = {
+        n: _camera(n, lens, T_camera_lidar.get(n), size_px, tree) for n, lens in lenses.items()
+    }
+    content: dict[str, Any] = {"lidar": lidar_frame or "lidar", "cameras": cameras}
+    content["relative_poses"] = [_relative_pose(pair, *sigmas) for pair in pairs]
+    return checked_model(Rig, content, parts[0].path)
+
+
+def _read_all(
+    files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
+) -> list[Part]:
+    """The parts, of which one has a lens at least.
+
+    Raises:
+        CalibrationError: if a file is malformed, or none has a lens.
+    """
+    chosen = {Path(file): name for file, name in names.items()}
+    read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    known = {name for part in read for name in (*part.lenses, *part.T_camera_lidar)}
+    if not any(part.lenses for part in read):
+        raise CalibrationError(
+            f"{', '.join(str(part.path) for part in read)}: no lens; add the file with the "
+            "intrinsics (camera_info, camchain, ...)"
+        )
+    for name in sorted(rename.keys() - known):
+        raise CalibrationError(
+            f"no camera {name!r} to rename; the files have {', '.join(sorted(known))}"
+        )
+    after = {rename.get(name, name) for name in known}
+    if len(after) < len(known):
+        raise CalibrationError("--rename gives two cameras one name; give each its own")
+    return [part.rename(rename) for part in read]
+
+
+def _merged(
+    parts: Iterable[Part],
+    select: Callable[[Part], Mapping[str, Value]],
+    what: str,
+    is_same: Callable[[Value, Value], bool],
+) -> dict[str, Value]:
+    """What the parts hold, by camera.
+
+    Raises:
+        FileError: if two parts differ.
+    """
+    merged: dict[str, Value] = {}
+    for part in parts:
+        for name, value in select(part).items():
+            if not is_same(merged.setdefault(name, value), value):
+                raise FileError(
+                    part.path, f"has another {what} of camera {name!r} than a file before it; "
+                    "leave one of them out"
+                )  # fmt: skip
+    return merged
+
+
+def _is_same(one: Array, other: Array) -> bool:
+    return bool(np.abs(one - other).max() <= _SAME)
+
+
+def _by_frames(
+    tree: FrameTree, cameras: Iterable[str], lidar_frame: str | None, chosen: Mapping[str, str]
+) -> dict[str, Array]:
+    """T_camera_lidar of the cameras that have a frame in the tree."""
+    frames = {name: find_camera_frame(tree, name, chosen) for name in cameras}
+    found = {name: frame for name, frame in frames.items() if frame is not None}
+    if not found:
+        return {}
+    lidar = lidar_frame or find_lidar_frame(tree)
+    return {name: tree.T_camera_lidar(frame, lidar) for name, frame in found.items()}
+
+
+def _by_pairs(known: Mapping[str, Array], pairs: Iterable[RelativeCamera]) -> dict[str, Array]:
+    """T_camera_lidar of the cameras that relative poses tie to one that is known."""
+    found = dict(known)
+    both_ways = [
+        step
+        for pair in pairs
+        for step in ((pair.a, pair.b, invert(pair.T_a_b)), (pair.b, pair.a, pair.T_a_b))
+    ]
+    for _ in both_ways:  # as many passes as the longest chain may need
+        for start, end, T_end_start in both_ways:
+            if start in found and end not in found:
+                found[end] = T_end_start @ found[start]
+    return found
+
+
+def _relative_pose(pair: RelativeCamera, sigma_rad: float, sigma_m: float) -> dict[str, Any]:
+    return {
+        "a": pair.a,
+        "b": pair.b,
+        "T_a_b": pair.T_a_b,
+        "rotation_sigma_rad": pair.rotation_sigma_rad or sigma_rad,
+        "translation_sigma_m": pair.translation_sigma_m or sigma_m,
+    }
+
+
+def _camera(
+    name: str,
+    lens: CameraLens,
+    T_camera_lidar: Array | None,
+    size_px: tuple[int, int] | None,
+    tree: FrameTree,
+) -> dict[str, Any]:
+    """The content of a rig file for a camera.
+
+    Raises:
+        RigError: if the image size or the extrinsic is missing.
+    """
+    size = lens.size_px or size_px
+    if size is None:
+        raise RigError(
+            f"camera {name!r}: its file has no image size; give it with --size WIDTHxHEIGHT",
+            camera=name,
+        )
+    if T_camera_lidar is None:
+        frames = f" (its frames are {', '.join(tree.names)})" if tree.names else ""
+        raise RigError(
+            f"camera {name!r}: no file has its T_camera_lidar{frames}; name its "
+            "frame with --camera-frame, or add a URDF, a sensor kit or a rig file with a guess",
+            camera=name,
+        )
+    fx, fy, cx, cy = lens.intrinsics_px
+    return {
+        "model": lens.model,
+        "width_px": size[0],
+        "height_px": size[1],
+        "intrinsics_px": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        "distortion": lens.distortion,
+        "T_camera_lidar": T_camera_lidar,
+    }

@@ -1,0 +1,154 @@
+"""Static transforms of ROS: publisher lines, a launch file, tf2's message."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from pydantic import BaseModel
+
+from calibgraph.errors import FileError
+from calibgraph.files import checked_model
+from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
+from calibgraph.io.formats.part import FrameLink, Part
+from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.formats.rotations import pose_of_quaternion, quaternion_xyzw
+from calibgraph.model.rig import Finite
+
+_DIRECTION = (
+    "each transform is the pose of the optical frame (child) in the LiDAR frame (parent): "
+    "p_lidar = T * p_camera, the inverse of T_camera_lidar"
+)
+
+
+def write_ros1(export: RigExport) -> str:
+    """Lines ``static_transform_publisher x y z qx qy qz qw frame_id child_frame_id`` of tf2_ros."""
+    publisher = ["rosrun", "tf2_ros", "static_transform_publisher"]
+    lines = [
+        shlex.join([*publisher, *_numbers(export, name), export.lidar_frame, frame])
+        for name, frame in export.optical_frames.items()
+    ]
+    order = "numbers: x y z qx qy qz qw, then parent and child frame"
+    return _script(export.statement(_DIRECTION, order), lines)
+
+
+def write_ros2(export: RigExport) -> str:
+    """Lines ``ros2 run tf2_ros static_transform_publisher --x ...``."""
+    lines = [
+        shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *arguments])
+        for arguments in _arguments(export)
+    ]
+    return _script(export.statement(_DIRECTION), lines)
+
+
+def _script(statement: list[str], lines: list[str]) -> str:
+    """A shell script that runs all lines until it is ended."""
+    return commented(statement) + "".join(f"{line} &\n" for line in lines) + "wait\n"
+
+
+def write_ros2_launch(export: RigExport) -> str:
+    """An XML launch file with one publisher per camera."""
+    root = ElementTree.Element("launch")
+    for arguments in _arguments(export):
+        attributes = {
+            "pkg": "tf2_ros",
+            "exec": "static_transform_publisher",
+            "args": " ".join(arguments),
+        }
+        ElementTree.SubElement(root, "node", attributes)
+    return commented_xml(export.statement(_DIRECTION), root)
+
+
+def _arguments(export: RigExport) -> list[list[str]]:
+    """The arguments of each ROS 2 publisher."""
+    keys = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    return [
+        [
+            *(part for pair in zip(keys, _numbers(export, name), strict=True) for part in pair),
+            *("--frame-id", export.lidar_frame, "--child-frame-id", frame),
+        ]
+        for name, frame in export.optical_frames.items()
+    ]
+
+
+def _numbers(export: RigExport, name: str) -> list[str]:
+    """The seven numbers x y z qx qy qz qw of a camera's pose in the LiDAR frame."""
+    T = export.T_lidar_camera(name)
+    return [repr(float(value)) for value in (*T[:3, 3], *quaternion_xyzw(T))]
+
+
+def write_tf2(export: RigExport) -> str:
+    """``tf2_msgs/TFMessage`` as YAML."""
+    content = {"transforms": [_stamped(export, name) for name in export.cameras]}
+    publish = (
+        "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
+        'tf2_msgs/msg/TFMessage "$(cat FILE)"'
+    )
+    return commented_yaml(export.statement(_DIRECTION, publish), content)
+
+
+def _stamped(export: RigExport, name: str) -> dict[str, Any]:
+    T = export.T_lidar_camera(name)
+    return {
+        "header": {"frame_id": export.lidar_frame},
+        "child_frame_id": export.optical_frames[name],
+        "transform": {
+            "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
+        },
+    }
+
+
+class _Vector(BaseModel):
+    x: Finite
+    y: Finite
+    z: Finite
+
+
+class _Quaternion(_Vector):
+    w: Finite
+
+
+class _Transform(BaseModel):
+    translation: _Vector
+    rotation: _Quaternion
+
+
+class _Header(BaseModel):
+    frame_id: str
+
+
+class _Stamped(BaseModel):
+    header: _Header
+    child_frame_id: str
+    transform: _Transform
+
+
+class _Message(BaseModel):
+    transforms: list[_Stamped]
+
+
+def is_tf2(content: dict[str, Any]) -> bool:
+    """Whether the content of a YAML file is a TFMessage."""
+    return "transforms" in content
+
+
+def read_tf2(content: dict[str, Any], path: Path) -> Part:
+    """The frames of a TFMessage.
+
+    Raises:
+        FileError: if it is malformed.
+    """
+    message = checked_model(_Message, content, path)
+    try:
+        return Part(path, links=tuple(_link(stamped) for stamped in message.transforms))
+    except ValueError as error:
+        raise FileError(path, str(error)) from error
+
+
+def _link(stamped: _Stamped) -> FrameLink:
+    t, q = stamped.transform.translation, stamped.transform.rotation
+    T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+    return FrameLink(stamped.header.frame_id, stamped.child_frame_id, T)

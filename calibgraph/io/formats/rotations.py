@@ -1,0 +1,49 @@
+"""Quaternions and roll, pitch, yaw, as files of others have them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.model.rig import ROUNDING
+
+Array = NDArray[np.float64]
+
+
+def quaternion_xyzw(T: Array) -> list[float]:
+    """[x, y, z, w] of the rotation of a (4, 4), w not negative."""
+    found = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return [float(value) for value in found]
+
+
+def roll_pitch_yaw(T: Array) -> list[float]:
+    """[roll, pitch, yaw] [rad] about fixed x, y, z: R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
+    return [float(value) for value in gtsam.Rot3(T[:3, :3]).rpy()]
+
+
+def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
+    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits.
+
+    Raises:
+        ValueError: if the quaternion has another length.
+    """
+    length = float(np.linalg.norm(xyzw))
+    if not abs(length - 1.0) <= ROUNDING:
+        raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
+    return _pose(xyz_m, Rotation.from_quat(xyzw).as_matrix())
+
+
+def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
+    """(4, 4) of a translation and roll, pitch, yaw about fixed axes."""
+    roll, pitch, yaw = rpy_rad
+    return _pose(xyz_m, gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix())
+
+
+def _pose(xyz_m: Sequence[float], R: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, xyz_m
+    return T

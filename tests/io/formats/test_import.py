@@ -1,0 +1,327 @@
+"""Files of other programs, written by hand or by their libraries, become a rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibgraph import (
+    Calibration,
+    CalibrationError,
+    Rig,
+    describe_rig,
+    export_calibration,
+    import_rig,
+    load_rig,
+)
+from tests.conftest import KANNALA, RADTAN5, RADTAN8, make_camera, stereo_relative_pose
+from tests.io.formats.conftest import rig_for, varied_rig
+from tests.io.test_kitti import written_kitti
+
+# A camera that looks along the LiDAR's x axis, 0.4 m ahead, 0.1 m left, 0.2 m below:
+# x = -left, y = -up, z = ahead of the point, less the same of the camera.
+FRONT = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.4], [0, 0, 0, 1.0]])
+SENTENCE = "front looks along LiDAR +x, sits 0.40 m ahead, 0.10 m left and 0.20 m below the LiDAR"
+
+CAMERA_INFO = """\
+image_width: 1920
+image_height: 1200
+camera_name: front
+camera_matrix: {rows: 3, cols: 3, data: [1000.5, 0, 960.25, 0, 1001.5, 600.75, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.02, 0.001, -0.002, 0.003]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+projection_matrix: {rows: 3, cols: 4, data: [900, 0, 960, 0, 0, 900, 600, 0, 0, 0, 1, 0]}
+"""
+KALIBR = """\
+cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [460.5, 461.5, 370.25, 240.75]
+  resolution: [752, 480]
+  rostopic: /stereo/left/image_raw
+  T_cam_lidar: [[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.4], [0, 0, 0, 1]]
+cam1:
+  camera_model: pinhole
+  T_cn_cnm1: [[1, 0, 0, -0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  distortion_coeffs: [0.01, -0.02, 0.003, -0.0004]
+  distortion_model: equidistant
+  intrinsics: [450, 451, 371, 241]
+  resolution: [752, 480]
+  rostopic: /stereo/right/image_raw
+"""
+URDF = """\
+<?xml version="1.0"?>
+<robot name="car">
+  <link name="base_link"/><link name="velodyne"/><link name="front_link"/>
+  <joint name="a" type="fixed">
+    <origin xyz="1.0 0.0 2.0" rpy="0 0 0"/><parent link="base_link"/><child link="velodyne"/>
+  </joint>
+  <joint name="b" type="fixed">
+    <origin xyz="1.4 0.1 1.8"/><parent link="base_link"/><child link="front_link"/>
+  </joint>
+  <joint name="c" type="fixed">
+    <origin rpy="-1.5707963267948966 0 -1.5707963267948966"/>
+    <parent link="front_link"/><child link="front_camera_optical_frame"/>
+  </joint>
+</robot>
+"""
+SENSOR_KIT = """\
+sensor_kit_base_link:
+  front/camera_link: {x: 0.4, y: 0.1, z: 0.6, roll: 0.0, pitch: 0.0, yaw: 0.0}
+  velodyne_top_base_link: {x: 0.0, y: 0.0, z: 0.8, roll: 0.0, pitch: 0.0, yaw: 0.0}
+  gnss_link: {x: -0.1, y: 0.0, z: 0.0, roll: 0.0, pitch: 0.0, yaw: 0.0}
+"""
+TF2 = """\
+transforms:
+- header: {frame_id: base_link}
+  child_frame_id: os_sensor
+  transform: {translation: {x: 1, y: 0, z: 2}, rotation: {x: 0, y: 0, z: 0, w: 1}}
+- header: {frame_id: base_link}
+  child_frame_id: front_optical_frame
+  transform: {translation: {x: 1.4, y: 0.1, z: 1.8}, rotation: {x: -0.5, y: 0.5, z: -0.5, w: 0.5}}
+"""
+KOIDE = {
+    "camera": {
+        "camera_model": "plumb_bob",
+        "intrinsics": [810.5, 811.5, 822.25, 622.75],
+        "distortion_coeffs": [-0.04, 0.08, 0.0001, -0.0002, -0.03],
+    },
+    "results": {
+        "T_lidar_camera": [0.4, 0.1, -0.2, -0.5, 0.5, -0.5, 0.5],
+        "init_T_lidar_camera": [9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0],
+    },
+}
+
+
+def write(folder: Path, **files: str) -> list[Path]:
+    """Files by name, with __ for the dot."""
+    paths = [folder / name.replace("__", ".") for name in files]
+    for path, text in zip(paths, files.values(), strict=True):
+        path.write_text(text)
+    return paths
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [{"car__urdf": URDF}, {"sensor_kit_calibration__yaml": SENSOR_KIT}, {"tf_static__yaml": TF2}],
+)
+def test_camera_info_and_frames_make_a_rig(frames: dict[str, str], tmp_path: Path) -> None:
+    rig = import_rig(write(tmp_path, info__yaml=CAMERA_INFO, **frames))
+    camera = rig.cameras["front"]
+    np.testing.assert_allclose(camera.T_camera_lidar, FRONT, atol=1e-12)
+    assert (camera.model, camera.width_px, camera.height_px) == ("pinhole", 1920, 1200)
+    assert tuple(camera.intrinsics_px.model_dump().values()) == (1000.5, 1001.5, 960.25, 600.75)
+    assert camera.distortion == (-0.1, 0.02, 0.001, -0.002, 0.003)
+    assert describe_rig(rig) == [SENTENCE]
+
+
+def test_a_camera_link_and_its_optical_frame_are_the_same_camera(tmp_path: Path) -> None:
+    files = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF)
+    for frame in ("front_link", "front_camera_optical_frame"):
+        rig = import_rig(files, camera_frames={"front": frame})
+        np.testing.assert_allclose(rig.T_camera_lidar["front"], FRONT, atol=1e-12)
+
+
+def test_names_of_cameras_can_be_folders(tmp_path: Path) -> None:
+    """ROS names cameras by namespaces, and files are often copies with the same name inside."""
+    info = CAMERA_INFO.replace("camera_name: front", "camera_name: stereo/left")
+    one, two, kit = write(tmp_path, one__yaml=info, two__yaml=info, kit__yaml=SENSOR_KIT)
+    frames = {"stereo_left": "front/camera_link", "right": "front/camera_link"}
+    rig = import_rig([one, two, kit], names={two: "right"}, camera_frames=frames)
+    assert list(rig.cameras) == ["stereo_left", "right"]
+
+
+def test_a_camchain_gives_lenses_a_guess_and_relative_poses(tmp_path: Path) -> None:
+    rig = import_rig(write(tmp_path, camchain__yaml=KALIBR), relative_sigma_deg=0.2)
+    left, right = rig.cameras.values()
+    assert list(rig.cameras) == ["cam0", "cam1"]
+    assert (left.model, left.distortion) == ("pinhole", (-0.1, 0.02, 0.001, -0.002))
+    assert (right.model, right.distortion) == ("fisheye", (0.01, -0.02, 0.003, -0.0004))
+    np.testing.assert_allclose(left.T_camera_lidar, FRONT, atol=1e-12)
+    # p_right = T_cn_cnm1 p_left: 0.11 m less to the right, so the right camera is at +0.11.
+    moved = FRONT.copy()
+    moved[0, 3] -= 0.11
+    np.testing.assert_allclose(right.T_camera_lidar, moved, atol=1e-12)
+    (pair,) = rig.relative_poses
+    assert (pair.a, pair.b) == ("cam1", "cam0")
+    assert pair.T_a_b[0, 3] == -0.11
+    assert pair.rotation_sigma_rad == pytest.approx(np.radians(0.2))
+    assert pair.translation_sigma_m == pytest.approx(0.005)
+    assert describe_rig(rig)[1:] == [
+        "cam1 looks along LiDAR +x, sits 0.40 m ahead, 0.01 m right and 0.20 m below the LiDAR",
+        "cam0 sits 0.11 m left of cam1, in the axes of cam1, turned by 0.0 deg against it "
+        "(1 sigma: 0.2 deg, 0.5 cm)",
+    ]
+
+
+@pytest.mark.parametrize("way", ["T_lidar_camera", "init_T_lidar_camera"])
+def test_koide3_gives_lens_and_result_or_guess(way: str, tmp_path: Path) -> None:
+    content = {**KOIDE, "results": {way: KOIDE["results"]["T_lidar_camera"]}}
+    (tmp_path / "calib.json").write_text(json.dumps(content))
+    rig = import_rig(
+        [tmp_path / "calib.json"], names={tmp_path / "calib.json": "front"}, size_px=(1646, 1240)
+    )
+    np.testing.assert_allclose(rig.T_camera_lidar["front"], FRONT, atol=1e-12)
+    assert rig.cameras["front"].distortion == (-0.04, 0.08, 0.0001, -0.0002, -0.03)
+    assert describe_rig(rig) == [SENTENCE]
+
+
+def test_the_result_of_koide3_comes_before_its_guess(tmp_path: Path) -> None:
+    (tmp_path / "calib.json").write_text(json.dumps(KOIDE))
+    rig = import_rig([tmp_path / "calib.json"], size_px=(1646, 1240))
+    np.testing.assert_allclose(rig.T_camera_lidar["calib"], FRONT, atol=1e-12)
+
+
+@pytest.mark.parametrize("first_line", ["%YAML:1.0\n", "%YAML 1.2\n", ""])
+def test_opencv_files_of_any_version_are_read(first_line: str, tmp_path: Path) -> None:
+    path = tmp_path / "front.yml"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", 1240)
+    file.write("image_height", 376)
+    file.write("camera_matrix", make_camera().matrix_px)
+    file.write("distortion_coefficients", np.array(RADTAN5)[:, None])
+    file.release()
+    body = path.read_text().partition("\n")[2]
+    path.write_text(first_line + body)
+    (tmp_path / "kit.yaml").write_text(SENSOR_KIT)
+    camera = import_rig([path, tmp_path / "kit.yaml"]).cameras["front"]
+    assert camera.intrinsics_px == make_camera().intrinsics_px
+    assert camera.distortion == RADTAN5
+
+
+def test_colmap_lenses_project_as_colmap_does(tmp_path: Path) -> None:
+    """COLMAP's pixel (0.5, 0.5) is the centre of the first one."""
+    lines = [
+        "# Camera list",
+        "1 PINHOLE 1240 376 718 710 607 185",
+        "2 OPENCV 1240 376 718 710 607 185 -0.11 0.05 0.001 -0.002",
+        "3 FULL_OPENCV 1240 376 718 710 607 185 " + " ".join(map(str, RADTAN8)),
+        "4 OPENCV_FISHEYE 1240 376 718 710 607 185 " + " ".join(map(str, KANNALA)),
+        "5 SIMPLE_RADIAL 1240 376 718 607 185 -0.11",
+        "6 RADIAL_FISHEYE 1240 376 718 607 185 0.02 -0.004",
+    ]
+    tree = "".join(
+        f"  camera_{k}/camera_link: {{x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}\n"
+        for k in range(1, 7)
+    )
+    kit = f"kit:\n{tree}  lidar: {{x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}\n"
+    rig = import_rig(write(tmp_path, cameras__txt="\n".join(lines), kit__yaml=kit))
+    rows = {"1": (), "2": (-0.11, 0.05, 0.001, -0.002), "3": RADTAN8, "5": (-0.11, 0, 0, 0)}
+    point = np.array([[1.0, 0.5, 10.0]])
+    for key, coefficients in rows.items():
+        K = np.array([[718, 0, 607], [0, 718 if key == "5" else 710, 185], [0, 0, 1.0]])
+        theirs, _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array(coefficients))
+        ours, _ = rig.cameras[f"camera_{key}"].lens.project(point)
+        np.testing.assert_allclose(ours + 0.5, theirs.reshape(1, 2), atol=1e-9)
+    for key, fy, coefficients in (("4", 710.0, KANNALA), ("6", 718.0, (0.02, -0.004, 0, 0))):
+        K = np.array([[718, 0, 607], [0, fy, 185], [0, 0, 1.0]])
+        zero = np.zeros((3, 1))
+        theirs, _ = cv2.fisheye.projectPoints(
+            point[None], zero, zero, K, np.array(coefficients, dtype=float)
+        )
+        ours, _ = rig.cameras[f"camera_{key}"].lens.project(point)
+        np.testing.assert_allclose(ours + 0.5, theirs.reshape(1, 2), atol=1e-9)
+
+
+@pytest.mark.parametrize("format", ["kalibr", "tf2", "urdf", "autoware", "opencv", "koide"])
+def test_what_was_exported_is_imported_again(format: str, tmp_path: Path) -> None:
+    rig = rig_for(format)
+    suffix = {"urdf": "urdf", "koide": "json"}.get(format, "yaml")
+    path = tmp_path / f"file.{suffix}"
+    export_calibration(rig, path, format)
+    files = [path]
+    if format in ("tf2", "urdf", "autoware"):  # frames alone: with the lenses of a rig
+        export_calibration(rig, tmp_path / "lenses.yaml", "opencv")
+        text = (tmp_path / "lenses.yaml").read_text().replace("T_camera_lidar:", "other:")
+        (tmp_path / "lenses.yaml").write_text(text)
+        files.append(tmp_path / "lenses.yaml")
+    again = import_rig(files, size_px=(1240, 376))
+    assert not again.relative_poses  # what was computed from T_camera_lidar is no measurement
+    assert list(again.cameras) == list(rig.cameras)
+    for name, camera in rig.cameras.items():
+        np.testing.assert_allclose(
+            again.T_camera_lidar[name], camera.T_camera_lidar, atol=1e-9, rtol=0
+        )
+        assert again.cameras[name].intrinsics_px == camera.intrinsics_px
+        assert again.cameras[name].width_px == camera.width_px
+
+
+def test_distorted_lenses_survive_the_way_there_and_back(mixed_rig: Rig, tmp_path: Path) -> None:
+    export_calibration(mixed_rig, tmp_path / "rig.yml", "opencv")
+    again = import_rig([tmp_path / "rig.yml"])
+    for name, camera in mixed_rig.cameras.items():
+        assert again.cameras[name].model_dump(exclude={"T_camera_lidar"}) == camera.model_dump(
+            exclude={"T_camera_lidar"}
+        )
+
+
+def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
+    chain = KALIBR.replace("T_cam_lidar", "T_cam_imu")
+    files = write(tmp_path, chain__yaml=chain, car__urdf=URDF)
+    rig = import_rig(files, camera_frames={"cam0": "front_link"})
+    expected = import_rig(write(tmp_path, whole__yaml=KALIBR))
+    for name, T in expected.T_camera_lidar.items():
+        np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-12)
+
+
+def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
+    folder = written_kitti(tmp_path / "00", frames=1)
+    for path in (folder, folder / "calib.txt"):
+        rig = import_rig([path])
+        expected = load_rig(folder)
+        assert list(rig.cameras) == ["image_2", "image_3"]
+        for name, T in expected.T_camera_lidar.items():
+            np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-15)
+
+
+def test_results_and_rig_files_are_imported_with_their_relative_poses(
+    solved: Calibration, tmp_path: Path
+) -> None:
+    solved.save(tmp_path / "result")
+    rig = import_rig([tmp_path / "result" / "calibration.yaml"])
+    np.testing.assert_allclose(rig.T_camera_lidar["left"], solved.T_camera_lidar["left"])
+    tied = Rig(cameras=rig.cameras, relative_poses=(stereo_relative_pose(rig),))
+    tied.save(tmp_path / "rig.yaml")
+    (pair,) = import_rig([tmp_path / "rig.yaml"]).relative_poses
+    assert (pair.rotation_sigma_rad, pair.translation_sigma_m) == (1e-3, 2e-3)
+    np.testing.assert_allclose(pair.T_a_b, tied.relative_poses[0].T_a_b, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("side", "side looks along LiDAR +y, 10 deg to the right, sits 0.40 m left and 0.10 m"),
+        ("portrait", "portrait looks along LiDAR +x, its image turned by 90 deg, sits 0.40 m"),
+    ],
+)
+def test_sentences_are_what_the_rig_was_made_of(name: str, said: str) -> None:
+    (sentence,) = (text for text in describe_rig(varied_rig()) if text.startswith(name))
+    assert sentence.startswith(said)
+
+
+def test_up_and_down_and_the_axis_z_are_in_the_sentences() -> None:
+    camera = make_camera()
+    for degrees in (20, 50):
+        angle = np.radians(degrees)
+        pitched = np.eye(4)
+        pitched[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        # p' = Rx(angle) p: a point on the old axis appears above, so the camera looks down.
+        down = Rig(cameras={"a": camera.moved_to(pitched @ camera.T_camera_lidar)})
+        said = f"a looks along LiDAR +x, {degrees} deg down, sits at the LiDAR"
+        assert describe_rig(down) == [said]
+    floor = Rig(cameras={"a": camera.moved_to(np.diag([1.0, -1, -1, 1]))})
+    assert describe_rig(floor) == ["a looks along LiDAR -z, sits at the LiDAR"]
+
+
+def test_two_files_that_differ_are_refused(tmp_path: Path) -> None:
+    other = CAMERA_INFO.replace("1000.5", "1200.5")
+    files = write(tmp_path, a__yaml=CAMERA_INFO, b__yaml=other, kit__yaml=SENSOR_KIT)
+    with pytest.raises(CalibrationError, match="another lens of camera 'front'"):
+        import_rig(files)
