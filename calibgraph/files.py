@@ -259,6 +259,16 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
 
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Copy the values of merge keys (``<<``) into a mapping, and count them all."""
+        super().flatten_mapping(node)
+        self._flattened = getattr(self, "_flattened", 0) + len(node.value)
+        if self._flattened > MAX_YAML_VALUES:
+            raise yaml.MarkedYAMLError(
+                problem=f"merge keys (<<) stand for over {MAX_YAML_VALUES} values",
+                problem_mark=node.start_mark,
+            )
+
 
 # OpenCV's matrices: mappings with the keys rows, cols, dt and data.
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)

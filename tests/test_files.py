@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from calibgraph import (
     Rig,
     load_rig,
 )
+from calibgraph.files import read_yaml
 from tests.model.test_rig import written
 
 
@@ -56,6 +58,33 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
     path.write_text("\n".join([*lines, "cameras: {a: {T_camera_lidar: *a11}}"]))
     with pytest.raises(FileError, match="aliases stand for over"):
         load_rig(path)
+
+
+def merge_bombs() -> dict[str, str]:
+    """YAML files whose merge keys multiply: by aliases of aliases, or of one large mapping."""
+    doubled = [f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 26)]
+    large = "a0: &a0 {" + ", ".join(f"k{k}: {k}" for k in range(3000)) + "}"
+    return {
+        "of aliases": "\n".join(["a0: &a0 {x: 1}", *doubled]),
+        "of a large mapping": "\n".join([large, "all:", *["- {<<: *a0}"] * 1000]),
+    }
+
+
+@pytest.mark.parametrize("kind", merge_bombs())
+def test_a_merge_key_bomb_is_refused_at_once(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(merge_bombs()[kind])
+    begin = time.process_time()
+    with pytest.raises(FileError, match="merge keys .* stand for over") as caught:
+        load_rig(path)
+    assert time.process_time() - begin < 10  # written out it takes over a minute
+    assert "\n" not in str(caught.value)
+
+
+def test_merge_keys_of_a_rig_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "some.yaml"
+    path.write_text("a: &a {x: 1, y: 2}\nb: &b {<<: *a, x: 5}\nc: {<<: [*b, *a], z: 1}\n")
+    assert read_yaml(path)["c"] == {"x": 5, "y": 2, "z": 1}
 
 
 def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:

@@ -87,6 +87,11 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         _print_error("interrupted")
         sys.exit(_INTERRUPTED)
+    except Exception as error:  # not the exit code 1 of Python: that is a FAIL
+        if "--debug" in sys.argv:
+            raise
+        _print_error(_crash(error))
+        sys.exit(2)
     finally:
         _flush(sys.stdout)
 
@@ -150,6 +155,16 @@ def _one_line(error: Exception) -> str:
         return f"{error.filename}: {error.strerror}"
     text = error.format_message() if hasattr(error, "format_message") else str(error)
     return " ".join(text.split()).removesuffix(".") + _help_hint(error)
+
+
+def _crash(error: Exception) -> str:
+    """An error that no one foresaw, in one line."""
+    from calibgraph.errors import CalibrationError
+
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error}); give fewer frames, or smaller files"
+    kind = f"{type(error).__name__}: {CalibrationError(str(error))}"
+    return f"internal error ({kind}); please report it with the output of calibgraph --debug"
 
 
 def _help_hint(error: Exception) -> str:

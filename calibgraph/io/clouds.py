@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import struct
+import tokenize
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,12 @@ from calibgraph.files import require_file
 
 CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
 MAX_CLOUD_BYTES = 2 * 2**30
+
+_UNREADABLE = (
+    ValueError, TypeError, OSError, EOFError, MemoryError, OverflowError, RecursionError,
+    SyntaxError, tokenize.TokenError,
+)  # fmt: skip
+"""Of numpy, which takes the header of a file as Python, and memory for all that it claims."""
 
 _XYZ, _XYZI = 3, 4
 _MOST_COLUMNS = 64
@@ -59,9 +67,9 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
 def _read_npy(path: Path) -> NDArray[np.float32]:
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except _UNREADABLE as error:
         raise FileError(
-            path, f"cannot be read as a .npy array ({error}); is it complete?"
+            path, f"cannot be read as a .npy array ({error!r}); is it complete?"
         ) from None
     if not isinstance(array, np.ndarray):
         raise FileError(path, "is an archive of arrays, expected one array; write it with np.save")
@@ -160,12 +168,27 @@ def _split_header(path: Path, data: bytes) -> tuple[str, bytes]:
 def _pcd_rows(path: Path, header: str) -> tuple[int, int, int]:
     fields = {words[0]: words[1:] for words in map(str.split, header.splitlines()) if words}
     try:
-        count = int(fields["POINTS"][0])
+        count, names = int(fields["POINTS"][0]), fields["FIELDS"]
         sizes = np.array(fields["SIZE"], dtype=int)
         repeats = np.array(fields.get("COUNT", ["1"] * len(sizes)), dtype=int)
-        return count, int(sizes @ repeats), int(repeats.sum())
-    except (KeyError, IndexError, ValueError) as error:
+        row_bytes = int(sizes @ repeats)
+    except (KeyError, IndexError, ValueError, OverflowError) as error:
         raise FileError(path, f"has a malformed PCD header ({error})") from error
+    plain = [n for n, repeat in zip(names, repeats, strict=False) if repeat == 1]
+    if not len(names) == len(sizes) or min(repeats) < 1 or not set(sizes) <= _PCD_BYTES:
+        raise FileError(path, "has a malformed PCD header: FIELDS, SIZE and COUNT do not fit")
+    _require_coordinates(path, plain)
+    return count, row_bytes, int(repeats.sum())
+
+
+_PCD_BYTES = {1, 2, 4, 8}
+
+
+def _require_coordinates(path: Path, names: Sequence[str]) -> None:
+    """Check the fields: Open3D takes uninitialized memory for a coordinate that is missing."""
+    for axis in "xyz":
+        if names.count(axis) != 1:
+            raise FileError(path, f"has the fields {' '.join(names)}, expected one {axis}")
 
 
 _PLY_BYTES = {
@@ -177,7 +200,8 @@ _PLY_BYTES = {
 
 def _ply_rows(path: Path, header: str) -> tuple[int, int, int]:
     vertex = re.search(r"element vertex (\d+)\s*\n((?:(?:property|comment)[^\n]*\n)*)", header)
-    kinds = re.findall(r"property (\w+) \w+", vertex[2]) if vertex else []
-    if vertex is None or not kinds or any(kind not in _PLY_BYTES for kind in kinds):
+    found = re.findall(r"property (\w+) (\w+)", vertex[2]) if vertex else []
+    if vertex is None or not found or any(kind not in _PLY_BYTES for kind, _ in found):
         raise FileError(path, "has no plain list of vertices in its PLY header")
-    return int(vertex[1]), sum(_PLY_BYTES[kind] for kind in kinds), len(kinds)
+    _require_coordinates(path, [name for _, name in found])
+    return int(vertex[1]), sum(_PLY_BYTES[kind] for kind, _ in found), len(found)

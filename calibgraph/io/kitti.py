@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
+from calibgraph.io.images import image_size
 from calibgraph.model.rig import Camera, Rig
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"
+
+_ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 
 
 def camera_folders(sequence: Path) -> dict[str, Path]:
@@ -59,8 +61,15 @@ def _camera(
         if needed not in matrices:
             raise FileError(path, f"line {needed!r} is missing")
     P, K = matrices[key], matrices[key][:, :3]
-    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] > 0):
+    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0):
         raise FileError(path, f"{key} is no projection matrix of a camera: {P.tolist()}")
+    plain = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+    if not np.allclose(K, plain, rtol=0, atol=_ROUNDED):
+        raise FileError(
+            path,
+            f"{key} begins with {K.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; undo its scale, "
+            "and undistort the skew",
+        )
     shift = np.eye(4)
     shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
     lidar_to_rectified = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
@@ -80,6 +89,8 @@ def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
         name, _, values = line.partition(":")
         if not values.strip():
             continue
+        if name.strip() in matrices:
+            raise FileError(path, f"line {number}: {name.strip()} is given twice; keep one")
         try:
             matrices[name.strip()] = np.array(values.split(), dtype=np.float64).reshape(3, 4)
         except ValueError as error:
@@ -91,7 +102,4 @@ def _image_size(folder: Path) -> tuple[int, int]:
     images = sorted(folder.glob("*.png"))
     if not images:
         raise FileError(folder, "holds no .png image")
-    image = cv2.imread(str(images[0]), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise FileError(images[0], "cannot be decoded as an image; is it complete?")
-    return image.shape[1], image.shape[0]
+    return image_size(images[0])

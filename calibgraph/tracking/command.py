@@ -22,7 +22,7 @@ from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, ma
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.preload import warm_up_tracker
-from calibgraph.tracking.run import Notify, follow
+from calibgraph.tracking.run import Notify, RunCounts, follow
 from calibgraph.tracking.streams import Item, frames_of
 
 STATE_FOLDER, PICTURE = "state", "track.png"
@@ -86,10 +86,17 @@ def track(
                 held = f"held no frame that could be used ({counts.refused} left out); check it"
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
             result = calibrator.tracker.calibration()
+    _report_counts(counts, calibrator.tracker.frame, notify)
+    return result, _write_results(settings.out, result, history if counts.updates else None)
+
+
+def _report_counts(counts: RunCounts, last: int | None, notify: Notify) -> None:
     notify(
         f"{counts.updates} updates, {counts.refused} left out, {counts.skipped} known from before"
     )
-    return result, _write_results(settings.out, result, history if counts.updates else None)
+    if counts.skipped and not counts.updates:
+        found = f"no frame comes after {last}"
+        notify(f"warning: {found}; if that number is wrong, choose another --out")
 
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:

@@ -10,6 +10,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.tracking.state import State
 
+_LAST = 2**63 - 1  # other programs write it for "none"
 _FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
 
 
@@ -44,6 +45,13 @@ def number_and_stamp(
 
 
 def _require_after(state: State, number: int, stamp: int | None) -> None:
+    for what, value in (("number", number), ("stamp_ns", stamp)):
+        if value == _LAST:
+            raise CorrespondenceError(
+                f"frame {number}: its {what} {value} is the largest there is, and no frame could "
+                "follow; correct it: it is left out",
+                frame=number,
+            )
     last, last_stamp = state.frame, state.stamp_ns
     if last is not None and number <= last:
         what = "comes again" if number == last else f"comes after frame {last}"

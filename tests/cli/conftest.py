@@ -31,4 +31,5 @@ def error_line(code: int, out: str, err: str) -> str:
     assert out == ""
     assert err.count("\n") == 1, err
     assert err.startswith("calibgraph: ")
+    assert "internal error" not in err
     return err

@@ -125,6 +125,25 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None
     assert (code, out, err) == (130, "", "calibgraph: interrupted\n")
 
 
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (TypeError("in\nlines"), "internal error (TypeError: in lines); please report"),
+        (MemoryError("1 TiB"), "not enough memory (1 TiB)"),
+    ],
+)
+def test_a_crash_is_one_line_and_no_fail(
+    error: Exception, message: str, monkeypatch: pytest.MonkeyPatch, call: Call
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("calibgraph.io.rigs.load_rig", fail)
+    code, out, err = call("evaluate", SAMPLE, SAMPLE)
+    assert (code, out) == (2, "")
+    assert message in err and err.count("\n") == 1
+
+
 def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     missing = str(tmp_path / "nothing.yaml")
     monkeypatch.setattr(sys, "argv", ["calibgraph", "--debug", "evaluate", missing, missing])

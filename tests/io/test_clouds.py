@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,71 @@ def test_bad_clouds_are_named(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(FileError, match=r"point 7 is not finite"):
         load_cloud(tmp_path / "infinite.npy")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (100000000000, 4), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (-5, 4), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1" + "0" * 400 + ", 4), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': " + "-" * 9000 + "1, }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': " + "[" * 4000 + "]" * 4000 + ", }",
+        "{" * 9000,
+    ],
+)
+def test_a_hostile_npy_header_is_one_line(header: str, tmp_path: Path) -> None:
+    path = tmp_path / "cloud.npy"
+    written = header.encode() + b"\n"
+    start = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(written))
+    path.write_bytes(start + written + bytes(64))
+    with pytest.raises(FileError, match="cannot be read as a .npy array") as caught:
+        load_cloud(path)
+    assert "\n" not in str(caught.value)
+
+
+def pcd(fields: str, size: str = "4 4 4 4", count: str = "1 1 1 1") -> bytes:
+    header = f"""VERSION 0.7
+FIELDS {fields}
+SIZE {size}
+TYPE F F F F
+COUNT {count}
+WIDTH 500
+HEIGHT 1
+POINTS 500
+DATA binary
+"""
+    return header.encode() + CLOUD.tobytes()
+
+
+def ply(*properties: str) -> bytes:
+    lines = "".join(f"property float {name}\n" for name in properties)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 500\n{lines}end_header\n"
+    return header.encode() + CLOUD.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("no_x.ply", ply("a", "y", "z", "intensity"), "fields a y z intensity, expected one x"),
+        ("no_z.ply", ply("x", "y", "intensity"), "expected one z"),
+        ("two_x.ply", ply("x", "x", "y", "z"), "expected one x"),
+        ("no_y.pcd", pcd("x a z intensity"), "expected one y"),
+        ("negative.pcd", pcd("x y z intensity", count="1 1 1 -1"), "do not fit"),
+        ("negative_x.pcd", pcd("x y z intensity", count="-1 1 1 1"), "do not fit"),
+        ("wide_x.pcd", pcd("x y z intensity", count="2 1 1 1"), "expected one x"),
+        ("sizes.pcd", pcd("x y z intensity", size="4 4 4"), "malformed"),
+        ("odd.pcd", pcd("x y z intensity", size="4 4 3 5"), "do not fit"),
+    ],
+)
+def test_fields_that_open3d_would_make_up_are_refused(
+    name: str, data: bytes, message: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("open3d", reason="open3d is missing", exc_type=ImportError)
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(FileError, match=message):
+        load_cloud(path)
 
 
 @pytest.mark.parametrize("ascii_format", [True, False])

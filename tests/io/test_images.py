@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -30,6 +32,71 @@ def test_truncated_and_wrong_images_are_named(tmp_path: Path) -> None:
     cv2.imwrite(str(png), image[:, :-2])
     with pytest.raises(FileError, match=r"is 638x360 px, the rig says 640x360 px"):
         load_image(png, camera)
+
+
+def png(width_px: int, height_px: int, pixels: bytes) -> bytes:
+    """A PNG with this header, whatever its pixels are."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        checked = kind + data
+        return struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+
+    header = struct.pack(">IIBBBBB", width_px, height_px, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(pixels)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+@pytest.mark.parametrize("side_px", [28_000, 10**6, 2**31 - 1])
+def test_a_size_is_compared_before_memory_is_taken_for_it(side_px: int, tmp_path: Path) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png(side_px, side_px, bytes(1000)))
+    with pytest.raises(FileError, match=f"is {side_px}x{side_px} px, the rig says 1240x376 px"):
+        load_image(path, make_camera())
+
+
+def sample_jpeg() -> bytes:
+    return (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
+
+
+def damaged_images() -> dict[str, bytes]:
+    """Images whose first and last bytes are right."""
+    jpg, camera = sample_jpeg(), load_rig(SAMPLE).cameras["left"]
+    middle = len(jpg) // 2
+    image = cv2.imencode(".png", cv2.imdecode(np.frombuffer(jpg, np.uint8), cv2.IMREAD_COLOR))[1]
+    flipped = bytearray(image.tobytes())
+    flipped[len(flipped) // 2] ^= 255
+    return {
+        "half.jpg": jpg[:middle] + b"\xff\xd9",
+        "gap.jpg": jpg[:middle] + jpg[middle + 500 :],
+        "flipped.png": bytes(flipped),
+        "short.png": png(camera.width_px, camera.height_px, bytes(1000)),
+    }
+
+
+@pytest.mark.parametrize("name", damaged_images())
+def test_a_damaged_image_is_not_filled_up(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(damaged_images()[name])
+    with pytest.raises(FileError, match=f"{name}: is damaged"):
+        load_image(path, load_rig(SAMPLE).cameras["left"])
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_an_image_that_programs_turn_differently_is_refused(
+    orientation: int, tmp_path: Path
+) -> None:
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack(
+        "<HHIHHI", 0x0112, 3, 1, orientation, 0, 0
+    )
+    jpg, path = sample_jpeg(), tmp_path / "turned.jpg"
+    marker = b"\xff\xe1" + struct.pack(">H", len(exif) + 2)
+    path.write_bytes(jpg[:2] + marker + exif + jpg[2:])
+    camera = load_rig(SAMPLE).cameras["left"]
+    if orientation == 1:
+        assert load_image(path, camera).any()
+    else:
+        with pytest.raises(FileError, match=f"has the EXIF orientation {orientation}"):
+            load_image(path, camera)
 
 
 def test_an_image_that_16_bits_make_black_is_named(tmp_path: Path) -> None:

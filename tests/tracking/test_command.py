@@ -117,6 +117,21 @@ def test_frame_numbers_may_be_any_of_64_bits(
     assert json.loads(out.splitlines()[-1])["stamp_ns"] == 10**18 + FRAMES - 1
 
 
+@pytest.mark.parametrize("key", ["frame", "stamp_ns"])
+def test_a_number_that_nothing_can_follow_is_left_out(
+    key: str, world: World, piped: Callable[..., Any], tmp_path: Path
+) -> None:
+    contents = [content_of(table) for table in world.tables]
+    for place, content in enumerate(contents):
+        content["stamp_ns"] = 10**18 + place
+    wrong = {**contents[6], key: 2**63 - 1}
+    given = [json.dumps(c).encode() + b"\n" for c in (*contents[:6], wrong, *contents[6:])]
+    code, out, err = piped(world.rig, b"".join(given), "--out", tmp_path / "out")
+    assert code == 0
+    assert frames_in(out) == [content["frame"] for content in contents]
+    assert f"its {'number' if key == 'frame' else key} {2**63 - 1} is the largest" in err
+
+
 @pytest.mark.parametrize("kind", ["one", "fisheye", "mixed", "tied"])
 def test_any_rig_continues_with_the_same_lines(
     kind: str, mixed_rig: Rig, call: Call, tmp_path: Path
