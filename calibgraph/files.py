@@ -57,7 +57,7 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
         FileError: if it is a folder, if a folder above it is a file or not writable, or if it ends
             in none of the suffixes.
     """
-    if suffixes and path.suffix.lower() not in suffixes:
+    if suffixes and path.suffix not in suffixes:
         raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise FileError(path, "is a folder, expected the name of a file to write")
@@ -199,9 +199,16 @@ def _expanded_size(value: Any, sizes: dict[int, int]) -> int:
     return sizes[id(value)]
 
 
-def write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line."""
-    write_text(path, yaml_text(content))
+def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:
+    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line.
+
+    Args:
+        path: of the file.
+        content: the mapping.
+        first_line: a comment above it.
+    """
+    text = yaml_text(content)
+    write_text(path, f"{first_line}\n{text}" if first_line else text)
 
 
 def yaml_text(content: dict[str, Any]) -> str:

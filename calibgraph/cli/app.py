@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from calibgraph.cli.benchmark import bench, tune
+from calibgraph.cli import outputs
+from calibgraph.cli.benchmark import bench, paper, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
+
+if TYPE_CHECKING:
+    from calibgraph.outputs import Output
 
 _INTERRUPTED = 130
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
@@ -59,11 +63,26 @@ def _options(
     """Options before the command; ``--debug`` is read by :func:`main`."""
 
 
-for _command in (
-    calibrate, match, solve, report, evaluate, perturb, export, import_, simulate, weights, train,
-    tune, track,
-):  # fmt: skip
-    app.command(_command.__name__.rstrip("_"))(_command)
+COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
+    calibrate: outputs.result,
+    match: outputs.table,
+    solve: outputs.result,
+    report: outputs.page,
+    evaluate: outputs.nothing,
+    perturb: outputs.guess,
+    export: outputs.exported,
+    import_: outputs.imported,
+    simulate: outputs.nothing,
+    weights: outputs.weights,
+    train: outputs.training,
+    tune: outputs.settings,
+    track: outputs.result,
+}
+"""Every command, and the files that it writes."""
+
+for _command, _outputs in COMMANDS.items():
+    app.command(_command.__name__.rstrip("_"))(outputs.keep_files(_command, _outputs))
+bench.command()(outputs.keep_files(paper, outputs.benchmark))
 app.add_typer(bench, name="bench")
 
 

@@ -48,7 +48,6 @@ def _bench() -> None:
     """Keep ``paper`` a subcommand: typer would merge the only command into its group."""
 
 
-@bench.command()
 def paper(
     data: DataArgument,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the tables.")],
@@ -77,13 +76,10 @@ def paper(
     PnP and its aggregates, the paper's solver with its settings, each camera alone, ours, ours with
     a known relative pose, and ours with weights computed from the simulation's truth.
     """
-    from calibgraph.evaluation.output import require_replaceable_report, write_report
+    from calibgraph.evaluation.output import write_report
     from calibgraph.evaluation.paper import run_experiment
     from calibgraph.evaluation.sources import Displacement, source_from
-    from calibgraph.files import require_place_for_folder
 
-    require_place_for_folder(out)
-    require_replaceable_report(out)
     with checked_arguments(), progress_bar() as progress:
         source = source_from(data, Displacement(rotation_deg, translation_m))
         report = run_experiment(
@@ -181,11 +177,8 @@ def tune(
     share no frame. FILE.yaml is read by --config.
     """
     from calibgraph.evaluation.sources import Displacement, source_from
-    from calibgraph.evaluation.tune import Candidates, require_replaceable_settings, tune
-    from calibgraph.files import require_place_for_file
+    from calibgraph.evaluation.tune import Candidates, tune
 
-    require_place_for_file(out, ".yaml", ".yml")
-    require_replaceable_settings(out)
     with checked_arguments(), progress_bar() as progress:
         candidates = Candidates(
             _parse_numbers("--lambda", prior_weight),

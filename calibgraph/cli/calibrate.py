@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,10 +43,8 @@ def calibrate(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
-    from calibgraph.model.result_files import require_place_for_result
     from calibgraph.pipeline import calibrate
 
-    require_place_for_result(out, config, *matching.files_read(dataset))
     with checked_arguments():
         settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed)
@@ -75,22 +74,18 @@ def match(
     as_json: JsonOption = False,
 ) -> None:
     """Find correspondences and write them as a table; exit 1 if a camera was not found."""
-    from calibgraph.files import require_place_for_file
-    from calibgraph.model.result_files import require_replaceable_table
+    from calibgraph.model.result_files import MATCH, WRITTEN_KEY
     from calibgraph.rounds import match_in_rounds
 
-    require_place_for_file(out)
     with checked_arguments():
-        if out.suffix not in (".parquet", ".csv"):
-            raise ValueError(f"--out {out}: the table's name must end in .parquet or .csv")
-        require_replaceable_table(out, matching.files_read(dataset))
         chosen = matching.find_matcher(seed=seed)
     data = matching.load_dataset(dataset)
     with progress_bar() as progress:
         run = match_in_rounds(
             data, matcher=chosen, time_limit_s=matching.limit_s, progress=progress
         )
-    run.correspondences.save(out)
+    found = run.correspondences
+    replace(found, metadata={**found.metadata, WRITTEN_KEY: MATCH}).save(out)
     _print_frames_used(len(run.dataset.frames), data)
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
 
@@ -114,12 +109,11 @@ def solve(
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256
-    from calibgraph.io.rigs import find_rig_file, load_rig
-    from calibgraph.model.result_files import REPORT_FILE, require_place_for_result
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.pipeline import solve
     from calibgraph.report import write_report
 
-    require_place_for_result(out, find_rig_file(rig), correspondences, config)
     with checked_arguments():
         settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
     with progress_bar("solving"):

@@ -141,15 +141,11 @@ def import_(
     ] = 0.5,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
-    from calibgraph.files import require_place_for_file
     from calibgraph.io.formats.rig_import import import_rig
     from calibgraph.io.formats.words import describe_rig
-    from calibgraph.io.rigs import require_replaceable_rig
+    from calibgraph.outputs import yaml_mark
 
-    require_place_for_file(out, ".yaml", ".yml")
     named = [_parse_name(text) for text in files]
-    for _, path in named:
-        require_replaceable_rig(out, read=path)
     with checked_arguments():
         rig = import_rig(
             [path for _, path in named],
@@ -161,7 +157,7 @@ def import_(
             relative_sigma_deg=relative_sigma_deg,
             relative_sigma_cm=relative_sigma_cm,
         )
-    rig.save(out)
+    rig.save(out, first_line=yaml_mark("import"))
     for sentence in describe_rig(rig):
         print_plain(terminal(), sentence)
     cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"

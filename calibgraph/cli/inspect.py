@@ -30,15 +30,11 @@ def report(
     ] = None,
 ) -> None:
     """Write a result as one HTML page that opens without a network."""
-    from calibgraph.files import require_place_for_file
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report import relocate_frames, require_replaceable_page, write_report
+    from calibgraph.report import relocate_frames, write_report
 
-    if out is not None:
-        require_place_for_file(out, ".html", ".htm")
-        require_replaceable_page(out)
     loaded = load_calibration(result)
     if dataset:
         loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
@@ -84,13 +80,11 @@ def perturb(
     ] = False,
 ) -> None:
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
-    from calibgraph.files import require_place_for_file
-    from calibgraph.io.rigs import load_rig, require_replaceable_rig, rig_file
+    from calibgraph.io.rigs import load_rig
     from calibgraph.model.perturbation import perturb
+    from calibgraph.outputs import yaml_mark
 
-    require_place_for_file(out, ".yaml", ".yml")
     given = load_rig(rig)
-    require_replaceable_rig(out, read=rig_file(rig))
     with checked_arguments():
         displaced = perturb(
             given,
@@ -99,5 +93,5 @@ def perturb(
             seed=seed,
             uniform=uniform,
         )
-    displaced.save(out)
+    displaced.save(out, first_line=yaml_mark("perturb"))
     print_plain(terminal(), f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")

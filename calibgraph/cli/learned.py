@@ -21,13 +21,7 @@ def weights(
 ) -> None:
     """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
     from calibgraph.matching.cmrnext import load_checkpoint
-    from calibgraph.model.result_files import require_not_read
 
-    with checked_arguments():
-        if out is not None and out.suffix != ".safetensors":
-            raise ValueError(f"--out {out}: the name must end in .safetensors")
-        if out is not None:
-            require_not_read(out, [file])
     checkpoint = load_checkpoint(file)
     if out is not None:
         checkpoint.save_safetensors(out)
@@ -112,7 +106,6 @@ def train(
     from calibgraph.cli.tables import print_validation
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
-    from calibgraph.matching.cmrnext.training.run import SETTINGS_SUFFIX
     from calibgraph.matching.cmrnext.training.scenes import load_trusted_dataset, split
     from calibgraph.matching.cmrnext.training.settings import load_settings
 
@@ -123,11 +116,6 @@ def train(
                 raise ValueError(
                     f"--{option}: --resume goes on with the settings in {out}; leave out"
                 )
-        if (
-            settings is not None
-            and settings.resolve() == out.with_suffix(SETTINGS_SUFFIX).resolve()
-        ):
-            raise ValueError(f"--settings {settings}: would be written over; choose another name")
         chosen = TrainSettings() if settings is None else load_settings(settings)
         chosen = chosen if seed is None else chosen.changed(seed=seed)
     trusted = load_rig(rig) if rig else None

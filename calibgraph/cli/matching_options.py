@@ -70,13 +70,6 @@ class MatchingOptions:
         """The chosen frames of these folders."""
         return dataset_from(folders, self.rig, self.frames)
 
-    def files_read(self, folders: list[Path]) -> list[Path]:
-        """The files that matching reads and a result might replace: rigs, a table, weights."""
-        from calibgraph.io.rigs import find_rig_file
-
-        rigs = [find_rig_file(path) for path in ([self.rig] if self.rig else folders)]
-        return [path for path in (*rigs, Path(self.matcher), *(self.weights or ())) if path]
-
 
 def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:
     """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``.

@@ -62,11 +62,9 @@ def track(
     the current update first.
     """
     from calibgraph.cli.tables import print_result
-    from calibgraph.io.rigs import find_rig_file, load_rig
-    from calibgraph.model.result_files import require_place_for_result
+    from calibgraph.io.rigs import load_rig
     from calibgraph.tracking.command import Tracking, track
 
-    require_place_for_result(out, *map(find_rig_file, (rig, *source)), config)
     with checked_arguments():
         settings = config_from(config, preset, seed)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.errors import FileError
 from calibgraph.evaluation.methods import HEADLINE
 from calibgraph.evaluation.paper import (
     IMPROVEMENT,
@@ -25,6 +24,7 @@ from calibgraph.evaluation.paper import (
 )
 from calibgraph.evaluation.published import AXES, PAIR, published
 from calibgraph.files import write_atomically, write_text
+from calibgraph.outputs import Output
 from calibgraph.report.as_json import finite
 
 if TYPE_CHECKING:
@@ -66,19 +66,13 @@ def write_report(report: Report, folder: Path) -> list[Path]:
     return written
 
 
-def require_replaceable_report(folder: Path) -> None:
-    """Check, before hours of work, that files of these names in a folder are of a report.
-
-    Raises:
-        FileError: if not: something else wrote them.
-    """
+def outputs_of_report(folder: Path) -> list[Output]:
+    """The files of a report in a folder; they are ours if the JSON there is a report's."""
     content: Any = {}
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, RecursionError):
         content = json.loads(_paths(folder)[1].read_text("utf-8"))
-    for path in _paths(folder):
-        if path.exists() and not (isinstance(content, dict) and "blocks" in content):
-            raise FileError(path, "is not of a benchmark and would be replaced; choose another "
-                            "--out")  # fmt: skip
+    of_report = isinstance(content, dict) and "blocks" in content
+    return [Output(path, "bench paper", lambda _: of_report) for path in _paths(folder)]
 
 
 def _paths(folder: Path) -> list[Path]:

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.errors import CorrespondenceError
 from calibgraph.evaluation.paper import draw_seed
 from calibgraph.evaluation.sources import Draw, Source
 from calibgraph.files import write_yaml
-from calibgraph.model.config import Config, load_config, preset
+from calibgraph.model.config import Config, preset
 from calibgraph.model.metrics import evaluate
+from calibgraph.outputs import yaml_mark
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.joint import solve_joint
 
@@ -100,23 +101,8 @@ class TuningResult:
 
     def save(self, path: Path) -> None:
         """Write the best candidate as a settings file for ``--config``."""
-        write_yaml(
-            path, {"preset": self.best.config.preset, **_searched_settings(self.best.config)}
-        )
-
-
-def require_replaceable_settings(path: Path) -> None:
-    """Check that a file to write settings into replaces nothing but settings.
-
-    Raises:
-        FileError: if it does.
-    """
-    try:
-        if path.exists():
-            load_config(path)
-    except FileError:
-        message = "is no file of settings, and would be replaced; choose another --out"
-        raise FileError(path, message) from None
+        settings = {"preset": self.best.config.preset, **_searched_settings(self.best.config)}
+        write_yaml(path, settings, first_line=yaml_mark("tune"))
 
 
 def _searched_settings(config: Config) -> dict[str, float]:

@@ -8,7 +8,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
-from calibgraph.model.result_files import CALIBRATION_FILE, require_not_read
+from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Rig
 
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
@@ -60,26 +60,3 @@ def find_rig_file(path: Path | str) -> Path | None:
         names = (RIG_FILE, CALIBRATION_FILE)
     paths = (folder / name for name in (*names, CALIBRATION_NAME))
     return next((path for path in paths if path.is_file()), None)
-
-
-def require_replaceable_rig(path: Path, *, read: Path) -> None:
-    """Check that a rig file to write replaces nothing but another guess.
-
-    Args:
-        path: of the file.
-        read: the rig file that the command reads.
-
-    Raises:
-        FileError: if it is the file that is read, a reference, or no rig file.
-    """
-    require_not_read(path, [read])
-    if path.exists() and (path.name == REFERENCE_FILE or not _is_rig_file(path)):
-        raise FileError(path, "is a reference or no rig file, and would be replaced; choose "
-                        "another --out")  # fmt: skip
-
-
-def _is_rig_file(path: Path) -> bool:
-    try:
-        return read_yaml(path).get("format") == RIG_FORMAT
-    except FileError:
-        return False

@@ -25,10 +25,11 @@ from calibgraph.model.result_files import (
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
     VERDICT_KEY,
-    require_replaceable,
+    outputs_of_calibration,
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Verdict, rig_verdict
+from calibgraph.outputs import require_free
 
 Array = NDArray[np.float64]
 
@@ -192,7 +193,7 @@ class Calibration:
             FileError: if a file of these names is there that is not of a result.
         """
         path = Path(folder) / CALIBRATION_FILE
-        require_replaceable(path.parent)
+        require_free(outputs_of_calibration(path.parent))
         hashes = {
             "correspondences_sha256": self._save_table(
                 self.correspondences, path.with_name(CORRESPONDENCES_FILE)

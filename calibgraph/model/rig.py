@@ -230,6 +230,6 @@ class Rig(_Model):
         }
         return self.model_copy(update={"cameras": cameras})
 
-    def save(self, path: Path | str) -> None:
-        """Write the rig file."""
-        write_yaml(Path(path), self.model_dump())
+    def save(self, path: Path | str, *, first_line: str = "") -> None:
+        """Write the rig file; the first line is a comment."""
+        write_yaml(Path(path), self.model_dump(), first_line=first_line)

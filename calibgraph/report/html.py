@@ -11,7 +11,6 @@ import yaml
 from jinja2 import Environment, StrictUndefined
 from numpy.typing import NDArray
 
-from calibgraph.errors import FileError
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.report.camera_section import camera_section
@@ -21,9 +20,6 @@ from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.reprojection_errors import errors_before_after
 
 Array = NDArray[np.float64]
-
-_GENERATOR = b'<meta name="generator" content="calibgraph">'
-_HEAD_BYTES = 1000
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
@@ -52,17 +48,6 @@ def write_report(result: Calibration, path: Path | str) -> Path:
     path = Path(path)
     write_text(path, report_html(result))
     return path
-
-
-def require_replaceable_page(path: Path) -> None:
-    """Check that a page to write replaces nothing but such a page.
-
-    Raises:
-        FileError: if it does.
-    """
-    if path.is_file() and _GENERATOR not in path.read_bytes()[:_HEAD_BYTES]:
-        message = "is not a report, and would be replaced; choose another --out"
-        raise FileError(path, message)
 
 
 def report_html(result: Calibration) -> str:

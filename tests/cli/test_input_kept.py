@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import shutil
 from pathlib import Path
 
 import pytest
 
-from calibgraph import load_calibration, load_correspondences, load_rig
+from calibgraph import (
+    load_calibration,
+    load_correspondences,
+    load_rig,
+    simulate_correspondences,
+)
+from calibgraph.cli import outputs
+from calibgraph.cli.app import COMMANDS
+from calibgraph.cli.benchmark import paper
+from calibgraph.cli.simulate import simulate
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
 
@@ -35,7 +45,7 @@ def test_a_table_that_is_only_beside_the_result_is_not_lost(simulated: Path, cal
     table = simulated / "correspondences.parquet"
     other = Path(shutil.copy(table, simulated / "other.parquet"))
     message = error_line(*call("solve", simulated, other, "--out", simulated))
-    assert "is not of an earlier result" in message
+    assert "was not written by calibgraph" in message
     assert table.read_bytes() == other.read_bytes()
 
 
@@ -54,32 +64,80 @@ def test_files_of_others_are_not_replaced(name: str, simulated: Path, call: Call
     (simulated / "out" / name).write_text("mine: 1\n")
     table = simulated / "correspondences.parquet"
     message = error_line(*call("solve", simulated, table, "--out", simulated / "out"))
-    assert f"{name}: is not of an earlier result" in message
+    assert f"{name}: was not written by calibgraph" in message
     assert (simulated / "out" / name).read_text() == "mine: 1\n"
 
 
-def test_named_files_of_another_kind_are_not_replaced(
+def files_in(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_named_files_of_others_are_not_replaced(
     simulated: Path, calibrated_sample: CommandRun, call: Call
 ) -> None:
     result = Path(shutil.copytree(calibrated_sample.folder, simulated / "result"))
-    (simulated / "paper.png").write_text("mine")
-    (simulated / "notes.html").write_text("<p>mine</p>")
+    for name in ("paper.png", "notes.html", "result/report.html", "notes.csv"):
+        (simulated / name).write_text("mine")
+    (simulated / "settings.yaml").write_text("preset: kitti\n")
     table = simulated / "table.parquet"
     load_correspondences(simulated / "correspondences.parquet").save(table)
-    cases: dict[str, tuple[object, ...]] = {
-        "is part of a result": (
-            "match", SAMPLE, "--matcher", table, "--out", result / "correspondences.parquet",
-        ),
-        "is read by this command": ("match", SAMPLE, "--matcher", table, "--out", table),
-        "is not a report": ("report", result, "--out", simulated / "notes.html"),
-        "or no rig file": ("perturb", simulated, "--out", result / "calibration.yaml"),
-        "paper.png: is not of a benchmark": ("bench", "paper", "kitti", "--out", simulated),
-        "no file of settings": ("tune", "kitti", "--out", simulated / "rig.yaml"),
-    }  # fmt: skip
-    before = {path: path.read_bytes() for path in simulated.rglob("*") if path.is_file()}
-    for message, arguments in cases.items():
-        assert message in error_line(*call(*arguments))
-    assert before == {path: path.read_bytes() for path in simulated.rglob("*") if path.is_file()}
+    match = "match", SAMPLE, "--matcher", table, "--out"
+    cases: list[tuple[str, tuple[object, ...]]] = [
+        ("match", (*match, result / "correspondences.parquet")),
+        ("match", (*match, simulated / "correspondences.parquet")),
+        ("match", (*match, simulated / "notes.csv")),
+        ("report", ("report", result)),
+        ("report", ("report", result, "--out", simulated / "notes.html")),
+        ("perturb", ("perturb", result, "--out", simulated / "rig.yaml")),
+        ("perturb", ("perturb", simulated, "--out", result / "calibration.yaml")),
+        ("bench paper", ("bench", "paper", "kitti", "--out", simulated)),
+        ("tune", ("tune", "kitti", "--out", simulated / "settings.yaml")),
+        ("tune", ("tune", "kitti", "--out", simulated / "rig.yaml")),
+    ]
+    before = files_in(simulated)
+    for command, arguments in cases:
+        message = error_line(*call(*arguments))
+        assert f"was not written by calibgraph {command}, and would be replaced" in message
+    assert "is read by this command" in error_line(*call(*match, table))
+    assert before == files_in(simulated)
+
+
+def test_what_a_command_wrote_is_replaced_by_it_but_not_while_it_is_read(
+    simulated: Path, call: Call
+) -> None:
+    table, found = simulated / "table.parquet", simulated / "found.parquet"
+    truth = load_rig(SAMPLE / "reference.yaml")
+    simulate_correspondences(truth, frames=6).save(table)
+    guess = simulated / "guess.yaml"
+    for arguments in (
+        ("match", SAMPLE, "--matcher", table, "--out", found),
+        ("perturb", simulated, "--out", guess),
+    ):
+        assert [call(*arguments)[0] for _ in range(2)] == [0, 0]
+    for arguments in (
+        ("match", SAMPLE, "--matcher", found, "--out", found),
+        ("perturb", guess, "--out", guess),
+    ):
+        assert "is read by this command" in error_line(*call(*arguments))
+
+
+def test_a_followed_folder_is_not_the_place_of_a_result(simulated: Path, call: Call) -> None:
+    source, out = simulated / "source", simulated / "out"
+    table = simulated / "correspondences.parquet"
+    assert call("solve", simulated, table, "--out", out)[0] == 0
+    source.mkdir()
+    shutil.copy(out / "correspondences.parquet", source)  # a result's, which may be replaced
+    before = files_in(source)
+    message = error_line(*call("track", simulated, source, "--out", source))
+    assert "is read by this command" in message
+    assert before == files_in(source)
+
+
+def test_every_command_with_an_output_declares_it() -> None:
+    for command, written in {**COMMANDS, paper: outputs.benchmark}.items():
+        has_output = "out" in inspect.signature(command).parameters
+        refuses_itself = command is simulate  # whatever is there
+        assert (written is not outputs.nothing) == (has_output and not refuses_itself)
 
 
 def test_the_table_of_another_result_is_refused(simulated: Path, call: Call) -> None:

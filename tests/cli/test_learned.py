@@ -108,13 +108,16 @@ def test_training_runs_on_the_command_line(tmp_path: Path, call: Call) -> None:
 
 
 def test_training_refuses_misuse_in_one_line(tmp_path: Path, call: Call) -> None:
-    out, wrong = tmp_path / "net.tar", tmp_path / "net.settings.yaml"
+    out, wrong = tmp_path / "net.tar", tmp_path / "wrong.yaml"
+    beside = tmp_path / "mine.settings.yaml"
+    beside.write_text("steps: 1\n")
     wrong.write_text("width: 12\n")
     good = tmp_path / "good.yaml"
     good.write_text("steps: 1\n")
     for arguments, message in (
         ((SAMPLE, "--out", tmp_path / "c.tar", "--settings", wrong), "width 12"),
-        ((SAMPLE, "--out", out, "--settings", wrong), "would be written over"),
+        ((SAMPLE, "--out", tmp_path / "mine.tar", "--settings", beside), "is read by this"),
+        ((SAMPLE, "--out", tmp_path / "mine.tar"), "was not written by calibgraph train"),
         ((SAMPLE, "--out", out, "--settings", tmp_path / "none.yaml"), "no such file"),
         ((SAMPLE, "--out", out, "--settings", good, "--resume"), "--settings: --resume goes on"),
         ((SAMPLE, "--out", out, "--seed", 0, "--resume"), "--seed: --resume goes on"),

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from calibgraph.errors import CalibrationError, FileError
-from calibgraph.files import read_yaml, require_place_for_file, write_bytes, write_text
+from calibgraph.errors import CalibrationError
+from calibgraph.files import read_yaml, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
 from calibgraph.io.formats.comments import commented
@@ -31,6 +31,7 @@ from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
+from calibgraph.outputs import Output, require_free
 
 WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
     "kalibr": write_kalibr,
@@ -130,33 +131,30 @@ def _loaded(path: Path | str) -> Calibration | Rig:
     return load_rig(file)
 
 
+def outputs_of_export(path: Path, format: str) -> list[Output]:
+    """The file of an export, and for the format without comments a text file beside it."""
+    beside = [path.with_name(f"{path.stem}.direction.txt")] if format == _WITHOUT_COMMENTS else []
+    return [Output(file, "export", _is_exported) for file in (path, *beside)]
+
+
+def _is_exported(path: Path) -> bool:
+    """Whether a file was exported before, by its mark."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _MARK.search(file.read(_MARK_BYTES)) is not None
+
+
 def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
     """Write all files or, if one may not be replaced, none."""
-    beside = path.with_name(f"{path.stem}.direction.txt")
-    files: dict[Path, str | bytes] = {path: WRITERS[format](export)}
+    outputs = outputs_of_export(path, format)
+    contents = [WRITERS[format](export)]
     if format == _WITHOUT_COMMENTS:
-        files[beside] = commented(kitti_statement(export))
-    for file in files:
-        _require_replaceable(file)
-    for file, content in files.items():
+        contents.append(commented(kitti_statement(export)))
+    require_free(outputs)
+    for output, content in zip(outputs, contents, strict=True):
         if isinstance(content, bytes):
-            write_bytes(file, content)
+            write_bytes(output.path, content)
         else:
-            write_text(file, content)
-    return tuple(files)
-
-
-def _require_replaceable(path: Path) -> None:
-    """Check that a file can be written, and that one that is there was exported before.
-
-    Raises:
-        FileError: if not.
-    """
-    require_place_for_file(path)
-    if path.exists():
-        with path.open("rb") as file:
-            if not _MARK.search(file.read(_MARK_BYTES)):
-                raise FileError(
-                    path, "is no file that calibgraph exported, and would be replaced; choose "
-                    "another --out"
-                )  # fmt: skip
+            write_text(output.path, content)
+    return tuple(output.path for output in outputs)

@@ -12,7 +12,7 @@ except ModuleNotFoundError as error:
         " (without a GPU: pip install torch --index-url https://download.pytorch.org/whl/cpu first)"
     ) from error
 
-from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
+from calibgraph.matching.cmrnext.checkpoint import Checkpoint, is_converted, load_checkpoint
 from calibgraph.matching.cmrnext.matcher import CmrNextMatcher
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.matching.cmrnext.training.train import train
@@ -23,6 +23,7 @@ __all__ = [
     "CmrNextMatcher",
     "TrainSettings",
     "Validation",
+    "is_converted",
     "load_checkpoint",
     "train",
 ]

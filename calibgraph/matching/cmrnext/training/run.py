@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.files import require_place_for_file, write_atomically
+from calibgraph.files import write_atomically
 from calibgraph.matching.cmrnext.checkpoint import TORCH_SUFFIXES, load_checkpoint, load_training
 from calibgraph.matching.cmrnext.network import CmrNext, torch_device
 from calibgraph.matching.cmrnext.training.losses import (
@@ -25,7 +25,6 @@ from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.matching.cmrnext.training.settings import (
     TrainSettings,
     adopt_architecture,
-    load_settings,
     settings_of,
     to_config,
 )
@@ -34,6 +33,7 @@ from calibgraph.matching.cmrnext.training.validation import (
     pose_error,
     summarize_poses,
 )
+from calibgraph.outputs import Output, has_yaml_mark, require_free
 
 SETTINGS_SUFFIX = ".settings.yaml"
 """Of the file beside a checkpoint with the settings of its training."""
@@ -148,26 +148,16 @@ def start_run(
         raise FileError(out, "is there already; go on with it (--resume), or choose another name")
     if out.suffix.lower() not in TORCH_SUFFIXES:
         raise FileError(out, f"the weights' name must end in one of {', '.join(TORCH_SUFFIXES)}")
-    require_place_for_file(out)
-    _require_replaceable_settings(out.with_suffix(SETTINGS_SUFFIX))
+    beside = out.with_suffix(SETTINGS_SUFFIX)
+    require_free([Output(out, "train"), Output(beside, "train", has_yaml_mark("train"))])
     if start is None:
         run = TrainingRun(settings, device)
     else:
         checkpoint = load_checkpoint(start)
         run = TrainingRun(adopt_architecture(settings, checkpoint), device)
         run.network.load_state_dict(checkpoint.state)
-    run.settings.save(out.with_suffix(SETTINGS_SUFFIX))
+    run.settings.save(beside)
     return run
-
-
-def _require_replaceable_settings(path: Path) -> None:
-    """Check that a file, if it is there, is one of settings, as of a training that was stopped."""
-    try:
-        if path.exists():
-            load_settings(path)
-    except FileError:
-        message = "is no file of settings, and would be replaced; choose another --out"
-        raise FileError(path, message) from None
 
 
 def resume_run(out: Path, device: str) -> TrainingRun:

@@ -17,6 +17,7 @@ from calibgraph.matching.cmrnext.checkpoint import Checkpoint
 from calibgraph.matching.cmrnext.training.samples import SampleSettings
 from calibgraph.matching.cmrnext.training.validation import Validation
 from calibgraph.model.config import Seed
+from calibgraph.outputs import yaml_mark
 
 Count = Annotated[int, Field(ge=1, le=10**9)]
 CropSize = Annotated[int, Field(ge=64, le=100_000, multiple_of=2)]
@@ -104,7 +105,7 @@ class TrainSettings(BaseModel):
 
     def save(self, path: Path) -> None:
         """Write all settings as YAML."""
-        write_yaml(path, self.model_dump())
+        write_yaml(path, self.model_dump(), first_line=yaml_mark("train"))
 
 
 def load_settings(path: Path | str) -> TrainSettings:

@@ -1,0 +1,136 @@
+"""What each command writes, and what it reads: checked before any work, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calibgraph.outputs import Output
+
+Given = Mapping[str, Any]
+"""The arguments and options of a command, by name."""
+
+TABLE_SUFFIXES = (".parquet", ".csv")
+
+
+def result(given: Given) -> list[Output]:
+    """The files of a result in the folder of ``--out``."""
+    from calibgraph.model.result_files import outputs_of_result
+
+    return outputs_of_result(given["out"])
+
+
+def table(given: Given) -> list[Output]:
+    """A table of correspondences; a CSV file has no place for a mark."""
+    from calibgraph.model.result_files import is_table_of_match
+    from calibgraph.outputs import Output
+
+    return [Output(given["out"], "match", is_table_of_match, TABLE_SUFFIXES)]
+
+
+def page(given: Given) -> list[Output]:
+    """The page of a report, in the folder of the result if it is not named."""
+    from calibgraph.model.result_files import REPORT_FILE, is_report
+    from calibgraph.outputs import Output
+
+    folder = given["result"] if given["result"].is_dir() else given["result"].parent
+    return [Output(given["out"] or folder / REPORT_FILE, "report", is_report, (".html", ".htm"))]
+
+
+def guess(given: Given) -> list[Output]:
+    """A displaced rig."""
+    return [_marked_yaml(given["out"], "perturb")]
+
+
+def exported(given: Given) -> list[Output]:
+    """A calibration in the format of another program."""
+    from calibgraph.io.formats.export import outputs_of_export
+
+    return outputs_of_export(given["out"], given["format"])
+
+
+def imported(given: Given) -> list[Output]:
+    """A rig from files of others."""
+    return [_marked_yaml(given["out"], "import")]
+
+
+def settings(given: Given) -> list[Output]:
+    """Settings of the solve."""
+    return [_marked_yaml(given["out"], "tune")]
+
+
+def weights(given: Given) -> list[Output]:
+    """Converted weights, if they are wanted."""
+    from calibgraph.outputs import Output
+
+    def is_ours(path: Path) -> bool:
+        from calibgraph.matching.cmrnext import is_converted
+
+        return is_converted(path)
+
+    out = given["out"]
+    return [] if out is None else [Output(out, "weights", is_ours, (".safetensors",))]
+
+
+def training(given: Given) -> list[Output]:
+    """Settings beside the weights, which the library refuses to replace but with ``--resume``."""
+    path = given["out"].with_suffix(".settings.yaml")
+    return [] if given["resume"] else [_marked_yaml(path, "train")]
+
+
+def benchmark(given: Given) -> list[Output]:
+    """The tables and the plot of the paper's experiment."""
+    from calibgraph.evaluation.output import outputs_of_report
+
+    return outputs_of_report(given["out"])
+
+
+def nothing(given: Given) -> list[Output]:
+    """No file; or a new folder, which the library refuses if it holds data."""
+    return []
+
+
+def keep_files(
+    command: Callable[..., None], outputs: Callable[[Given], list[Output]]
+) -> Callable[..., None]:
+    """A command that refuses, before any work, to replace what it reads or did not write.
+
+    Args:
+        command: a function for typer. What it reads is every path among its arguments but ``out``.
+        outputs: the files that it writes with given arguments.
+    """
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        from calibgraph.outputs import require_free
+
+        require_free(outputs(given), [path for name in given if name != "out"
+                                      for path in _files_at(given[name])])  # fmt: skip
+        command(**given)
+
+    return run
+
+
+def _files_at(value: object) -> Iterator[Path]:
+    """The files that an argument names: itself, or in a folder the rig's file and tables."""
+    from calibgraph.io.rigs import find_rig_file
+
+    items = value if isinstance(value, (list, tuple)) else [value]
+    named = [Path(item) for item in items if isinstance(item, (str, Path))]
+    texts = (item.partition("=") for item in items if isinstance(item, str))
+    named += [Path(file) for _, equals, file in texts if equals]  # NAME=FILE
+    for path in filter(Path.exists, named):
+        rig = find_rig_file(path)
+        if rig is not None:
+            yield rig
+        else:
+            yield from (file for suffix in TABLE_SUFFIXES for file in path.glob(f"*{suffix}"))
+
+
+def _marked_yaml(path: Path, command: str) -> Output:
+    from calibgraph.outputs import Output, has_yaml_mark
+
+    return Output(path, command, has_yaml_mark(command), (".yaml", ".yml"))
