@@ -37,6 +37,7 @@ def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
         ("a: 2020-13-45", "not valid YAML"),
         ("a: !!int abc", "not valid YAML"),
         ("a: " + "9" * 5000, "not valid YAML"),
+        ("format: 0x" + "f" * 5000, "too many digits"),
         ("[" * 20_000, "not valid YAML|too deeply"),
         ("{a: " * 1000, "not valid YAML|too deeply"),
         ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml, sha256
 from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.config import Config
+from calibgraph.model.config import Config, Terms
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
@@ -27,6 +28,8 @@ from calibgraph.model.verdict import Check, Verdict
 
 Array = NDArray[np.float64]
 Table = TypeVar("Table")
+
+_POSE = 6  # numbers of one
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -42,30 +45,75 @@ def load_calibration(path: Path | str) -> Calibration:
         raise FileError(
             path, f"has format {content.get('format')!r}, expected {CALIBRATION_FORMAT}"
         )
-    try:
-        found = Calibration(
-            rig=checked_model(Rig, content["rig"], path),
-            initial_rig=checked_model(Rig, content["initial_rig"], path),
-            covariance={k: _array(v) for k, v in content["covariance"].items()},
-            joint_covariance=_array(content["joint_covariance"]),
-            camera_verdicts={k: _verdict(v) for k, v in content["camera_verdicts"].items()},
-            residuals={k: Residuals(**v) for k, v in content["residuals"].items()},
-            stage1_T_camera_lidar={
-                k: np.array(v) for k, v in content["stage1_T_camera_lidar"].items()
-            },
-            config=checked_model(Config, content["config"], path),
-            weaknesses={k: tuple(v) for k, v in content["weaknesses"].items()},
-            bootstrap={k: np.array(v) for k, v in content["bootstrap_covariance"].items()},
-            frames=tuple(content["frames_used"]),
-            rounds=tuple(content["rounds"]),
-            correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
-            camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
-            **{name: content[name] for name in _PLAIN},
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FileError(path, f"is not a complete result ({error!r}); write it again") from error
+    parts = checked_model(_Parts, content, path)
+    found = Calibration(
+        rig=checked_model(Rig, parts.rig, path),
+        initial_rig=checked_model(Rig, parts.initial_rig, path),
+        config=checked_model(Config, parts.config, path),
+        camera_verdicts={k: Verdict(v.checks) for k, v in parts.camera_verdicts.items()},
+        bootstrap=parts.bootstrap_covariance,
+        frames=tuple(frame.model_dump() for frame in parts.frames_used),
+        correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
+        camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
+        **{name: getattr(parts, name) for name in _PLAIN},
+    )
     _require_consistent(path, content, found)
     return found
+
+
+def _matrix(side: int | None) -> BeforeValidator:
+    """A square matrix of finite numbers as an array; of any side if None."""
+
+    def check(value: Any) -> Array:
+        try:
+            found = np.array(value, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError("expected a matrix of numbers") from error
+        rows = len(found) if side is None and found.ndim else side
+        if found.shape != (rows, rows) or not np.isfinite(found).all():
+            raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
+        return found
+
+    return BeforeValidator(check)
+
+
+Matrix4 = Annotated[Any, _matrix(4)]
+Matrix6 = Annotated[Any, _matrix(_POSE)]
+Square = Annotated[Any, _matrix(None)]
+
+
+class _FrameEntry(BaseModel):
+    frame: int
+    name: str
+    cloud: str
+    images: dict[str, str]
+
+
+class _Checks(BaseModel):
+    checks: tuple[Check, ...]
+
+
+class _Parts(BaseModel):
+    """The keys of a result's file that are read, with their types; the others repeat them."""
+
+    rig: dict[str, Any]
+    initial_rig: dict[str, Any]
+    config: dict[str, Any]
+    covariance: dict[str, Matrix6 | None]
+    joint_covariance: Square | None
+    bootstrap_covariance: dict[str, Matrix6]
+    stage1_T_camera_lidar: dict[str, Matrix4]
+    camera_verdicts: dict[str, _Checks]
+    residuals: dict[str, Residuals]
+    weaknesses: dict[str, tuple[str, ...]]
+    frames_used: tuple[_FrameEntry, ...]
+    rounds: tuple[dict[str, Any], ...]
+    counts: dict[str, dict[str, int]]
+    timings_s: dict[str, float]
+    terms: Terms
+    prior_share: dict[str, float]
+    inputs: dict[str, str]
+    versions: dict[str, str]
 
 
 def _require_consistent(path: Path, content: Mapping[str, Any], found: Calibration) -> None:
@@ -82,20 +130,22 @@ def _require_consistent(path: Path, content: Mapping[str, Any], found: Calibrati
             f"has the verdict {status}, its checks give {found.verdict.status}: it was edited; "
             "write it again",
         )
-    names = set(found.rig.cameras)
-    parts = {
-        "initial_rig": found.initial_rig.cameras,
-        "camera_verdicts": found.camera_verdicts,
-        "counts": found.counts,
-        "residuals": found.residuals,
-    }
-    for part, of in parts.items():
-        if not isinstance(of, Mapping) or not names.issuperset(of):
-            raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
+    names, joint = set(found.rig.cameras), found.joint_covariance
+    right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
+    right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
+    right["initial_rig"] = names == {*found.initial_rig.cameras}
+    right["joint_covariance"] = joint is None or len(joint) == _POSE * len(names)
+    for part in (part for part, is_right in right.items() if not is_right):
+        raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
 
 
-_PLAIN = ("counts", "timings_s", "terms", "prior_share", "inputs", "versions")
-assert {*_PLAIN} <= {f.name for f in fields(Calibration)}
+_OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
+_OF_SOME_CAMERAS = ("residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap")
+_PLAIN = (
+    "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
+    "counts", "timings_s", "terms", "prior_share", "inputs", "versions",
+)  # fmt: skip
+assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 
 
 def _table(
@@ -134,11 +184,3 @@ def rig_of_calibration(content: Mapping[str, Any], path: Path) -> Rig:
     if "rig" not in content:
         raise FileError(path, "is a result without a rig; write it again")
     return checked_model(Rig, content["rig"], path)
-
-
-def _verdict(content: Mapping[str, Any]) -> Verdict:
-    return Verdict(tuple(Check(**check) for check in content["checks"]))
-
-
-def _array(value: Any) -> Array | None:
-    return None if value is None else np.array(value, dtype=np.float64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.io.correspondence_tables import arrow_reads
+from calibgraph.io.correspondence_tables import arrow_reads, open_parquet, require_short_names
 from calibgraph.model.camera_matches import (
     COLUMNS,
     FORMAT,
@@ -51,14 +51,14 @@ def load_camera_matches(path: Path | str) -> CameraMatches:
 
 def _read(path: Path) -> pa.Table:
     import pyarrow as pa
-    from pyarrow import csv, parquet
+    from pyarrow import csv
 
     with arrow_reads(path):
         if path.suffix == ".csv":
             types = dict.fromkeys(NAMES, pa.string()) | {"frame": pa.int64()}
             types |= dict.fromkeys((*NUMBERS, *PLANES), pa.float64())
             return csv.read_csv(path, convert_options=csv.ConvertOptions(column_types=types))
-        with parquet.ParquetFile(path) as file:
+        with open_parquet(path, NAMES) as file:
             return file.read()
 
 
@@ -68,6 +68,8 @@ def _from_arrow(table: pa.Table) -> CameraMatches:
         if table[name].null_count:
             row = table[name].is_null().to_pylist().index(True)
             raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+    for name in NAMES:
+        require_short_names(table[name])
     names = [table[name].to_pylist() for name in NAMES]
     given = json.loads(metadata.get(b"cameras", b"null"))
     in_order = [name for row in zip(*names, strict=True) for name in row]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import tokenize
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +20,7 @@ MAX_CLOUD_BYTES = 2 * 2**30
 
 _UNREADABLE = (
     ValueError, TypeError, OSError, EOFError, MemoryError, OverflowError, RecursionError,
-    SyntaxError, tokenize.TokenError,
+    SyntaxError, tokenize.TokenError, zipfile.BadZipFile,
 )  # fmt: skip
 """Of numpy, which takes the header of a file as Python, and memory for all that it claims."""
 
@@ -133,12 +134,13 @@ def _require_complete(path: Path) -> int:
     """
     data = path.read_bytes()
     header, body = _split_header(path, data)
-    rows_of = _pcd_rows if path.suffix.lower() == ".pcd" else _ply_rows
-    count, row_bytes, row_words = rows_of(path, header)
-    if "compressed" in header:
+    is_pcd = path.suffix.lower() == ".pcd"
+    count, row_bytes, row_words = (_pcd_rows if is_pcd else _ply_rows)(path, header)
+    encoding = _encoding(path, header)
+    if encoding == "binary_compressed":
         sizes = struct.unpack("<II", body[:8]) if len(body) >= 8 else (1, 0)  # noqa: PLR2004
         complete = len(body) >= 8 + sizes[0] and sizes[1] >= count * row_bytes
-    elif "ascii" in header:
+    elif encoding == "ascii":
         rows = [line for line in body.splitlines() if line.strip()][:count]
         complete = len(rows) == count and all(len(row.split()) == row_words for row in rows)
         _require_numbers(path, rows)
@@ -163,6 +165,21 @@ def _split_header(path: Path, data: bytes) -> tuple[str, bytes]:
     if end is None:
         raise FileError(path, f"has no complete {path.suffix} header; is it complete?")
     return data[: end.end()].decode("ascii", "replace"), data[end.end() :]
+
+
+_ENCODING = re.compile(
+    r"^(?:DATA +(ascii|binary|binary_compressed)"
+    r"|format +(ascii|binary_(?:little|big)_endian) .*)\s*$",
+    re.MULTILINE,
+)
+
+
+def _encoding(path: Path, header: str) -> str:
+    """How the points are written: Open3D guesses, or prints its own messages."""
+    found = _ENCODING.search(header)
+    if found is None:
+        raise FileError(path, "has an unknown encoding in its header; write it as binary or ascii")
+    return str(found[1] or found[2])
 
 
 def _pcd_rows(path: Path, header: str) -> tuple[int, int, int]:
@@ -191,6 +208,7 @@ def _require_coordinates(path: Path, names: Sequence[str]) -> None:
             raise FileError(path, f"has the fields {' '.join(names)}, expected one {axis}")
 
 
+_MOST_DIGITS = 18  # of a number of 64 bits
 _PLY_BYTES = {
     "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
     "int": 4, "uint": 4, "float": 4, "int32": 4, "uint32": 4, "float32": 4, "double": 8,
@@ -204,4 +222,6 @@ def _ply_rows(path: Path, header: str) -> tuple[int, int, int]:
     if vertex is None or not found or any(kind not in _PLY_BYTES for kind, _ in found):
         raise FileError(path, "has no plain list of vertices in its PLY header")
     _require_coordinates(path, [name for _, name in found])
+    if len(vertex[1]) > _MOST_DIGITS:
+        raise FileError(path, f"claims a number of points of {len(vertex[1])} digits")
     return int(vertex[1]), sum(_PLY_BYTES[kind] for kind, _ in found), len(found)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _PART_ROWS = 2**18
+_MOST_NAME_BYTES = 400  # 100 letters of 4 bytes
 
 
 def load_correspondences(path: Path | str) -> Correspondences:
@@ -65,13 +67,12 @@ def parts_of_file(path: Path) -> Iterator[Correspondences]:
 
 def _arrow_parts(path: Path) -> Iterator[pa.Table]:
     import pyarrow as pa
-    from pyarrow import parquet
 
     if path.suffix == ".csv":
         yield read_arrow(path)
         return
     # One row group after the other: a reader keeps in memory all that it has read of a group.
-    with arrow_reads(path), parquet.ParquetFile(path) as file:
+    with arrow_reads(path), open_parquet(path) as file:
         metadata = file.schema_arrow.metadata
         for group in range(file.num_row_groups):
             for batch in file.iter_batches(_PART_ROWS, row_groups=[group]):
@@ -85,14 +86,30 @@ def read_arrow(path: Path) -> pa.Table:
         FileError: if it cannot be read.
     """
     import pyarrow as pa
-    from pyarrow import csv, parquet
+    from pyarrow import csv
 
     with arrow_reads(path):
         if path.suffix == ".csv":
             strings = csv.ConvertOptions(column_types={"camera": pa.string()})
             return csv.read_csv(path, convert_options=strings)
-        with parquet.ParquetFile(path) as file:
+        with open_parquet(path) as file:
             return file.read()
+
+
+def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
+    """A Parquet file, whose pages are compared with their checksums, if it has them.
+
+    Args:
+        path: of the file.
+        names: columns of names: each is in memory once, however many rows have it.
+    """
+    from pyarrow import parquet
+
+    checked = partial(parquet.ParquetFile, path, page_checksum_verification=True)
+    try:
+        return checked(read_dictionary=list(names))
+    except KeyError:  # a column is missing, which is reported with the columns that are there
+        return checked()
 
 
 @contextmanager
@@ -128,6 +145,7 @@ def from_arrow(table: pa.Table) -> Correspondences:
 
     check_schema(table.schema)
     try:
+        require_short_names(table["camera"])
         # As plain strings: a dictionary may contain a null name.
         names = table["camera"].cast(pa.string())
         camera = table.column_names.index("camera")
@@ -135,6 +153,25 @@ def from_arrow(table: pa.Table) -> Correspondences:
     except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
         message = f"a column or the metadata has the wrong type: {error}"
         raise CorrespondenceError(message) from error
+
+
+def require_short_names(column: pa.ChunkedArray) -> None:
+    """Check the names of a dictionary before each of its rows takes memory for one.
+
+    Raises:
+        CorrespondenceError: if one is longer than the name of a camera can be.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if not pa.types.is_dictionary(column.type):
+        return
+    for chunk in column.chunks:
+        longest = compute.max(compute.binary_length(chunk.dictionary)).as_py() or 0
+        if longest > _MOST_NAME_BYTES:
+            raise CorrespondenceError(
+                f"column 'camera' holds a name of {longest} bytes; give the names of the rig"
+            )
 
 
 def _from_plain_columns(table: pa.Table) -> Correspondences:

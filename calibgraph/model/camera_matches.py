@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
 from calibgraph.model.correspondences import MAX_COORDINATE
+from calibgraph.model.table_columns import write_parquet
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -116,10 +117,10 @@ class CameraMatches:
 
     def save(self, path: Path | str) -> None:
         """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
-        from pyarrow import csv, parquet
+        from pyarrow import csv
 
         path, arrow = Path(path), self.to_arrow()
-        write = csv.write_csv if path.suffix == ".csv" else parquet.write_table
+        write = csv.write_csv if path.suffix == ".csv" else write_parquet
         write_atomically(path, lambda part: write(arrow, part))
 
     def to_arrow(self) -> pa.Table:

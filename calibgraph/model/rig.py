@@ -25,6 +25,7 @@ from pydantic import (
 
 from calibgraph.errors import RigError
 from calibgraph.files import write_yaml
+from calibgraph.model.correspondences import MAX_COORDINATE
 from factors import Lens, LensModel
 from factors.lens import ORDERS
 
@@ -50,6 +51,8 @@ def rigid_transform(value: Any) -> Array:
         raise ValueError(f"expected a 4x4 matrix, found shape {T.shape}")
     if not np.isfinite(T).all():
         raise ValueError("the matrix holds values that are not finite")
+    if np.abs(T).max() > MAX_COORDINATE:
+        raise ValueError(f"the matrix holds {T.flat[np.abs(T).argmax()]:g}; lengths are in metres")
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
         raise ValueError(f"the last row must be 0 0 0 1, found {T[3].tolist()}")
     deviation = np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max()
@@ -112,8 +115,8 @@ def _checked_model(name: Any) -> Any:
 CameraName = Annotated[str, AfterValidator(_checked_name)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Bounded = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=MAX_COORDINATE, allow_inf_nan=False)]
 
 
 class _Model(BaseModel):
@@ -125,8 +128,8 @@ class Intrinsics(_Model):
 
     fx: Positive
     fy: Positive
-    cx: Finite
-    cy: Finite
+    cx: Bounded
+    cy: Bounded
 
 
 class Camera(_Model):
@@ -136,7 +139,7 @@ class Camera(_Model):
     width_px: Size
     height_px: Size
     intrinsics_px: Intrinsics
-    distortion: tuple[Finite, ...] = ()
+    distortion: tuple[Bounded, ...] = ()
     T_camera_lidar: Transform
 
     @model_validator(mode="after")

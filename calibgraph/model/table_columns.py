@@ -25,13 +25,20 @@ _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 def write_table(arrow: pa.Table, path: Path) -> None:
     """Write a table as Parquet, or as CSV if the name ends in .csv, atomically."""
-    from pyarrow import csv, parquet
+    from pyarrow import csv
 
     if path.suffix == ".csv":
         strings = arrow.set_column(0, "camera", arrow["camera"].cast("string"))
         write_atomically(path, lambda part: csv.write_csv(strings, part))
     else:
-        write_atomically(path, lambda part: parquet.write_table(arrow, part))
+        write_atomically(path, lambda part: write_parquet(arrow, part))
+
+
+def write_parquet(arrow: pa.Table, path: Path) -> None:
+    """Write a Parquet file with checksums of its pages."""
+    from pyarrow import parquet
+
+    parquet.write_table(arrow, path, write_page_checksum=True)
 
 
 def check_schema(schema: pa.Schema) -> None:

@@ -11,7 +11,13 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.io.correspondence_tables import arrow_reads, from_arrow, read_arrow, require_rows
+from calibgraph.io.correspondence_tables import (
+    arrow_reads,
+    from_arrow,
+    open_parquet,
+    read_arrow,
+    require_rows,
+)
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.table_columns import check_schema
 
@@ -64,15 +70,13 @@ def frames_of_table(path: Path) -> Iterator[Item]:
 
 def _parts_of_file(path: Path) -> Iterator[pa.Table]:
     """Tables of whole frames, those of later ones ascending, that make up a file."""
-    from pyarrow import parquet
-
     if path.suffix == ".csv":
         table = read_arrow(path)
         require_rows(path, len(table))
         require_schema(path, table.schema)
         yield table
         return
-    with arrow_reads(path), parquet.ParquetFile(path) as file:
+    with arrow_reads(path), open_parquet(path) as file:
         require_rows(path, file.metadata.num_rows)
         require_schema(path, file.schema_arrow)
         spans = _frame_spans(file)

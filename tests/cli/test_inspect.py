@@ -74,6 +74,6 @@ def edit(result: Calibration, folder: Path) -> Path:
     if folder.name == "verdict":
         content["verdict"]["status"] = "FAIL" if result.verdict.status == "PASS" else "PASS"
     else:
-        content["counts"] = None
+        content["counts"] = {"other": {"used": 1}}
     path.write_text(yaml.safe_dump(content))
     return folder

@@ -68,13 +68,14 @@ def test_bad_clouds_are_named(tmp_path: Path) -> None:
         "{'descr': '<f4', 'fortran_order': False, 'shape': " + "-" * 9000 + "1, }",
         "{'descr': '<f4', 'fortran_order': False, 'shape': " + "[" * 4000 + "]" * 4000 + ", }",
         "{" * 9000,
+        None,
     ],
 )
-def test_a_hostile_npy_header_is_one_line(header: str, tmp_path: Path) -> None:
+def test_a_hostile_npy_header_is_one_line(header: str | None, tmp_path: Path) -> None:
     path = tmp_path / "cloud.npy"
-    written = header.encode() + b"\n"
+    written = (header or "").encode() + b"\n"
     start = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(written))
-    path.write_bytes(start + written + bytes(64))
+    path.write_bytes((start + written if header else b"PK\x03\x04") + bytes(64))
     with pytest.raises(FileError, match="cannot be read as a .npy array") as caught:
         load_cloud(path)
     assert "\n" not in str(caught.value)
@@ -111,6 +112,9 @@ def ply(*properties: str) -> bytes:
         ("negative_x.pcd", pcd("x y z intensity", count="-1 1 1 1"), "do not fit"),
         ("wide_x.pcd", pcd("x y z intensity", count="2 1 1 1"), "expected one x"),
         ("sizes.pcd", pcd("x y z intensity", size="4 4 4"), "malformed"),
+        ("coded.pcd", pcd("x y z intensity").replace(b"binary", b"gzip"), "unknown encoding"),
+        ("coded.ply", ply("x", "y", "z", "a").replace(b"_little", b"_middle"), "unknown encoding"),
+        ("many.ply", ply("x", "y", "z", "a").replace(b"500", b"9" * 5000), "of 5000 digits"),
         ("odd.pcd", pcd("x y z intensity", size="4 4 3 5"), "do not fit"),
     ],
 )

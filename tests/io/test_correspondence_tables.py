@@ -11,6 +11,7 @@ from pyarrow import parquet
 
 from calibgraph import (
     CorrespondenceError,
+    Correspondences,
     FileError,
     load_correspondences,
 )
@@ -214,3 +215,31 @@ def test_a_column_whose_name_is_no_utf8_is_named_in_one_line(tmp_path: Path) -> 
     with pytest.raises(FileError, match="table.csv: a column's name is not UTF-8") as caught:
         load_correspondences(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_long_name_does_not_take_its_memory_for_every_row(tmp_path: Path) -> None:
+    path, rows = tmp_path / "table.parquet", 20_000
+    name = pa.DictionaryArray.from_arrays(pa.array([0] * rows, pa.int32()), ["n" * 100_000])
+    given = to_arrow(table()).take(pa.array([0] * rows))
+    parquet.write_table(given.set_column(0, "camera", name), path)  # 2 GB if it is written out
+    before = pa.total_allocated_bytes()
+    with pytest.raises(FileError, match="a name of 100000 bytes"):
+        load_correspondences(path)
+    assert pa.total_allocated_bytes() - before < 10**8
+
+
+def test_changed_bytes_of_a_table_are_not_taken_for_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    rng = np.random.default_rng(0)
+    given = Correspondences.from_arrays(
+        camera="left", frame=0, pixels_px=rng.uniform(0, 300, (2000, 2)),
+        points_lidar_m=rng.normal(size=(2000, 3)),
+    )  # fmt: skip
+    given.save(path)
+    data = bytearray(path.read_bytes())
+    place = data.find(given.points_lidar_m[1000:1003, 0].tobytes())
+    assert place > 0  # random numbers are not compressed
+    data[place] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(FileError, match="cannot be read as Parquet"):
+        load_correspondences(path)

@@ -62,6 +62,15 @@ BAD = {
     ),
     "missing key": ({"intrinsics_px": {"fx": 700, "fy": 700, "cx": 1}}, r"cy' is missing"),
     "not finite": ({"T_camera_lidar": [[math.nan] * 4] * 4}, r"not finite"),
+    "far away": (
+        {"T_camera_lidar": [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+        r"holds 1e\+308; lengths are in metres",
+    ),
+    "long lens": (
+        {"intrinsics_px": {"fx": 1e300, "fy": 700, "cx": 1, "cy": 1}},
+        r"intrinsics_px.fx.*less than or equal to 1000000",
+    ),
+    "large coefficient": ({"distortion": [1e300] * 5}, r"distortion.0.*1e\+300"),
     "shape": ({"T_camera_lidar": [[1, 0], [0, 1]]}, r"4x4.*\(2, 2\)"),
     "ragged": ({"T_camera_lidar": [[1, 0], [0]]}, r"4x4"),
     "not a rotation": ({"T_camera_lidar": (2 * np.eye(4)).tolist()}, r"last row"),
