@@ -189,11 +189,13 @@ def _pcd_rows(path: Path, header: str) -> tuple[int, int, int]:
         sizes = np.array(fields["SIZE"], dtype=int)
         repeats = np.array(fields.get("COUNT", ["1"] * len(sizes)), dtype=int)
         row_bytes = int(sizes @ repeats)
+        whole = count == int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
     except (KeyError, IndexError, ValueError, OverflowError) as error:
         raise FileError(path, f"has a malformed PCD header ({error})") from error
     plain = [n for n, repeat in zip(names, repeats, strict=False) if repeat == 1]
-    if not len(names) == len(sizes) or min(repeats) < 1 or not set(sizes) <= _PCD_BYTES:
-        raise FileError(path, "has a malformed PCD header: FIELDS, SIZE and COUNT do not fit")
+    if not whole or len(names) != len(sizes) or min(repeats) < 1 or not set(sizes) <= _PCD_BYTES:
+        raise FileError(path, "has a malformed PCD header: its FIELDS, SIZE and COUNT, or its "
+                        "WIDTH, HEIGHT and POINTS do not fit")  # fmt: skip
     _require_coordinates(path, plain)
     return count, row_bytes, int(repeats.sum())
 

@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 
 RIG_FORMAT: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
 
+MAX_PIXELS = 200_000_000
+"""Of an image, 0.6 GB decoded; the largest sensors have 151 million."""
+
 ROUNDING = 1e-3
 """Largest deviation of R^T R from the identity that counts as rounded digits, not as an error."""
 
@@ -141,6 +144,14 @@ class Camera(_Model):
     intrinsics_px: Intrinsics
     distortion: tuple[Bounded, ...] = ()
     T_camera_lidar: Transform
+
+    @model_validator(mode="after")
+    def _image_fits_into_memory(self) -> Self:
+        if self.width_px * self.height_px > MAX_PIXELS:
+            raise ValueError(
+                f"{self.width_px}x{self.height_px} px are over {MAX_PIXELS:.0e} pixels"
+            )
+        return self
 
     @model_validator(mode="after")
     def _lens_can_be_built(self) -> Self:

@@ -115,6 +115,7 @@ def ply(*properties: str) -> bytes:
         ("coded.pcd", pcd("x y z intensity").replace(b"binary", b"gzip"), "unknown encoding"),
         ("coded.ply", ply("x", "y", "z", "a").replace(b"_little", b"_middle"), "unknown encoding"),
         ("many.ply", ply("x", "y", "z", "a").replace(b"500", b"9" * 5000), "of 5000 digits"),
+        ("wide.pcd", pcd("x y z intensity").replace(b"WIDTH 500", b"WIDTH 7"), "do not fit"),
         ("odd.pcd", pcd("x y z intensity", size="4 4 3 5"), "do not fit"),
     ],
 )

@@ -88,6 +88,7 @@ BAD = {
     "unknown lens": ({"model": "omni"}, r"'pinhole' or 'fisheye', found 'omni'"),
     "fisheye without": ({"model": "fisheye", "distortion": []}, r"0 distortion"),
     "size": ({"width_px": 0}, r"width_px"),
+    "gigapixels": ({"width_px": 28_000, "height_px": 28_000}, r"28000x28000 px are over 2e\+08"),
 }
 
 
