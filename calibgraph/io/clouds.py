@@ -67,7 +67,8 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
 
 def _read_npy(path: Path) -> NDArray[np.float32]:
     try:
-        array = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:  # numpy leaves it open if it is no whole archive
+            array = np.load(file, allow_pickle=False)
     except _UNREADABLE as error:
         raise FileError(
             path, f"cannot be read as a .npy array ({error!r}); is it complete?"

@@ -19,7 +19,6 @@ from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-_PNG_START = b"\x89PNG"
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH  # without a reduction to 8 bits
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
@@ -43,7 +42,8 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
             f"is {header.width}x{header.height} px, the rig says {expected[0]}x{expected[1]} px; "
             "correct width_px and height_px, and the intrinsics if the image was scaled",
         )
-    _require_upright(path, header)
+    if not _is_png(data) or b"eXIf" in data:  # Pillow decodes a PNG whole to look for it
+        _require_upright(path, header)
     image = _decode(path, data)
     if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
         raise FileError(path, "has 16 bits, of which only the lower 8 are used; write it with 8")
@@ -64,11 +64,15 @@ def _read(path: Path) -> tuple[bytes, ImageFile]:
     if not path.is_file():
         raise FileError(path, "no such image")
     data = path.read_bytes()
-    kind = PngImageFile if data.startswith(_PNG_START) else JpegImageFile
+    kind = PngImageFile if _is_png(data) else JpegImageFile
     try:
         return data, kind(io.BytesIO(data))
     except (SyntaxError, OSError, ValueError) as error:
         raise _damaged(path, error) from error
+
+
+def _is_png(data: bytes) -> bool:
+    return data.startswith(b"\x89PNG")
 
 
 def _require_upright(path: Path, header: ImageFile) -> None:
@@ -88,7 +92,7 @@ def _require_upright(path: Path, header: ImageFile) -> None:
 def _decode(path: Path, data: bytes) -> NDArray[np.uint8]:
     """(height, width, 3) BGR. OpenCV fills up damaged images, and does not report it."""
     try:
-        if not data.startswith(_PNG_START):
+        if not _is_png(data):
             return np.asarray(simplejpeg.decode_jpeg(data, "BGR", strict=True))
         PngImageFile(io.BytesIO(data)).verify()  # checksums, up to the end mark
         image = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)

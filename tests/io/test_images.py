@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import struct
 import zlib
@@ -10,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
+from PIL.ExifTags import Base
 
 from calibgraph import FileError, load_rig
 from calibgraph.io.images import load_image
@@ -81,16 +84,14 @@ def test_a_damaged_image_is_not_filled_up(name: str, tmp_path: Path) -> None:
         load_image(path, load_rig(SAMPLE).cameras["left"])
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_an_image_that_programs_turn_differently_is_refused(
-    orientation: int, tmp_path: Path
+    orientation: int, suffix: str, tmp_path: Path
 ) -> None:
-    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack(
-        "<HHIHHI", 0x0112, 3, 1, orientation, 0, 0
-    )
-    jpg, path = sample_jpeg(), tmp_path / "turned.jpg"
-    marker = b"\xff\xe1" + struct.pack(">H", len(exif) + 2)
-    path.write_bytes(jpg[:2] + marker + exif + jpg[2:])
+    exif, path = Image.Exif(), tmp_path / f"turned.{suffix}"
+    exif[Base.Orientation] = orientation
+    Image.open(io.BytesIO(sample_jpeg())).save(path, exif=exif)
     camera = load_rig(SAMPLE).cameras["left"]
     if orientation == 1:
         assert load_image(path, camera).any()
