@@ -78,7 +78,7 @@ def test_wrong_exports_are_one_line(call: Call, tmp_path: Path) -> None:
     )
     rig = SAMPLE / "rig.yaml"
     message = error_line(*call("export", rig, "--format", "tf2", "--out", rig))
-    assert "would be replaced" in message
+    assert "would replace it" in message
 
 
 def test_import_prints_a_sentence_per_camera_and_writes_a_rig(call: Call, tmp_path: Path) -> None:

@@ -90,6 +90,8 @@ def test_named_files_of_others_are_not_replaced(
         ("report", ("report", result, "--out", simulated / "notes.html")),
         ("perturb", ("perturb", result, "--out", simulated / "rig.yaml")),
         ("perturb", ("perturb", simulated, "--out", result / "calibration.yaml")),
+        ("export", ("export", simulated, "--format", "ros2", "--out", simulated / "notes.html")),
+        ("import", ("import", simulated / "rig.yaml", "--out", simulated / "settings.yaml")),
         ("bench paper", ("bench", "paper", "kitti", "--out", simulated)),
         ("tune", ("tune", "kitti", "--out", simulated / "settings.yaml")),
         ("tune", ("tune", "kitti", "--out", simulated / "rig.yaml")),
@@ -117,6 +119,9 @@ def test_what_a_command_wrote_is_replaced_by_it_but_not_while_it_is_read(
     for arguments in (
         ("match", SAMPLE, "--matcher", found, "--out", found),
         ("perturb", guess, "--out", guess),
+        ("import", guess, "--out", guess),
+        ("import", f"left={guess}", "--out", guess),
+        ("export", guess, "--format", "ros2", "--out", guess),
     ):
         assert "is read by this command" in error_line(*call(*arguments))
 
