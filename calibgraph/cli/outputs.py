@@ -122,12 +122,20 @@ def _files_at(value: object) -> Iterator[Path]:
     named = [Path(item) for item in items if isinstance(item, (str, Path))]
     texts = (item.partition("=") for item in items if isinstance(item, str))
     named += [Path(file) for _, equals, file in texts if equals]  # NAME=FILE
-    for path in filter(Path.exists, named):
+    for path in filter(_exists, named):
         rig = find_rig_file(path)
         if rig is not None:
             yield rig
         else:
             yield from (file for suffix in TABLE_SUFFIXES for file in path.glob(f"*{suffix}"))
+
+
+def _exists(path: Path) -> bool:
+    """Whether an argument is a path at all: a list of frames may be longer than any name."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def _marked_yaml(path: Path, command: str) -> Output:

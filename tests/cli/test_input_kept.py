@@ -138,6 +138,12 @@ def test_a_followed_folder_is_not_the_place_of_a_result(simulated: Path, call: C
     assert before == files_in(source)
 
 
+def test_an_argument_longer_than_a_name_is_no_file(tmp_path: Path, call: Call) -> None:
+    frames = ",".join(["0", *["7"] * 500])
+    message = error_line(*call("match", SAMPLE, "--frames", frames, "--out", tmp_path / "t.csv"))
+    assert "expected start:stop:step or positions" in message
+
+
 def test_every_command_with_an_output_declares_it() -> None:
     for command, written in {**COMMANDS, paper: outputs.benchmark}.items():
         has_output = "out" in inspect.signature(command).parameters
