@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
 import tokenize
 import zipfile
 from collections.abc import Sequence
@@ -17,6 +18,10 @@ from calibgraph.files import require_file
 
 CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
 MAX_CLOUD_BYTES = 2 * 2**30
+
+_PARSER = threading.Lock()
+"""numpy reads headers by Python's parser, which in 3.11 raises SystemError if another thread parses
+in the midst of it."""
 
 _UNREADABLE = (
     ValueError, TypeError, OSError, EOFError, MemoryError, OverflowError, RecursionError,
@@ -67,7 +72,7 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
 
 def _read_npy(path: Path) -> NDArray[np.float32]:
     try:
-        with path.open("rb") as file:  # numpy leaves it open if it is no whole archive
+        with _PARSER, path.open("rb") as file:  # numpy leaves it open if it is no whole archive
             array = np.load(file, allow_pickle=False)
     except _UNREADABLE as error:
         raise FileError(
