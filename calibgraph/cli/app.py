@@ -15,6 +15,7 @@ from typing import Annotated, TextIO
 
 import typer
 
+from calibgraph.cli.bag import bag
 from calibgraph.cli.benchmark import bench, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.exchange import export, import_
@@ -31,7 +32,7 @@ app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
     "T_a_b maps coordinates in b to coordinates in a: p_camera = T_camera_lidar * p_lidar. "
     "A RIG, ESTIMATE or REFERENCE is a rig file, a result (file or folder), a dataset folder "
-    "(its rig.yaml) or a KITTI odometry sequence folder.",
+    "(its rig.yaml), a KITTI odometry sequence folder or a ROS bag.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -60,7 +61,7 @@ def _options(
 
 
 for _command in (
-    calibrate, match, solve, report, evaluate, perturb, export, import_, simulate, weights, train,
+    calibrate, match, solve, report, evaluate, perturb, bag, export, import_, simulate, weights, train,
     tune, track,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
