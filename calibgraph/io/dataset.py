@@ -19,6 +19,7 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, BagOptions, hash_message, is_bag
 from calibgraph.io.bags.frames import frames_of_bag
+from calibgraph.io.bags.rig import describe_rig
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.images import load_image
@@ -76,7 +77,7 @@ class Dataset:
         frames: in order of time.
         folders: their sources.
         recorded: all frames of the folders, where only some of them were selected.
-        notes: what was left out of a bag, a line each.
+        notes: what was found in a bag and what was left out of it, a line each.
     """
 
     rig: Rig
@@ -152,7 +153,8 @@ def load_dataset(
     rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
     for path, other in zip(paths, rigs, strict=True):
         _require_same_lenses(paths[0], rigs[0], path, other)
-    data = Dataset(rig=rigs[0], frames=(), folders=paths)
+    notes = describe_rig(rigs[0]) if rig is None and is_bag(paths[0]) else []
+    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):

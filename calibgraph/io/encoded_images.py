@@ -1,19 +1,22 @@
-"""PNG and JPEG data, complete, as images of 8 bits."""
+"""Images from PNG and JPEG data that is complete."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 
-def decode_image(data: bytes, *, gray: bool = False) -> NDArray[np.uint8] | None:
-    """(height, width, 3) BGR, or (height, width); None if it is incomplete or no image."""
-    if not _ends_properly(data):
-        return None
-    kind = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
-    return None if image is None else np.asarray(image, dtype=np.uint8)
+def decode_image(data: bytes, kind: int = cv2.IMREAD_COLOR) -> NDArray[Any] | None:
+    """The image in PNG or JPEG data; None if it is incomplete or of another format.
+
+    Args:
+        data: the bytes.
+        kind: OpenCV's flags, by default for (height, width, 3) uint8, BGR.
+    """
+    return cv2.imdecode(np.frombuffer(data, np.uint8), kind) if _ends_properly(data) else None
 
 
 def _ends_properly(data: bytes) -> bool:

@@ -119,13 +119,17 @@ def _summary(
 ) -> str:
     """How many frames there are, how far apart their stamps are, and what was left out."""
     clouds = stamps[topics.lidar]
-    parts = [f"{len(clouds.paths)} clouds, {len(complete)} frames within {options.tolerance_s:g} s"]
+    parts = [
+        f"{len(clouds.paths)} clouds, {len(complete)} with all images within "
+        f"{options.tolerance_s:g} s"
+    ]
     for name, rows in pairs.items():
         images = stamps[topics.cameras[name].image]
         if len(complete):
             ahead = np.array(images.stamp_ns)[rows] - np.array(clouds.stamp_ns)
             ahead_ms = ahead[complete] / 1e6
-            parts.append(f"{name} {np.median(ahead_ms):+.0f} ms ({np.abs(ahead_ms).max():.0f})")
+            most = np.abs(ahead_ms).max()
+            parts.append(f"{name} {np.median(ahead_ms):+.0f} ms (median), at most {most:.0f}")
         if np.any(rows < 0):
             parts.append(f"{np.sum(rows < 0)} without an image of {name}")
     for topic, each in stamps.items():

@@ -7,6 +7,7 @@ wherever the path of an image or a cloud does.
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
-_METADATA = "metadata.yaml"
+_METADATA, _HEAD_BYTES = "metadata.yaml", 1000
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
 _REPAIR_ROS2 = "ros2 bag reindex"
 _MOST_OPEN_BAGS = 8
@@ -38,9 +39,13 @@ _MOST_OPEN_BAGS = 8
 def is_bag(path: Path | str) -> bool:
     """Whether a path is a ROS 1 bag, a file of a ROS 2 bag or the folder of one."""
     path = Path(path)
-    if path.suffix.lower() in (".bag", ".mcap", ".db3"):
-        return path.is_file() or (path / _METADATA).is_file()
-    return (path / _METADATA).is_file()
+    if path.suffix.lower() in (".bag", ".mcap", ".db3") and path.is_file():
+        return True
+    metadata = path / _METADATA
+    if not metadata.is_file():
+        return False
+    with metadata.open("rb") as file:
+        return b"rosbag2" in file.read(_HEAD_BYTES)
 
 
 @dataclass(frozen=True)
@@ -176,6 +181,9 @@ def read_message(path: Path) -> tuple[bytes, Any]:
 def _kept_open(path: Path, _changed_ns: int) -> Bag:
     """The bag, opened once: that takes seconds where it is large."""
     return Bag(path)
+
+
+os.register_at_fork(after_in_child=_kept_open.cache_clear)  # parent and child would share offsets
 
 
 def _reader(path: Path) -> Reader1 | Reader2:

@@ -109,7 +109,7 @@ def _to_8_bits(pixels: NDArray[Any]) -> Image:
 
 def _to_bgr(pixels: Image, layout: str) -> Image:
     if layout == "bgr":
-        return pixels
+        return pixels if pixels.flags.writeable else pixels.copy()
     return np.asarray(cv2.cvtColor(pixels, _TO_BGR[layout]), dtype=np.uint8)
 
 
@@ -120,9 +120,11 @@ def _of_compressed(message: Any, where: str) -> Image:
     if not data.startswith((b"\xff\xd8", b"\x89PNG")):
         raise DatasetError(f"{where}: its format {message.format!r} is neither JPEG nor PNG")
     mosaic = encoding.startswith("bayer_") and "bgr" not in codec and "rgb" not in codec
-    image = decode_image(data, gray=mosaic)
-    if image is None:
+    kind = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
+    decoded = decode_image(data, kind | cv2.IMREAD_ANYDEPTH)
+    if decoded is None:
         raise DatasetError(f"{where}: is truncated or no image of its kind; record it again")
+    image = _to_8_bits(decoded)
     if mosaic:
         return _to_bgr(image, _layout(encoding, where)[0])
     return _to_bgr(image, "rgb") if "compressed rgb" in codec else image

@@ -57,9 +57,13 @@ def choose_topics(
         if topic not in bag.topics or not bag.topics[topic].count:
             raise DatasetError(f"{bag.path}: has no messages of {topic} ({name}); {_listed(bag)}")
     chosen = {name: topic for name, topic in named.items() if name != LIDAR}
-    wanted = list(cameras) if cameras is not None else list(chosen)
-    found = _found_cameras(bag, calibrated=not wanted)
+    wanted = list(chosen) if cameras is None else list(cameras)
+    for name in set(chosen) - set(wanted):
+        raise DatasetError(f"--topic {name}: the rig has no such camera, but {', '.join(wanted)}")
+    found = _found_cameras(bag, calibrated=True)
     names = wanted or list(found)
+    if set(names) - set(found):  # the rig has the lenses, the bag need not
+        found = {**_found_cameras(bag, calibrated=False), **found}
     if not names:
         raise DatasetError(
             f"{bag.path}: has no image topic with a camera_info beside it; {_listed(bag)}: give a "
