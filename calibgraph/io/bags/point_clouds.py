@@ -29,17 +29,18 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
     """
     points = _structured(message, where)
     cloud = np.full((len(points), 4), np.nan, dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite: no return
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, or is a signalling NaN
         for column, name in enumerate(points.dtype.names or ()):
             cloud[:, column] = points[name]
-    xyz = cloud[:, :3]
-    return cloud[np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)]
+        xyz = cloud[:, :3]
+        return cloud[np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)]
 
 
 def has_points(message: Any, where: str) -> bool:
     """Whether a message holds a return, by its x alone: a scan that sees nothing has none."""
     x = _structured(message, where)["x"]
-    return bool((np.isfinite(x) & (x != 0)).any())
+    with np.errstate(invalid="ignore"):
+        return bool((np.isfinite(x) & (x != 0)).any())
 
 
 def _structured(message: Any, where: str) -> NDArray[np.void]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,17 +52,15 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_calibration_from_a_bag_equals_that_from_the_folder(tmp_path: Path, kind: str) -> None:
+def test_a_calibration_from_a_bag_equals_that_from_the_folder(tmp_path: Path) -> None:
     rig = load_rig(SAMPLE)
-    results = [calibrate(data, rig) for data in (sample_bag(tmp_path, kind), SAMPLE)]
+    results = [calibrate(data, rig) for data in (sample_bag(tmp_path, "mcap"), SAMPLE)]
     for name in rig.cameras:
         one, two = (result.T_camera_lidar[name] for result in results)
         np.testing.assert_array_equal(one, two)
         np.testing.assert_array_equal(*(result.covariance[name] for result in results))
     assert results[0].verdict.status == results[1].verdict.status
     assert list(results[0].inputs) != list(results[1].inputs)
-    results[0].save(tmp_path / "result")
 
 
 def changed(
@@ -172,7 +169,7 @@ def test_clocks_that_differ_are_named_and_the_time_of_recording_serves(tmp_path:
     assert numbers(load_dataset(bag, bag=BagOptions(stamps="record"))) == [0, 1, 2, 3, 4, 5]
 
 
-def test_messages_recorded_in_the_same_nanosecond_are_told_apart(tmp_path: Path) -> None:
+def test_messages_recorded_in_the_same_nanosecond_stay_apart(tmp_path: Path) -> None:
     def at_once(number: int, each: Stamped) -> Stamped:
         return replace(each, record_ns=START_NS)
 
@@ -181,8 +178,8 @@ def test_messages_recorded_in_the_same_nanosecond_are_told_apart(tmp_path: Path)
         np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
 
 
-def long_bag(folder: Path, kind: str, frames: int, **cloud: Any) -> Path:
-    """A bag of many small frames, 0.1 s apart: the sample's with tiny clouds."""
+def long_bag(folder: Path, kind: str, frames: int) -> Path:
+    """A bag of the sample's frames, again and again, 0.1 s apart."""
     data = load_dataset(SAMPLE)
     many = [replace(data.frames[k % 6], index=k) for k in range(frames)]
     return write_bag(
