@@ -198,8 +198,10 @@ def _reader(path: Path) -> Reader1 | Reader2:
 
 
 def _deserializer(path: Path) -> Callable[[bytes, str], Any]:
-    store = type_store(ros1=path.suffix.lower() == ".bag")
-    return store.deserialize_ros1 if path.suffix.lower() == ".bag" else store.deserialize_cdr
+    ros1 = path.suffix.lower() == ".bag"
+    store = type_store(ros1=ros1)
+    read: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    return read
 
 
 @cache

@@ -33,7 +33,8 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
         for column, name in enumerate(points.dtype.names or ()):
             cloud[:, column] = points[name]
         xyz = cloud[:, :3]
-        return cloud[np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)]
+        returned: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
+    return np.asarray(cloud[returned], dtype=np.float32)
 
 
 def has_points(message: Any, where: str) -> bool:
