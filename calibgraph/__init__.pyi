@@ -1,5 +1,8 @@
 """The public names and where they come from."""
 
+from .doctor import Diagnosis as Diagnosis
+from .doctor import Finding as Finding
+from .doctor import diagnose as diagnose
 from .errors import CalibrationError as CalibrationError
 from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError

@@ -18,6 +18,7 @@ import typer
 from calibgraph.cli.bag import bag
 from calibgraph.cli.benchmark import bench, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
@@ -61,8 +62,8 @@ def _options(
 
 
 for _command in (
-    calibrate, match, solve, report, evaluate, perturb, bag, export, import_, simulate, weights, train,
-    tune, track,
+    calibrate, match, solve, report, evaluate, perturb, bag, doctor, export, import_, simulate,
+    weights, train, tune, track,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
 app.add_typer(bench, name="bench")
