@@ -240,9 +240,17 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
     for path in paths:
-        if not path.is_dir() and not is_bag(path):
+        if is_bag(path):
+            continue
+        if not path.is_dir():
             raise FileError(
                 path, "no such folder or ROS bag; expected a dataset, a KITTI sequence or a bag"
+            )
+        for recorded in (*path.glob("*.mcap"), *path.glob("*.db3")):
+            raise FileError(
+                path,
+                f"has no metadata.yaml, as a ROS 2 bag that was not closed; name {recorded.name}, "
+                "or write the file with `ros2 bag reindex`",
             )
     if bag is not None and not any(map(is_bag, paths)):
         raise ValueError("options for ROS bags, such as --every-s, are given without a bag")

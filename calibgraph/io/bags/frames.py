@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.options import BagOptions
+from calibgraph.io.bags.point_clouds import time_fields
 from calibgraph.io.bags.stamps import TopicStamps, nearest, read_stamps, to_every_ns, windows_of
 from calibgraph.io.bags.topics import RigTopics, choose_topics
 
@@ -88,9 +89,16 @@ def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> Ba
         )
         for row, cell in zip(complete, cells, strict=True)
     )
-    if options.every_s is None:
-        return BagFrames(recorded, tuple(range(len(recorded))), summary)
-    return BagFrames(recorded, _picked(record_ns, cells, windows), summary)
+    picked = _picked(record_ns, cells, windows) if options.every_s else range(len(recorded))
+    return BagFrames(recorded, tuple(picked), f"{summary}{_note_on_times(bag, topics.lidar)}")
+
+
+def _note_on_times(bag: Bag, topic: str) -> str:
+    """What to do if the points of a topic have times."""
+    times = time_fields(bag.first(topic))
+    if not times:
+        return ""
+    return f"; points have a {times[0]}: correct the clouds for motion, or stand still"
 
 
 def _cells(record_ns: Rows, start_ns: int, every_s: float | None) -> Rows:

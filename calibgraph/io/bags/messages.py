@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import os
 import weakref
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from threading import Lock
@@ -91,6 +94,7 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = Lock()
+        _require_closed(path)
         with _errors_in_one_line(path):
             self._reader = _reader(path)
             self._reader.open()
@@ -154,8 +158,9 @@ class Bag:
         self, topics: Collection[str], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[tuple[str, int, bytes]]:
         chosen = [each for each in self._reader.connections if each.topic in topics]
+        reader = _narrowed(self._reader, start_ns, stop_ns)
         if chosen:  # the library takes none for all
-            for connection, record_ns, data in self._reader.messages(chosen, start_ns, stop_ns):
+            for connection, record_ns, data in reader.messages(chosen, start_ns, stop_ns):
                 yield connection.topic, record_ns, data
 
 
@@ -195,6 +200,44 @@ def _reader(path: Path) -> Reader1 | Reader2:
             f"{path}: reading ROS bags needs rosbags: pip install 'calibgraph[ros]' ({error})"
         ) from error
     return Reader1(path) if path.suffix.lower() == ".bag" else Reader2(path)
+
+
+def _require_closed(path: Path) -> None:
+    """Check that a database's messages are all in its file: a recorder that crashed leaves some."""
+    for log in (path.parent if path.is_file() else path).glob("*.db3-wal"):
+        if log.stat().st_size and (path.is_dir() or log.name == f"{path.name}-wal"):
+            raise FileError(
+                path,
+                f"was not closed: {log.name} holds messages that are not yet in it; close it with "
+                f"`sqlite3 {log.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'`",
+            )
+
+
+def _narrowed(
+    reader: Reader1 | Reader2, start_ns: int | None, stop_ns: int | None
+) -> Reader1 | Reader2:
+    """The reader; of ROS 1 with the part of its index that is asked for.
+
+    It goes through its whole index from the start: 0.16 s for a window late in 200,000 messages.
+    """
+    indexes = getattr(reader, "indexes", None)
+    if indexes is None or start_ns is None or stop_ns is None:
+        return reader
+    part: Any = copy(reader)
+    part.current_chunk = (-1, BytesIO())  # closed when the next is read, so not the original's
+    part.indexes = {
+        connection: entries[
+            bisect_left(entries, start_ns, key=_time_of) : bisect_left(
+                entries, stop_ns, key=_time_of
+            )
+        ]
+        for connection, entries in indexes.items()
+    }
+    return part  # type: ignore[no-any-return]
+
+
+def _time_of(entry: Any) -> int:
+    return int(entry.time)
 
 
 def _deserializer(path: Path) -> Callable[[bytes, str], Any]:

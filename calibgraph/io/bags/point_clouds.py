@@ -11,6 +11,7 @@ from calibgraph.errors import DatasetError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY = ("intensity", "reflectivity", "i")
+_TIMES = ("t", "time", "timestamp", "offset_time", "time_offset")  # Ouster, Velodyne, Hesai, Livox
 
 
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
@@ -42,6 +43,11 @@ def has_points(message: Any, where: str) -> bool:
     x = _structured(message, where)["x"]
     with np.errstate(invalid="ignore"):
         return bool((np.isfinite(x) & (x != 0)).any())
+
+
+def time_fields(message: Any) -> list[str]:
+    """The fields that give each point a time: such clouds are often as they were scanned."""
+    return [each.name for each in message.fields if each.name in _TIMES]
 
 
 def _structured(message: Any, where: str) -> NDArray[np.void]:

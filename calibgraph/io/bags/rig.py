@@ -16,6 +16,9 @@ from calibgraph.io.bags.transforms import Tree, static_tree, transform_between
 from calibgraph.model.geometry import camera_center, relative_transform
 from calibgraph.model.rig import Camera, RelativePose, Rig
 
+_STEEP_DEG = 60
+"""A camera's body axes, taken for its optical ones, look straight up: z is up in them."""
+
 
 def rig_of_bag(
     path: Path | str,
@@ -64,6 +67,8 @@ def _describe(name: str, camera: Camera) -> str:
     yaw, pitch = np.degrees([np.arctan2(left, ahead), np.arctan2(up, np.hypot(ahead, left))])
     across = f"{abs(yaw):.0f} deg {'left' if yaw > 0 else 'right'} of +x"
     upward = f"{abs(pitch):.0f} deg {'up' if pitch > 0 else 'down'}"
+    if abs(pitch) > _STEEP_DEG:
+        upward += " (are these the optical axes, z ahead and y down?)"
     return (
         f"{name}: {camera.model}, {camera.width_px}x{camera.height_px} px; in the LiDAR's frame at "
         f"x {x:.2f} y {y:.2f} z {z:.2f} m, looks {across} and {upward}"

@@ -58,6 +58,21 @@ def test_overwritten_bytes_end_in_one_line_or_in_data(tmp_path: Path, kind: str)
     assert refused
 
 
+def test_a_recording_that_was_not_closed_is_named(tmp_path: Path) -> None:
+    rig, bag = load_rig(SAMPLE), sample_bag(tmp_path, "sqlite3")
+    (bag / "metadata.yaml").rename(tmp_path / "metadata.yaml")
+    with pytest.raises(FileError, match=r"has no metadata.yaml, .* name drive_sqlite3.db3, or"):
+        load_dataset(bag, rig)
+    assert len(load_dataset(bag / "drive_sqlite3.db3", rig).frames) == 6
+    log = bag / "drive_sqlite3.db3-wal"
+    log.write_bytes(b"messages")
+    for path in (bag / "drive_sqlite3.db3", bag):
+        if path == bag:
+            (tmp_path / "metadata.yaml").rename(bag / "metadata.yaml")
+        with pytest.raises(FileError, match="was not closed: drive_sqlite3.db3-wal holds messages"):
+            load_dataset(path, rig)
+
+
 def test_a_file_of_another_kind_is_no_bag(tmp_path: Path) -> None:
     path = tmp_path / "drive.bag"
     path.write_bytes(b"no bag at all")

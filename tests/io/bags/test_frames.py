@@ -215,6 +215,28 @@ def test_bags_and_folders_form_one_problem(tmp_path: Path) -> None:
     assert data.neighbour(data.frames[5], 1) is None
 
 
+def test_times_of_points_are_noticed(tmp_path: Path) -> None:
+    make = Messages("mcap")
+
+    def with_times(_: int, each: Stamped) -> Stamped:
+        if each.topic != POINTS:
+            return each
+        points = np.zeros(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])
+        points["x"] = 5.0
+        return replace(each, content=make.cloud(points, stamp_of(each)))
+
+    data = load_dataset(changed(tmp_path, with_times))
+    assert data.notes[-1].endswith("points have a t: correct the clouds for motion, or stand still")
+
+
+def test_a_file_of_a_bag_is_a_bag(tmp_path: Path) -> None:
+    bag = sample_bag(tmp_path, "mcap")
+    data = load_dataset(bag / "drive_mcap.mcap")
+    np.testing.assert_array_equal(
+        data.frames[5].load_cloud(), load_dataset(bag).frames[5].load_cloud()
+    )
+
+
 def test_options_of_bags_are_checked() -> None:
     with pytest.raises(ValueError, match="are given without a bag"):
         load_dataset(SAMPLE, bag=BagOptions(every_s=1.0))

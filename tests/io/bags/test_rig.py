@@ -83,6 +83,18 @@ def test_a_rig_is_described_in_a_sentence_per_camera(tmp_path: Path) -> None:
     )
 
 
+def test_body_axes_in_place_of_optical_ones_are_noticed(tmp_path: Path) -> None:
+    edges = [("velodyne", "eye", shifted(0.5, 0.0, -0.3))]  # x ahead, as the LiDAR's
+    messages = [
+        *sample_messages(MAKE)[-4:],
+        Stamped("/left/camera_info", "sensor_msgs/msg/CameraInfo", START_NS,
+                MAKE.camera_info(make_camera(), "eye")),
+        Stamped("/tf_static", TREE, START_NS, MAKE.transforms(edges)),
+    ]  # fmt: skip
+    (line,) = describe_rig(rig_of_bag(write_bag(tmp_path, "mcap", messages)))
+    assert line.endswith("90 deg up (are these the optical axes, z ahead and y down?)")
+
+
 def test_what_is_missing_for_a_rig_is_named(tmp_path: Path) -> None:
     messages = sample_messages(MAKE)
     bag = write_bag(tmp_path / "a", "mcap", without(messages, "/tf_static"))
