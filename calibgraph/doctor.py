@@ -17,6 +17,7 @@ from calibgraph.io.dataset import Dataset, Frame, hash_source, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs
+from calibgraph.matching.standstill import same_places
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
@@ -94,8 +95,9 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
-    examined = data.spread_out(MOST_FRAMES).frames
-    clouds = _examine_frames(examined, data.rig, findings)
+    examined = data.spread_out(MOST_FRAMES)
+    clouds = _examine_frames(examined.frames, data.rig, findings)
+    findings += _examine_places(examined)
     seen: dict[str, int] = {}
     written: list[Path] = []
     if clouds:
@@ -203,8 +205,26 @@ def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding
         others = f", and {len(repeated) - 1} more repeat one" if repeated[1:] else ""
         yield Finding(
             "warning",
-            f"frames {repeated[0][0]} and {repeated[0][1]} have the same {what}{others}; they "
-            "count as independent, so leave repeats out",
+            f"frames {repeated[0][0]} and {repeated[0][1]} have the same {what}{others}; leave "
+            "repeats out",
+        )
+
+
+def _examine_places(data: Dataset) -> Iterator[Finding]:
+    """How many places the frames are of, if the vehicle stands in some."""
+    try:
+        places = same_places(data, data.rig)
+    except (CalibrationError, OSError):  # which is a finding already
+        return
+    if places:
+        names = {frame.index: frame.name for frame in data.frames}
+        most = max(places, key=len)
+        count = len(data.frames) - sum(len(place) - 1 for place in places)
+        yield Finding(
+            "warning",
+            f"{len(data.frames)} frames are of {count} places: the vehicle stands, as in "
+            f"{len(most)} frames from {names[most[0]]} to {names[most[-1]]}; frames of one place "
+            f"count as one, and {MIN_FRAMES_FOR_ERROR_BAR} are needed for an error bar",
         )
 
 

@@ -69,12 +69,21 @@ def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
     found = diagnose([folder])
     assert found.healthy
     assert texts(found, "warning") == [
-        "frames 000001 and 000004 have the same cloud; they count as independent, so leave repeats "
-        "out",
-        "frames 000002 and 000003 have the same image of left, and 1 more repeat one; they count "
-        "as independent, so leave repeats out",
+        "frames 000001 and 000004 have the same cloud; leave repeats out",
+        "frames 000002 and 000003 have the same image of left, and 1 more repeat one; leave "
+        "repeats out",
     ]
     assert "4 frames give no error bar" in texts(diagnose([folder], frames="0:4"), "warning")[0]
+
+
+def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
+    for camera in (folder / "cameras").iterdir():
+        for name in ("000003", "000004"):
+            shutil.copy(camera / "000002.jpg", camera / f"{name}.jpg")
+    warnings = texts(diagnose([folder]), "warning")
+    assert warnings[-1].startswith(
+        "6 frames are of 4 places: the vehicle stands, as in 3 frames from 000002 to 000004;"
+    )
 
 
 def test_a_guess_that_sees_nothing_is_named_with_what_it_may_be() -> None:

@@ -51,6 +51,21 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
     assert len({hash_source(path) for path in paths}) == len(paths)
 
 
+@pytest.mark.realdata
+@pytest.mark.parametrize("kind", KINDS)
+def test_recorded_frames_are_the_same_from_a_bag(tmp_path: Path, realdata: Path, kind: str) -> None:
+    folder = load_dataset(realdata / "kitti_odometry" / "sequences" / "05", frames="0:3")
+    for raw in (False, True):
+        bag = sample_bag(tmp_path / str(raw), kind, data=folder, raw=raw)
+        data = load_dataset(bag)
+        for found, expected in zip(data.frames, folder.frames, strict=True):
+            np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
+            for name, camera in data.rig.cameras.items():
+                np.testing.assert_array_equal(
+                    found.load_image(name, camera), expected.load_image(name, camera)
+                )
+
+
 @pytest.mark.slow
 def test_a_calibration_from_a_bag_equals_that_from_the_folder(tmp_path: Path) -> None:
     rig = load_rig(SAMPLE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +29,6 @@ from calibgraph.io.bags.messages import type_store  # noqa: E402
 KINDS = ("ros1", "sqlite3", "mcap")
 STORES = {ros1: type_store(ros1=ros1) for ros1 in (True, False)}
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
-POINT_FIELDS = ("x", "y", "z", "intensity")
-
-Make = Callable[["Messages"], Any]
 
 
 @dataclass(frozen=True)
@@ -223,7 +220,7 @@ def sample_messages(
         )
     for number, frame in enumerate(data.frames):
         stamp_ns = START_NS + number * PERIOD_NS
-        cloud = make.cloud(structured(np.load(frame.cloud_path)), stamp_ns)
+        cloud = make.cloud(structured(frame.load_cloud()), stamp_ns)
         written.append(Stamped("/points", "sensor_msgs/msg/PointCloud2", stamp_ns + 9, cloud))
         for name, path in frame.image_paths.items():
             if raw:
@@ -232,7 +229,7 @@ def sample_messages(
                     Stamped(f"/{name}/image_raw", "sensor_msgs/msg/Image", stamp_ns, image)
                 )
             else:
-                jpeg = make.compressed(path.read_bytes(), "jpeg", stamp_ns + 3_000_000)
+                jpeg = make.compressed(path.read_bytes(), path.suffix[1:], stamp_ns + 3_000_000)
                 topic = f"/{name}/image_raw/compressed"
                 written.append(Stamped(topic, "sensor_msgs/msg/CompressedImage", stamp_ns, jpeg))
     return written
@@ -246,8 +243,3 @@ def sample_bag(folder: Path, kind: str, **options: Any) -> Path:
 def without(messages: Iterable[Stamped], topic: str) -> list[Stamped]:
     """The messages of all other topics."""
     return [each for each in messages if each.topic != topic]
-
-
-def fields_of(mapping: Mapping[str, Any]) -> list[str]:
-    """The keys of a mapping, sorted."""
-    return sorted(mapping)
