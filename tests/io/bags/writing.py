@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibgraph import Camera, Dataset, Rig, load_dataset
+from calibgraph.io.bags.messages import type_store
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 
@@ -23,8 +24,6 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
-
-from calibgraph.io.bags.messages import type_store  # noqa: E402
 
 KINDS = ("ros1", "sqlite3", "mcap")
 STORES = {ros1: type_store(ros1=ros1) for ros1 in (True, False)}
@@ -167,6 +166,7 @@ def write_bag(folder: Path, kind: str, messages: Iterable[Stamped]) -> Path:
     """
     ros1 = kind == "ros1"
     store, path = STORES[ros1], folder / ("drive.bag" if ros1 else f"drive_{kind}")
+    folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if ros1:
             writer: Any = stack.enter_context(Writer1(path))
