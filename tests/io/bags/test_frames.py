@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, Dataset, DatasetError, calibrate, load_dataset, load_rig
+from calibgraph import BagOptions, Dataset, DatasetError, Frame, calibrate, load_dataset, load_rig
 from calibgraph.io.dataset import hash_source
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -250,6 +251,31 @@ def test_a_file_of_a_bag_is_a_bag(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         data.frames[5].load_cloud(), load_dataset(bag).frames[5].load_cloud()
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "compression"),
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"),
+     ("mcap", "STORAGE")],
+)  # fmt: skip
+def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: str) -> None:
+    messages = sample_messages(Messages(kind))
+    data = load_dataset(write_bag(tmp_path, kind, messages, compression=compression))
+    for found, expected in zip(data.frames, load_dataset(SAMPLE).frames, strict=True):
+        np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
+        for name, camera in data.rig.cameras.items():
+            np.testing.assert_array_equal(
+                found.load_image(name, camera), expected.load_image(name, camera)
+            )
+
+
+def test_threads_read_a_bag_at_the_same_time(tmp_path: Path) -> None:
+    for kind in KINDS:
+        frames = load_dataset(long_bag(tmp_path, kind, 30)).frames
+        alone = [frame.load_cloud() for frame in frames]
+        with ThreadPoolExecutor(8) as pool:
+            for one, two in zip(pool.map(Frame.load_cloud, frames), alone, strict=True):
+                np.testing.assert_array_equal(one, two)
 
 
 def test_options_of_bags_are_checked() -> None:

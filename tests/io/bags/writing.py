@@ -21,7 +21,7 @@ from tests.conftest import SAMPLE
 pytest.importorskip("rosbags")
 
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
 
@@ -158,8 +158,16 @@ def structured(
     return points
 
 
-def write_bag(folder: Path, kind: str, messages: Iterable[Stamped]) -> Path:
+def write_bag(
+    folder: Path, kind: str, messages: Iterable[Stamped], *, compression: str = ""
+) -> Path:
     """Write a bag.
+
+    Args:
+        folder: where to.
+        kind: of the bag.
+        messages: its messages.
+        compression: BZ2 or LZ4 of ROS 1; FILE, MESSAGE or STORAGE of ROS 2.
 
     Returns:
         The .bag file of ROS 1, or the folder of a ROS 2 bag.
@@ -169,10 +177,15 @@ def write_bag(folder: Path, kind: str, messages: Iterable[Stamped]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         if ros1:
-            writer: Any = stack.enter_context(Writer1(path))
+            writer: Any = Writer1(path)
+            if compression:
+                writer.set_compression(Writer1.CompressionFormat[compression])
         else:
             plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-            writer = stack.enter_context(Writer2(path, version=9, storage_plugin=plugin))
+            writer = Writer2(path, version=9, storage_plugin=plugin)
+            if compression:
+                writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+        stack.enter_context(writer)
         connections: dict[str, Any] = {}
         for each in messages:
             if each.topic not in connections:
