@@ -41,7 +41,8 @@ def bag(
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static."""
     from calibgraph.files import require_place_for_file
-    from calibgraph.io.bags.rig import describe_rig, rig_of_bag
+    from calibgraph.io.bags.rig import doubtful_axes, rig_of_bag
+    from calibgraph.io.formats.words import describe_rig
     from calibgraph.io.rigs import require_replaceable_rig
 
     if out is not None:
@@ -60,7 +61,7 @@ def bag(
     if as_json:
         _print_json(topics, rig, out)
         return
-    for line in describe_rig(rig):
+    for line in (*describe_rig(rig), *doubtful_axes(rig)):
         print_plain(terminal(), line)
     if out is not None:
         print_plain(terminal(), f"{out}: written")

@@ -19,9 +19,10 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, BagOptions, hash_message, is_bag
 from calibgraph.io.bags.frames import frames_of_bag
-from calibgraph.io.bags.rig import describe_rig
+from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.dataset_folders import frames_of_folder
+from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.images import load_image
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Camera, Rig
@@ -153,8 +154,9 @@ def load_dataset(
     rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
     for path, other in zip(paths, rigs, strict=True):
         _require_same_lenses(paths[0], rigs[0], path, other)
-    notes = describe_rig(rigs[0]) if rig is None and is_bag(paths[0]) else []
-    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=tuple(notes))
+    from_bag = rig is None and is_bag(paths[0])
+    notes = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
+    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):

@@ -36,7 +36,7 @@ def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> N
     code, _, err = call("bag", bag, "--out", out)
     assert code == 0
     assert "/points  sensor_msgs/msg/PointCloud2  6\n" in err
-    assert "left: pinhole, 640x360 px; in the LiDAR's frame at" in err
+    assert "left looks along LiDAR +y, 14 deg to the right" in err
     for name, camera in load_rig(SAMPLE).cameras.items():
         T = load_rig(out).cameras[name].T_camera_lidar
         np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.model.rig import MODELS_OF_OTHERS
+from factors import LensModel
 
 Array = NDArray[np.float64]
 
-_PINHOLE = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential")
-_FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
-_PINHOLE_LENGTHS = (0, 4, 5, 8)
-_FISHEYE_LENGTH = 4
+_MODELS: Mapping[str, LensModel] = {**MODELS_OF_OTHERS, "fisheye": "fisheye"}
+_LENGTHS: Mapping[LensModel, Sequence[int]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,12 @@ def _on_image(message: Any, K: Array) -> dict[str, Any]:
 def _distortion(message: Any, where: str) -> tuple[str, list[float]]:
     """Lens model and coefficients; both may be empty for none, and zeros appended."""
     given = np.trim_zeros(_field(message, "D"), "b").tolist()
-    name = message.distortion_model.strip().lower()
-    if name in _FISHEYE and len(given) <= _FISHEYE_LENGTH:
-        return "fisheye", _padded(given, [_FISHEYE_LENGTH])
-    if not given or (name in _PINHOLE and len(given) <= max(_PINHOLE_LENGTHS)):
-        return "pinhole", _padded(given, _PINHOLE_LENGTHS)
+    model = _MODELS.get(message.distortion_model.strip().lower(), None if given else "pinhole")
+    if model is not None and len(given) <= max(_LENGTHS[model]):
+        return model, _padded(given, _LENGTHS[model])
     raise DatasetError(
         f"{where}: distortion model {message.distortion_model!r} with {len(given)} coefficients is "
-        f"unknown; known are {', '.join((*_PINHOLE, *_FISHEYE))}: give a rig with the lens (--rig)"
+        f"unknown; known are {', '.join(_MODELS)}: give a rig with the lens (--rig)"
     )
 
 

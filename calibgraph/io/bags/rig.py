@@ -2,22 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.files import checked_model
-from calibgraph.io.bags.camera_info import lens_of
+from calibgraph.io.bags.camera_info import CameraLens, lens_of
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.options import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Tree, static_tree, transform_between
-from calibgraph.model.geometry import camera_center, relative_transform
+from calibgraph.model.geometry import relative_transform
 from calibgraph.model.rig import Camera, RelativePose, Rig
 
-_STEEP_DEG = 60
-"""A camera's body axes, taken for its optical ones, look straight up: z is up in them."""
+Array = NDArray[np.float64]
+
+_UPWARD = 0.9
+"""Vertical part of a camera's axis (64 deg), beyond which it looks up: z is up in body axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class BagCamera:
+    """A camera of a bag.
+
+    Attributes:
+        lens: from its CameraInfo.
+        T_camera_lidar: (4, 4); None if /tf_static does not connect it with the LiDAR.
+        where: its CameraInfo, for errors.
+    """
+
+    lens: CameraLens
+    T_camera_lidar: Array | None
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class BagRig:
+    """The LiDAR's frame, the cameras by name, and all frames of /tf_static."""
+
+    lidar: str
+    cameras: Mapping[str, BagCamera]
+    frames: tuple[str, ...]
+
+
+def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
+    """What a bag holds about its rig; extrinsics may be missing.
+
+    Args:
+        path: the bag.
+        options: which topics; those found by type if None.
+
+    Raises:
+        FileError, DatasetError: if the bag is damaged, or a topic or a lens is missing.
+    """
+    bag = Bag(path)
+    chosen = choose_topics(bag, (options or BagOptions()).topics)
+    lidar = bag.first(chosen.lidar).header.frame_id.lstrip("/")
+    tree = static_tree(bag)
+    cameras = {
+        name: _read_camera(bag, name, topics, tree, lidar)
+        for name, topics in chosen.cameras.items()
+    }
+    return BagRig(lidar, cameras, tuple(sorted(tree)))
 
 
 def rig_of_bag(
@@ -41,41 +92,29 @@ def rig_of_bag(
     Raises:
         FileError, DatasetError: if the bag is damaged, or a topic, a lens or a transform missing.
     """
-    bag = Bag(Path(path))
-    chosen = choose_topics(bag, (options or BagOptions()).topics)
-    lidar = bag.first(chosen.lidar).header.frame_id.lstrip("/")
-    tree = static_tree(bag)
+    read = read_bag_rig(Path(path), options)
     cameras = {
-        name: _camera(bag, name, topics, tree, lidar) for name, topics in chosen.cameras.items()
+        name: checked_model(Camera, _content(name, camera, read), camera.where)
+        for name, camera in read.cameras.items()
     }
     content = {
-        "lidar": lidar,
+        "lidar": read.lidar,
         "cameras": cameras,
         "relative_poses": _relative_poses(cameras, relative_sigmas),
     }
     return checked_model(Rig, content, path)
 
 
-def describe_rig(rig: Rig) -> list[str]:
-    """A sentence per camera: where it sits, and where it looks, as +x of the LiDAR is ahead."""
-    return [_describe(name, camera) for name, camera in rig.cameras.items()]
+def doubtful_axes(rig: Rig) -> list[str]:
+    """A line for each camera that looks straight up, as with body axes for optical ones."""
+    return [
+        f"{name} looks straight up: is the frame of its camera_info optical, z ahead and y down?"
+        for name, T_camera_lidar in rig.T_camera_lidar.items()
+        if T_camera_lidar[2, 2] > _UPWARD
+    ]
 
 
-def _describe(name: str, camera: Camera) -> str:
-    x, y, z = camera_center(camera.T_camera_lidar)
-    ahead, left, up = camera.T_camera_lidar[2, :3]
-    yaw, pitch = np.degrees([np.arctan2(left, ahead), np.arctan2(up, np.hypot(ahead, left))])
-    across = f"{abs(yaw):.0f} deg {'left' if yaw > 0 else 'right'} of +x"
-    upward = f"{abs(pitch):.0f} deg {'up' if pitch > 0 else 'down'}"
-    if abs(pitch) > _STEEP_DEG:
-        upward += " (are these the optical axes, z ahead and y down?)"
-    return (
-        f"{name}: {camera.model}, {camera.width_px}x{camera.height_px} px; in the LiDAR's frame at "
-        f"x {x:.2f} y {y:.2f} z {z:.2f} m, looks {across} and {upward}"
-    )
-
-
-def _camera(bag: Bag, name: str, topics: CameraTopics, tree: Tree, lidar: str) -> Camera:
+def _read_camera(bag: Bag, name: str, topics: CameraTopics, tree: Tree, lidar: str) -> BagCamera:
     if topics.info is None:
         raise DatasetError(
             f"{bag.path}: {topics.image} has no camera_info beside it; give a rig with the lens of "
@@ -85,18 +124,27 @@ def _camera(bag: Bag, name: str, topics: CameraTopics, tree: Tree, lidar: str) -
     where = f"{bag.path}: {topics.info}"
     lens = lens_of(bag.first(topics.info), where, rectified=topics.rectified)
     T_frame_lidar = transform_between(tree, lens.frame, lidar)
-    if T_frame_lidar is None:
-        frames = ", ".join(sorted(tree)) or "none"
-        raise DatasetError(
-            f"{bag.path}: /tf_static does not connect the LiDAR's frame {lidar!r} with the frame "
-            f"{lens.frame!r} of camera {name!r}; its frames are {frames}: give a rig with the "
-            "guess (--rig)",
-            camera=name,
-        )
     T_image_frame = np.eye(4)
     T_image_frame[:3, :3] = lens.R_image_frame
-    content = {**lens.content, "T_camera_lidar": T_image_frame @ T_frame_lidar}
-    return checked_model(Camera, content, where)
+    T_camera_lidar = None if T_frame_lidar is None else T_image_frame @ T_frame_lidar
+    return BagCamera(lens, T_camera_lidar, where)
+
+
+def _content(name: str, camera: BagCamera, read: BagRig) -> dict[str, Any]:
+    """The fields of a Camera.
+
+    Raises:
+        DatasetError: if the extrinsic is missing.
+    """
+    if camera.T_camera_lidar is None:
+        raise DatasetError(
+            f"{camera.where}: /tf_static does not connect the LiDAR's frame {read.lidar!r} with "
+            f"the frame {camera.lens.frame!r} of camera {name!r}; its frames are "
+            f"{', '.join(read.frames) or 'none'}: give a rig with the guess (--rig), or import the "
+            "bag together with a URDF",
+            camera=name,
+        )
+    return {**camera.lens.content, "T_camera_lidar": camera.T_camera_lidar}
 
 
 def _relative_poses(

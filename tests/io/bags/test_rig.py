@@ -8,10 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, DatasetError, load_rig, rig_of_bag
+from calibgraph import (
+    BagOptions,
+    CalibrationError,
+    DatasetError,
+    describe_rig,
+    import_rig,
+    load_dataset,
+    load_rig,
+    rig_of_bag,
+)
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.messages import Bag
-from calibgraph.io.bags.rig import describe_rig
+from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.transforms import static_tree, transform_between
 from calibgraph.model.geometry import relative_transform
 from tests.conftest import SAMPLE, make_camera
@@ -78,8 +87,8 @@ def test_the_cameras_relative_poses_are_measurements_only_on_request(tmp_path: P
 def test_a_rig_is_described_in_a_sentence_per_camera(tmp_path: Path) -> None:
     bag = write_bag(tmp_path, "mcap", sample_messages(MAKE))
     assert describe_rig(rig_of_bag(bag))[2] == (
-        "left: pinhole, 640x360 px; in the LiDAR's frame at x -0.05 y 0.29 z -0.19 m, looks 76 deg "
-        "left of +x and 3 deg down"
+        "left looks along LiDAR +y, 14 deg to the right, 3 deg down, sits 0.05 m behind, 0.29 m "
+        "left and 0.19 m below the LiDAR"
     )
 
 
@@ -91,8 +100,33 @@ def test_body_axes_in_place_of_optical_ones_are_noticed(tmp_path: Path) -> None:
                 MAKE.camera_info(make_camera(), "eye")),
         Stamped("/tf_static", TREE, START_NS, MAKE.transforms(edges)),
     ]  # fmt: skip
-    (line,) = describe_rig(rig_of_bag(write_bag(tmp_path, "mcap", messages)))
-    assert line.endswith("90 deg up (are these the optical axes, z ahead and y down?)")
+    bag = write_bag(tmp_path, "mcap", messages)
+    line = "left looks straight up: is the frame of its camera_info optical, z ahead and y down?"
+    assert doubtful_axes(rig_of_bag(bag)) == [line]
+    assert line in load_dataset(bag).notes
+    assert not doubtful_axes(load_rig(SAMPLE))
+
+
+def test_a_bag_is_imported_with_the_extrinsics_of_another_file(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "a", "mcap", sample_messages(MAKE))
+    whole = import_rig([bag])
+    for name, camera in rig_of_bag(bag).cameras.items():
+        assert whole.cameras[name].intrinsics_px == camera.intrinsics_px
+        assert whole.cameras[name].distortion == camera.distortion
+        np.testing.assert_array_equal(whole.T_camera_lidar[name], camera.T_camera_lidar)
+    bare = write_bag(tmp_path / "b", "mcap", without(sample_messages(MAKE), "/tf_static"))
+    with pytest.raises(CalibrationError, match="no file has its T_camera_lidar"):
+        import_rig([bare])
+    urdf = "".join(
+        f'<joint name="{n}" type="fixed"><parent link="velodyne"/><child link="{n}_optical"/>'
+        f'<origin xyz="0.5 0 {k}" rpy="-1.5707963267948966 0 -1.5707963267948966"/></joint>'
+        f'<link name="{n}_optical"/>'
+        for k, n in enumerate(whole.cameras)
+    )
+    path = tmp_path / "rig.urdf"
+    path.write_text(f'<robot name="r"><link name="velodyne"/>{urdf}</robot>')
+    T = import_rig([bare, path]).T_camera_lidar["left"]
+    np.testing.assert_allclose(T @ [3.5, 0, 2, 1], [0, 0, 3, 1], atol=1e-12)  # 3 m ahead of it
 
 
 def test_what_is_missing_for_a_rig_is_named(tmp_path: Path) -> None:
