@@ -21,7 +21,7 @@ from calibgraph.io.bags import MESSAGE_SUFFIX, BagOptions, hash_message, is_bag
 from calibgraph.io.bags.frames import frames_of_bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.clouds import load_cloud
-from calibgraph.io.dataset_folders import frames_of_folder
+from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.images import load_image
 from calibgraph.io.rigs import load_rig
@@ -242,7 +242,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
     for path in paths:
-        if is_bag(path):
+        if is_bag(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():
             raise FileError(

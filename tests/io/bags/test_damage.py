@@ -64,6 +64,11 @@ def test_a_recording_that_was_not_closed_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"has no metadata.yaml, .* name drive_sqlite3.db3, or"):
         load_dataset(bag, rig)
     assert len(load_dataset(bag / "drive_sqlite3.db3", rig).frames) == 6
+    (tmp_path / "dataset").mkdir()
+    for name in ("lidar", "cameras", "drive.db3"):  # a bag may lie beside a dataset's files
+        source = bag / "drive_sqlite3.db3" if name == "drive.db3" else SAMPLE / name
+        (tmp_path / "dataset" / name).symlink_to(source)
+    assert load_dataset(tmp_path / "dataset", rig).frames[0].cloud_path.suffix == ".npy"
     log = bag / "drive_sqlite3.db3-wal"
     log.write_bytes(b"messages")
     for path in (bag / "drive_sqlite3.db3", bag):
