@@ -18,7 +18,7 @@ $(VENV)/base: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/base
-	$(INSTALL) --editable '.[test,pointcloud,learned]'
+	$(INSTALL) --editable '.[test,pointcloud,learned,ros]'
 	@touch $@
 
 install: $(VENV)/base ## Install into .venv

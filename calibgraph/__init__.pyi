@@ -1,10 +1,15 @@
 """The public names and where they come from."""
 
+from .doctor import Diagnosis as Diagnosis
+from .doctor import Finding as Finding
+from .doctor import diagnose as diagnose
 from .errors import CalibrationError as CalibrationError
 from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError
 from .errors import FileError as FileError
 from .errors import RigError as RigError
+from .io.bags.options import BagOptions as BagOptions
+from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.calibrations import load_calibration as load_calibration
 from .io.camera_match_tables import load_camera_matches as load_camera_matches
 from .io.correspondence_tables import load_correspondences as load_correspondences

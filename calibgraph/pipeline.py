@@ -14,8 +14,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.files import sha256
-from calibgraph.io.dataset import Dataset
+from calibgraph.io.dataset import Dataset, hash_source
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
@@ -151,4 +150,4 @@ def hash_inputs(dataset: Dataset) -> dict[str, str]:
     files = [
         path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
     ]
-    return {str(path): sha256(path) for path in files}
+    return {str(path): hash_source(path) for path in files}

@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from calibgraph.cli import outputs
+from calibgraph.cli.bag import bag
 from calibgraph.cli.benchmark import bench, paper, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
@@ -35,7 +37,7 @@ app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
     "T_a_b maps coordinates in b to coordinates in a: p_camera = T_camera_lidar * p_lidar. "
     "A RIG, ESTIMATE or REFERENCE is a rig file, a result (file or folder), a dataset folder "
-    "(its rig.yaml) or a KITTI odometry sequence folder.",
+    "(its rig.yaml), a KITTI odometry sequence folder or a ROS bag.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -70,6 +72,8 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     report: outputs.page,
     evaluate: outputs.nothing,
     perturb: outputs.guess,
+    bag: outputs.rig_of_bag,
+    doctor: outputs.pictures,
     export: outputs.exported,
     import_: outputs.imported,
     simulate: outputs.nothing,

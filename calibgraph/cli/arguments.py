@@ -7,7 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+
 if TYPE_CHECKING:
+    from calibgraph.io.bags import BagOptions
     from calibgraph.io.dataset import Dataset
     from calibgraph.matching.protocol import Matcher
     from calibgraph.model.config import Config, Terms
@@ -26,19 +29,52 @@ def checked_arguments() -> Iterator[None]:
         raise CalibrationError(str(error)) from error
 
 
-def dataset_from(folders: list[Path], rig: Path | None, frames: str | None) -> Dataset:
-    """The dataset in these folders.
+def dataset_from(
+    folders: list[Path], rig: Path | None, frames: str | None, bag: BagOptions | None = None
+) -> Dataset:
+    """The dataset in these folders; of bags, a line each is printed.
 
     Args:
         folders: of one rig.
         rig: file of the initial guess; the dataset's own if None.
         frames: positions, ``A:B:STEP``; all if None.
+        bag: how ROS bags are read.
     """
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
+    with checked_arguments(), progress_bar("reading"):
+        data = load_dataset(folders, load_rig(rig) if rig else None, frames=frames, bag=bag)
+    for note in data.notes:
+        print_plain(terminal(), note)
+    return data
+
+
+def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | None:
+    """How bags are read; None if no option is given.
+
+    Args:
+        topic: ``NAME=/TOPIC``, each.
+        options: the fields of :class:`calibgraph.BagOptions`; None if not given.
+
+    Raises:
+        CalibrationError: if a value is out of range, or a topic has no name.
+    """
+    from calibgraph.io.bags import BagOptions
+
+    given = {name: value for name, value in options.items() if value is not None}
+    if not topic and not given:
+        return None
     with checked_arguments():
-        return load_dataset(folders, load_rig(rig) if rig else None, frames=frames)
+        named = dict(_name_and_topic(text) for text in topic or ())
+        return BagOptions(topics=named, **given)
+
+
+def _name_and_topic(text: str) -> tuple[str, str]:
+    name, _, topic = text.partition("=")
+    if not name or not topic:
+        raise ValueError(f"--topic {text}: expected NAME=/TOPIC, as in lidar=/velodyne_points")
+    return name, topic
 
 
 def matcher_from(

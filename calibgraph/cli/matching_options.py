@@ -9,11 +9,12 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from calibgraph.cli.arguments import dataset_from, matcher_from
+from calibgraph.cli.arguments import bag_options_from, dataset_from, matcher_from
 from calibgraph.cli.options import (
     BatchOption,
     DeviceOption,
     EstimateOption,
+    EverySecondsOption,
     FramesOption,
     HalfOption,
     IterationsOption,
@@ -22,7 +23,10 @@ from calibgraph.cli.options import (
     RigOption,
     SearchDegOption,
     SearchMetresOption,
+    StampsOption,
     TimeLimitOption,
+    ToleranceOption,
+    TopicOption,
     WeightsOption,
 )
 
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
 
 
 SEARCH_LIMIT_S = 1800.0
+_OF_BAGS = ("topic", "every_s", "tolerance_s", "stamps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +56,10 @@ class MatchingOptions:
     half_resolution: HalfOption = None
     occlusion_filter: OcclusionOption = None
     batch: BatchOption = None
+    topic: TopicOption = None
+    every_s: EverySecondsOption = None
+    tolerance_s: ToleranceOption = None
+    stamps: StampsOption = None
 
     @property
     def limit_s(self) -> float | None:
@@ -60,15 +69,15 @@ class MatchingOptions:
 
     def find_matcher(self, *, seed: int) -> Matcher:
         """The matcher; see :func:`calibgraph.cli.arguments.matcher_from`."""
-        own = ("rig", "matcher", "frames", "time_limit_s", "weights")
+        own = ("rig", "matcher", "frames", "time_limit_s", "weights", *_OF_BAGS)
         others = {name: value for name, value in vars(self).items() if name not in own}
-        return matcher_from(
-            self.matcher, self.weights, seed=seed, all_frames=self.frames is not None, **others
-        )
+        chosen = self.frames is not None or self.every_s is not None
+        return matcher_from(self.matcher, self.weights, seed=seed, all_frames=chosen, **others)
 
     def load_dataset(self, folders: list[Path]) -> Dataset:
         """The chosen frames of these folders."""
-        return dataset_from(folders, self.rig, self.frames)
+        bag = bag_options_from(**{name: getattr(self, name) for name in _OF_BAGS})
+        return dataset_from(folders, self.rig, self.frames, bag)
 
 
 def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -12,8 +12,8 @@ DatasetArgument = Annotated[
     list[Path],
     typer.Argument(
         metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/) or KITTI odometry sequence; "
-        "several of one rig are calibrated together.",
+        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence or ROS "
+        "bag; several of one rig are calibrated together.",
     ),
 ]
 RigOption = Annotated[
@@ -116,6 +116,42 @@ FramesOption = Annotated[
         metavar="A:B:STEP",
         help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
         "all; of more than 30 the matcher structure takes 30, evenly spread)",
+    ),
+]
+_BAGS = "ROS bags"
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=/TOPIC",
+        help="Topic of a camera's images, or of the clouds as lidar=/TOPIC; may be repeated. "
+        "(default: found by the messages' types)",
+        rich_help_panel=_BAGS,
+    ),
+]
+EverySecondsOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.001,
+        metavar="SECONDS",
+        help="One frame in this time; only its surroundings are read. (default: all frames)",
+        rich_help_panel=_BAGS,
+    ),
+]
+ToleranceOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0,
+        metavar="SECONDS",
+        help="Largest difference of the stamps of a cloud and its images. (default: 0.05)",
+        rich_help_panel=_BAGS,
+    ),
+]
+StampsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="header|record",
+        help="Stamps of the sensors, or of recording. (default: header)",
+        rich_help_panel=_BAGS,
     ),
 ]
 ConfigOption = Annotated[

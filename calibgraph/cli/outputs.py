@@ -57,6 +57,20 @@ def imported(given: Given) -> list[Output]:
     return [_marked_yaml(given["out"], "import")]
 
 
+def rig_of_bag(given: Given) -> list[Output]:
+    """A rig from a bag, if it is wanted."""
+    return [] if given["out"] is None else [_marked_yaml(given["out"], "bag")]
+
+
+def pictures(given: Given) -> list[Output]:
+    """The guess on images, which have no place for a mark."""
+    from calibgraph.outputs import Output
+
+    folder = given["out"]
+    found = [] if folder is None else sorted(folder.glob("guess_*.png"))
+    return [Output(path, "doctor, as far as can be seen") for path in found]
+
+
 def settings(given: Given) -> list[Output]:
     """Settings of the solve."""
     return [_marked_yaml(given["out"], "tune")]

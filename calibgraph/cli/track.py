@@ -30,7 +30,7 @@ def track(
             metavar="SOURCE...",
             help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
             "standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher: "
-            "dataset folders or KITTI sequences of one rig, as one drive.",
+            "dataset folders, KITTI sequences or ROS bags of one rig, as one drive.",
         ),
     ],
     out: Annotated[

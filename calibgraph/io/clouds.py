@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_file
+from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
 
 CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
 MAX_CLOUD_BYTES = 2 * 2**30
@@ -37,7 +38,8 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
     """Read a cloud.
 
     Args:
-        path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), .pcd or .ply.
+        path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), .pcd or .ply;
+            or the address of a message in a bag.
 
     Returns:
         (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
@@ -47,8 +49,10 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
         FileError: if the file is missing, truncated, empty, of another format, or has values that
             are not finite.
     """
-    path = require_file(Path(path))
-    if path.stat().st_size > MAX_CLOUD_BYTES:
+    path = Path(path)
+    if path.suffix == MESSAGE_SUFFIX:
+        return load_bag_cloud(path)
+    if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     readers = {".npy": _read_npy, ".bin": _read_bin, ".pcd": _read_open3d, ".ply": _read_open3d}
     if path.suffix.lower() not in readers:

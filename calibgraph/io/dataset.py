@@ -1,4 +1,7 @@
-"""Datasets: frames of one rig, from folders. Images and clouds are decoded when they are loaded."""
+"""Datasets: frames of one rig, from folders and ROS bags.
+
+Images and clouds are decoded when they are loaded.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError, FileError
+from calibgraph.files import sha256
+from calibgraph.io.bags import MESSAGE_SUFFIX, BagOptions, hash_message, is_bag
+from calibgraph.io.bags.frames import frames_of_bag
+from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.clouds import load_cloud
-from calibgraph.io.dataset_folders import frames_of_folder
+from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
+from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.images import load_image
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Camera, Rig
@@ -28,9 +36,9 @@ class Frame:
 
     Attributes:
         index: number of the frame in its dataset, the ``frame`` of its correspondences.
-        name: the files' stem, after the sequence's name if there are several.
-        cloud_path: the cloud's file.
-        image_paths: the image's file, per camera that has one.
+        name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
+        cloud_path: the cloud's file, or its address in a bag.
+        image_paths: the same of the image, per camera that has one.
     """
 
     index: int
@@ -70,12 +78,14 @@ class Dataset:
         frames: in order of time.
         folders: their sources.
         recorded: all frames of the folders, where only some of them were selected.
+        notes: what was found in a bag and what was left out of it, a line each.
     """
 
     rig: Rig
     frames: tuple[Frame, ...]
     folders: tuple[Path, ...]
     recorded: tuple[Frame, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def neighbour(self, frame: Frame, later: int) -> Frame | None:
         """The frame recorded ``later`` frames later in the same folder, selected or not."""
@@ -120,41 +130,74 @@ def load_dataset(
     rig: Rig | None = None,
     *,
     frames: str | None = None,
+    bag: BagOptions | None = None,
 ) -> Dataset:
-    """Find the frames of a dataset folder, a KITTI odometry sequence, or several of one rig.
+    """Find the frames of a dataset folder, a KITTI odometry sequence, a bag, or several of one rig.
 
     Args:
-        folders: one folder or several; several form one calibration problem.
-        rig: used instead of the rig in the folder.
+        folders: one or several; several form one calibration problem.
+        rig: used instead of the rig in the folder or bag.
         frames: which to keep, see :meth:`Dataset.select`; all if None. Those left out may lack
             images.
+        bag: how ROS bags are read.
 
     Raises:
         FileError, DatasetError: if a folder is missing, frames do not pair up, or the folders'
             rigs differ.
-        ValueError: if ``frames`` selects nothing, or is no selection.
+        ValueError: if ``frames`` selects nothing, or is no selection; or if ``bag`` is given
+            without a bag.
     """
     if isinstance(folders, (str, Path)):
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
-    if not paths:
-        raise ValueError("no dataset folder given")
-    for path in paths:
-        _require_folder(path)
-    rigs = [rig if rig is not None else load_rig(path) for path in paths]
+    _require_folders(paths, bag)
+    rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
     for path, other in zip(paths, rigs, strict=True):
         _require_same_lenses(paths[0], rigs[0], path, other)
-    found = [
-        (f"{path.name}/" if len(paths) > 1 else "", files)
-        for path in paths
-        for files in frames_of_folder(path, list(rigs[0].cameras), complete=frames is None)
-    ]
-    recorded = tuple(
-        Frame(index, prefix + files.stem, files.cloud, files.images)
-        for index, (prefix, files) in enumerate(found)
-    )
-    data = Dataset(rig=rigs[0], frames=recorded, folders=paths)
+    from_bag = rig is None and is_bag(paths[0])
+    notes = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
+    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
+    for path in paths:
+        prefix = f"{path.name}/" if len(paths) > 1 else ""
+        if is_bag(path):
+            data = _with_bag(data, path, prefix, bag or BagOptions())
+        else:
+            data = _with_folder(data, path, prefix, complete=frames is None)
+    if data.recorded == data.frames:
+        data = replace(data, recorded=())
     return data if frames is None else _complete(data.select(frames))
+
+
+def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:
+    """The dataset with the frames of a folder; of complete ones if not all are needed."""
+    start = _next_index(data)
+    found = tuple(
+        Frame(start + number, prefix + files.stem, files.cloud, files.images)
+        for number, files in enumerate(
+            frames_of_folder(path, list(data.rig.cameras), complete=complete)
+        )
+    )
+    return _with(data, found, found)
+
+
+def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
+    """The dataset with the frames of a bag."""
+    start = _next_index(data)
+    found = frames_of_bag(path, list(data.rig.cameras), options)
+    recorded = tuple(
+        Frame(start + each.number, f"{prefix}{each.stamp_ns}", each.cloud, each.images)
+        for each in found.recorded
+    )
+    data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
+    return _with(data, tuple(recorded[i] for i in found.picked), recorded)
+
+
+def _with(data: Dataset, frames: tuple[Frame, ...], recorded: tuple[Frame, ...]) -> Dataset:
+    return replace(data, frames=(*data.frames, *frames), recorded=(*data.recorded, *recorded))
+
+
+def _next_index(data: Dataset) -> int:
+    return 1 + max((frame.index for frame in data.recorded), default=-1)
 
 
 def _complete(data: Dataset) -> Dataset:
@@ -176,6 +219,11 @@ def _complete(data: Dataset) -> Dataset:
     return replace(data, recorded=tuple(recorded))
 
 
+def hash_source(path: Path) -> str:
+    """SHA-256 of an image's or a cloud's file, or of its message in a bag."""
+    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)
+
+
 def spread_out(items: Sequence[Item], most: int) -> list[Item]:
     """At most ``most`` of the items, evenly spread over them: neighbours look alike."""
     places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
@@ -190,9 +238,24 @@ def _indices(text: str, count: int) -> list[int]:
     return list(range(count))[slice(*parts)]
 
 
-def _require_folder(path: Path) -> None:
-    if not path.is_dir():
-        raise FileError(path, "no such folder; expected a dataset or a KITTI sequence")
+def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
+    if not paths:
+        raise ValueError("no dataset folder given")
+    for path in paths:
+        if is_bag(path) or folder_layout(path).clouds.is_dir():
+            continue
+        if not path.is_dir():
+            raise FileError(
+                path, "no such folder or ROS bag; expected a dataset, a KITTI sequence or a bag"
+            )
+        for recorded in (*path.glob("*.mcap"), *path.glob("*.db3")):
+            raise FileError(
+                path,
+                f"has no metadata.yaml, as a ROS 2 bag that was not closed; name {recorded.name}, "
+                "or write the file with `ros2 bag reindex`",
+            )
+    if bag is not None and not any(map(is_bag, paths)):
+        raise ValueError("options for ROS bags, such as --every-s, are given without a bag")
 
 
 def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:

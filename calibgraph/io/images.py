@@ -1,4 +1,4 @@
-"""Images from disk: PNG and JPEG, complete and of the size that the rig gives."""
+"""Images: PNG, JPEG and messages of bags, complete and of the size that the rig gives."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import simplejpeg
 from numpy.typing import NDArray
 from PIL.ExifTags import Base
 from PIL.ImageFile import ImageFile
@@ -15,39 +14,55 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from calibgraph.errors import FileError
+from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_image
+from calibgraph.io.encoded_images import decode_image, is_png
 from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH  # without a reduction to 8 bits
-_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
 
 
 def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """Decode an image, after its header's size was checked against the rig's.
 
+    Args:
+        path: a file, or the address of a message in a bag.
+        camera: the camera that took it.
+
     Returns:
         (height, width, 3) uint8, BGR.
 
     Raises:
-        FileError: if it is missing, damaged, marked as turned, or not of the size that the rig
-            gives.
+        FileError, DatasetError: if it is missing, damaged, marked as turned, or not of the size
+            that the rig gives.
     """
+    if path.suffix == MESSAGE_SUFFIX:
+        image = load_bag_image(path)
+        _require_size(path, (image.shape[1], image.shape[0]), camera)
+        return image
     data, header = _read(path)
-    expected = camera.width_px, camera.height_px
-    if header.size != expected:
-        raise FileError(
-            path,
-            f"is {header.width}x{header.height} px, the rig says {expected[0]}x{expected[1]} px; "
-            "correct width_px and height_px, and the intrinsics if the image was scaled",
-        )
-    if not _is_png(data) or b"eXIf" in data:  # Pillow decodes a PNG whole to look for it
+    _require_size(path, header.size, camera)
+    if not is_png(data) or b"eXIf" in data:  # Pillow decodes a PNG whole to look for it
         _require_upright(path, header)
-    image = _decode(path, data)
+    try:
+        image = np.asarray(decode_image(data), np.uint8)
+    except ValueError as error:
+        raise _damaged(path, error) from error
     if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
         raise FileError(path, "has 16 bits, of which only the lower 8 are used; write it with 8")
     return image
+
+
+def _require_size(path: Path, found: tuple[int, int], camera: Camera) -> None:
+    expected = camera.width_px, camera.height_px
+    if found != expected:
+        raise FileError(
+            path,
+            f"is {found[0]}x{found[1]} px, the rig says {expected[0]}x{expected[1]} px; "
+            "correct width_px and height_px, and the intrinsics if the image was scaled",
+        )
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -64,15 +79,11 @@ def _read(path: Path) -> tuple[bytes, ImageFile]:
     if not path.is_file():
         raise FileError(path, "no such image")
     data = path.read_bytes()
-    kind = PngImageFile if _is_png(data) else JpegImageFile
+    kind = PngImageFile if is_png(data) else JpegImageFile
     try:
         return data, kind(io.BytesIO(data))
     except (SyntaxError, OSError, ValueError) as error:
         raise _damaged(path, error) from error
-
-
-def _is_png(data: bytes) -> bool:
-    return data.startswith(b"\x89PNG")
 
 
 def _require_upright(path: Path, header: ImageFile) -> None:
@@ -87,20 +98,6 @@ def _require_upright(path: Path, header: ImageFile) -> None:
             f"has the EXIF orientation {found}, by which some programs turn it and others do not; "
             "write the images without it, and the intrinsics for the pixels as they are stored",
         )
-
-
-def _decode(path: Path, data: bytes) -> NDArray[np.uint8]:
-    """(height, width, 3) BGR. OpenCV fills up damaged images, and does not report it."""
-    try:
-        if not _is_png(data):
-            return np.asarray(simplejpeg.decode_jpeg(data, "BGR", strict=True))
-        PngImageFile(io.BytesIO(data)).verify()  # checksums, up to the end mark
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)
-    except (SyntaxError, OSError, ValueError, cv2.error) as error:
-        raise _damaged(path, error) from error
-    if image is None:
-        raise _damaged(path, "its pixels")
-    return np.asarray(image, np.uint8)
 
 
 def _damaged(path: Path, why: object) -> FileError:

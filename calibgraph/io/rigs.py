@@ -1,4 +1,4 @@
-"""Rigs from disk: a rig file, a result, a dataset folder or a KITTI sequence."""
+"""Rigs from disk: a rig file, a result, a dataset folder, a KITTI sequence or a ROS bag."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_yaml
+from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.bags.rig import rig_of_bag
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
 from calibgraph.model.result_files import CALIBRATION_FILE
@@ -14,15 +16,22 @@ from calibgraph.model.rig import RIG_FORMAT, Rig
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 
 
-def load_rig(path: Path | str) -> Rig:
-    """Read a rig from a rig file, a result (file or folder), a dataset or a KITTI sequence folder.
+def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
+    """Read a rig from a rig file, a result (file or folder), a dataset, a KITTI sequence or a bag.
 
-    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``.
+    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``, a bag
+    those of its /tf_static.
+
+    Args:
+        path: a file or folder.
+        bag: which topics of a bag are the rig's; those found by type if None.
 
     Raises:
-        FileError: if there is none, or it is malformed.
+        FileError, DatasetError: if there is none, or it is malformed.
     """
     path = rig_file(path)
+    if is_bag(path):
+        return rig_of_bag(path, bag)
     if path.name == CALIBRATION_NAME:
         return load_kitti_rig(path.parent)
     content = read_yaml(path)
@@ -45,15 +54,15 @@ def rig_file(path: Path | str) -> Path:
         raise FileError(
             path,
             f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
-            "dataset folder with a rig.yaml, or a KITTI odometry sequence",
+            "dataset folder with a rig.yaml, a KITTI odometry sequence, or a ROS bag",
         )
     return found
 
 
 def find_rig_file(path: Path | str) -> Path | None:
-    """The path itself, or the rig file of a folder; None if a folder holds none."""
+    """The path itself, or the rig file of a folder that is no bag; None if it holds none."""
     folder = Path(path)
-    if not folder.is_dir():
+    if not folder.is_dir() or is_bag(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it

@@ -56,6 +56,25 @@ def write_overlays(
     return paths
 
 
+def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
+    """Write ``guess_CAMERA.png`` for every camera of the guess.
+
+    Returns:
+        The paths.
+
+    Raises:
+        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
+    """
+    cloud = frame.load_cloud()[:, :3].astype(np.float64)
+    paths = []
+    for name, camera in guess.cameras.items():
+        image = draw_points(frame.load_image(name, camera), cloud, camera)
+        panels = [_titled(image, f"{name}, frame {frame.name}: guess"), _depth_bar(image.shape[1])]
+        paths.append(folder / f"guess_{name}.png")
+        write_image(paths[-1], _shrink(np.vstack(panels)))
+    return paths
+
+
 def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
     """Draw a cloud on an image, near points over far ones, coloured by their distance.
 

@@ -25,6 +25,6 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
 IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info, OpenCV FileStorage, Autoware sensor kit, tf2 TFMessage "
     "(.yaml), URDF (.urdf, .xml), COLMAP cameras.txt, koide3 calib.json, KITTI calib.txt in its "
-    "sequence, a rig file or result of calibgraph"
+    "sequence, a ROS bag, a rig file or result of calibgraph"
 )
 """What ``calibgraph import`` reads."""

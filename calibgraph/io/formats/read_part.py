@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from calibgraph.errors import FileError
 from calibgraph.files import parse_yaml, read_text, require_file
+from calibgraph.io.bags import is_bag
+from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.colmap import read_colmap
@@ -28,12 +32,14 @@ def read_part(path: Path, name: str | None) -> Part:
     """What a file holds about a rig.
 
     Args:
-        path: of the file, or of a KITTI sequence or a result's folder.
+        path: of the file, or of a KITTI sequence, a result's folder or a ROS bag.
         name: of the camera, if the file is of a single one; None for the file's own name of it.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.
     """
+    if is_bag(path):
+        return _part_of_bag(path)
     if path.is_dir() or path.name == CALIBRATION_NAME:
         return _part_of_rig(load_rig(path), path)
     suffix = require_file(path).suffix.lower()
@@ -66,6 +72,25 @@ def _read_yaml(path: Path, name: str | None) -> Part:
             return read(content, path)
     keys = ", ".join(str(key) for key in list(content)[:5])
     raise FileError(path, f"its keys ({keys}) are of no known format; known are {IMPORT_FORMATS}")
+
+
+def _part_of_bag(path: Path) -> Part:
+    """Lenses from camera_info, and the extrinsics that /tf_static has."""
+    cameras = read_bag_rig(path).cameras
+    found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
+    return Part(
+        path,
+        lenses={name: _lens_of_bag(camera.lens.content) for name, camera in cameras.items()},
+        T_camera_lidar={name: T for name, T in found.items() if T is not None},
+    )
+
+
+def _lens_of_bag(content: Mapping[str, Any]) -> CameraLens:
+    k = content["intrinsics_px"]
+    size = (content["width_px"], content["height_px"])
+    return CameraLens(
+        content["model"], size, (k["fx"], k["fy"], k["cx"], k["cy"]), tuple(content["distortion"])
+    )
 
 
 def _part_of_rig(rig: Rig, path: Path) -> Part:

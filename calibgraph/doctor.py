@@ -1,0 +1,253 @@
+"""What can be seen of a dataset before anything is solved: what is there, and what to fix first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.dataset import Dataset, Frame, hash_source, load_dataset
+from calibgraph.io.dataset_folders import frames_of_folder
+from calibgraph.io.formats.words import describe_rig
+from calibgraph.io.rigs import load_rig
+from calibgraph.matching.camera_pairs import overlapping_pairs
+from calibgraph.matching.standstill import same_places
+from calibgraph.matching.structure.matcher import MOST_FRAMES
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.parallel import map_on_cores
+from calibgraph.report.point_overlay import write_guess_overlays
+from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR
+from calibgraph.trust.conventions import undo_convention_errors
+
+Level = Literal["error", "warning", "note"]
+_ORDER = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line about a dataset: an error stops a calibration, a warning spoils it."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found in a dataset.
+
+    Attributes:
+        findings: errors first, then warnings and notes.
+        frames: number of frames that can be calibrated.
+        points_in_image: per camera, how many points of a cloud lie in its image by the guess.
+        pictures: the guess drawn on one image per camera, where asked for.
+    """
+
+    findings: tuple[Finding, ...]
+    frames: int = 0
+    points_in_image: dict[str, int] = field(default_factory=dict)
+    pictures: tuple[Path, ...] = ()
+
+    @property
+    def healthy(self) -> bool:
+        """Whether nothing has to be fixed first."""
+        return all(finding.level != "error" for finding in self.findings)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The diagnosis as plain values."""
+        return {
+            "healthy": self.healthy,
+            "frames": self.frames,
+            "points_in_image": self.points_in_image,
+            "findings": [vars(finding) for finding in self.findings],
+            "pictures": [str(path) for path in self.pictures],
+        }
+
+
+def diagnose(
+    folders: Sequence[Path],
+    rig: Rig | None = None,
+    *,
+    frames: str | None = None,
+    bag: BagOptions | None = None,
+    pictures: Path | None = None,
+) -> Diagnosis:
+    """Examine a dataset in seconds: of many frames, those that a calibration would match.
+
+    Args:
+        folders: dataset folders, KITTI odometry sequences or bags of one rig.
+        rig: the guess; that of the data if None.
+        frames: which frames to keep, see :meth:`calibgraph.Dataset.select`.
+        bag: how ROS bags are read.
+        pictures: folder for ``guess_CAMERA.png``: the guess on an image of each camera; written
+            where there is no error.
+
+    Raises:
+        ValueError: if the options do not fit.
+    """
+    findings: list[Finding] = []
+    data = _load(folders, rig, frames, bag, findings)
+    if data is None:
+        return Diagnosis(tuple(findings))
+    findings += _describe(data)
+    examined = data.spread_out(MOST_FRAMES)
+    clouds = _examine_frames(examined.frames, data.rig, findings)
+    findings += _examine_places(examined)
+    seen: dict[str, int] = {}
+    written: list[Path] = []
+    if clouds:
+        frame, cloud = clouds[len(clouds) // 2]
+        seen = {name: _count_seen(camera, cloud) for name, camera in data.rig.cameras.items()}
+        findings += _examine_guess(data.rig, cloud, seen)
+        if pictures is not None and not any(finding.level == "error" for finding in findings):
+            written = write_guess_overlays(frame, data.rig, pictures)
+    findings.sort(key=lambda finding: _ORDER.index(finding.level))
+    return Diagnosis(tuple(findings), len(data.frames), seen, tuple(written))
+
+
+def _load(
+    folders: Sequence[Path],
+    rig: Rig | None,
+    frames: str | None,
+    bag: BagOptions | None,
+    findings: list[Finding],
+) -> Dataset | None:
+    """The dataset; where frames do not pair up, that of those that do; None if there is none."""
+    try:
+        return load_dataset(folders, rig, frames=frames, bag=bag)
+    except (CalibrationError, OSError) as error:
+        findings.append(Finding("error", str(error)))
+        if not isinstance(error, DatasetError) or frames is not None or any(map(is_bag, folders)):
+            return None
+    try:
+        given = rig if rig is not None else load_rig(folders[0])
+        cameras = list(given.cameras)
+        found = [f for path in folders for f in frames_of_folder(path, cameras, complete=False)]
+        paired = [str(i) for i, files in enumerate(found) if files.images.keys() >= set(cameras)]
+        return load_dataset(folders, rig, frames=",".join(paired)) if paired else None
+    except (CalibrationError, OSError):
+        return None
+
+
+def _describe(data: Dataset) -> Iterator[Finding]:
+    """What is there, and whether the frames are enough."""
+    count = len(data.frames)
+    yield Finding("note", f"{count} frames, {len(data.rig.cameras)} cameras")
+    notes = data.notes if any(map(is_bag, data.folders)) else ()
+    yield from (Finding("note", note) for note in notes)
+    if not set(describe_rig(data.rig)) & set(notes):
+        yield from (Finding("note", line) for line in describe_rig(data.rig))
+    if count < MIN_FRAMES_FOR_ERROR_BAR:
+        yield Finding(
+            "warning",
+            f"{count} frames give no error bar; record at least {MIN_FRAMES_FOR_ERROR_BAR}, better "
+            "10 to 30 from several places",
+        )
+
+
+def _examine_frames(
+    frames: Sequence[Frame], rig: Rig, findings: list[Finding]
+) -> list[tuple[Frame, NDArray[np.float32]]]:
+    """The clouds that can be read, by frame; with findings about clouds and images."""
+    read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
+    for source in ("", *rig.cameras):
+        problems = [each[source] for _, each in read if source in each]
+        if problems:
+            others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
+            findings.append(Finding("error", problems[0] + others))
+    clouds = [(f, cloud) for f, (cloud, _) in zip(frames, read, strict=True) if cloud is not None]
+    findings += _repeats("cloud", [(f.name, f.cloud_path) for f, _ in clouds])
+    for name in rig.cameras:
+        images = [(f.name, f.image_paths[name]) for f, _ in clouds]
+        findings += _repeats(f"image of {name}", images)
+    return clouds
+
+
+def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, dict[str, str]]:
+    """The cloud, if it can be read; and what is wrong with it ("") and with a camera's image."""
+    problems: dict[str, str] = {}
+    cloud = None
+    try:
+        cloud = frame.load_cloud()
+    except (CalibrationError, OSError) as error:
+        problems[""] = str(error)
+    for name, camera in rig.cameras.items():
+        try:
+            gray = frame.load_gray(name, camera)
+        except (CalibrationError, OSError) as error:
+            problems[name] = str(error)
+            continue
+        if np.ptp(gray) == 0:
+            problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
+    return cloud, problems
+
+
+def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding]:
+    """Frames with the same cloud or image: they are not independent.
+
+    Args:
+        what: of which sources.
+        sources: a frame's name and its file or message.
+    """
+    hashes = map_on_cores(hash_source, [path for _, path in sources])
+    first: dict[str, str] = {}
+    repeated = [
+        (first[digest], name)
+        for (name, _), digest in zip(sources, hashes, strict=True)
+        if first.setdefault(digest, name) != name
+    ]
+    if repeated:
+        others = f", and {len(repeated) - 1} more repeat one" if repeated[1:] else ""
+        yield Finding(
+            "warning",
+            f"frames {repeated[0][0]} and {repeated[0][1]} have the same {what}{others}; leave "
+            "repeats out",
+        )
+
+
+def _examine_places(data: Dataset) -> Iterator[Finding]:
+    """How many places the frames are of, if the vehicle stands in some."""
+    try:
+        places = same_places(data, data.rig)
+    except (CalibrationError, OSError):  # which is a finding already
+        return
+    if places:
+        names = {frame.index: frame.name for frame in data.frames}
+        most = max(places, key=len)
+        count = len(data.frames) - sum(len(place) - 1 for place in places)
+        yield Finding(
+            "warning",
+            f"{len(data.frames)} frames are of {count} places: the vehicle stands, as in "
+            f"{len(most)} frames from {names[most[0]]} to {names[most[-1]]}; frames of one place "
+            f"count as one, and {MIN_FRAMES_FOR_ERROR_BAR} are needed for an error bar",
+        )
+
+
+def _examine_guess(rig: Rig, cloud: NDArray[np.float32], seen: dict[str, int]) -> Iterator[Finding]:
+    """Whether the cameras see points of a cloud by the guess, and which see the same."""
+    for name, camera in rig.cameras.items():
+        yield Finding("note", f"{name}: {seen[name]} of {len(cloud)} points lie in the image")
+        if not seen[name]:
+            fitting = [
+                error
+                for error, T in undo_convention_errors(camera.T_camera_lidar).items()
+                if _count_seen(camera.moved_to(T), cloud)
+            ]
+            hint = f"; some would if the guess is {', or '.join(fitting)}" if fitting else ""
+            yield Finding(
+                "error", f"{name}: by the guess, no point of the cloud lies in the image{hint}"
+            )
+    pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(rig, cloud)) or "none"
+    yield Finding("note", f"cameras that see the same by the guess: {pairs}")
+
+
+def _count_seen(camera: Camera, cloud: NDArray[np.float32]) -> int:
+    """Number of points of a cloud that lie in the image."""
+    T = camera.T_camera_lidar
+    pixels, valid = camera.lens.project(cloud[:, :3].astype(np.float64) @ T[:3, :3].T + T[:3, 3])
+    return int(np.sum(valid & camera.in_image(pixels)))

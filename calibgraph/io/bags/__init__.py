@@ -1,0 +1,46 @@
+"""ROS bags without ROS: frames, lenses and transforms from ROS 1 and ROS 2 bags (sqlite3, MCAP).
+
+The rest of the package reads a message as it reads a file: by the path that is its address.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
+from calibgraph.io.bags.messages import is_bag as is_bag
+from calibgraph.io.bags.messages import read_message
+from calibgraph.io.bags.options import BagOptions as BagOptions
+from calibgraph.io.bags.pictures import picture_of
+from calibgraph.io.bags.point_clouds import points_of
+
+
+def load_bag_cloud(path: Path) -> NDArray[np.float32]:
+    """(n, 4) the cloud in the message with this address.
+
+    Raises:
+        FileError, DatasetError: if it cannot be read, or holds no point.
+    """
+    cloud = points_of(read_message(path)[1], str(path))
+    if not len(cloud):
+        raise FileError(path, "holds no point")
+    return cloud
+
+
+def load_bag_image(path: Path) -> NDArray[np.uint8]:
+    """(height, width, 3) the image in the message with this address, BGR.
+
+    Raises:
+        FileError, DatasetError: if it cannot be read or decoded.
+    """
+    return picture_of(read_message(path)[1], str(path))
+
+
+def hash_message(path: Path) -> str:
+    """SHA-256 of the bytes of the message with this address."""
+    return hashlib.sha256(read_message(path)[0]).hexdigest()

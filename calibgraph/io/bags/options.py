@@ -1,0 +1,44 @@
+"""What is read of a bag, and how its images are paired with its clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal, get_args
+
+Stamps = Literal["header", "record"]
+LIDAR = "lidar"
+"""The key of the clouds' topic in :attr:`BagOptions.topics`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagOptions:
+    """What is read of a bag.
+
+    Attributes:
+        topics: the clouds' topic under ``lidar``, and image topics by camera name; those that are
+            not given are found by their types.
+        every_s: seconds between frames, of which only the surroundings are read; all if None.
+        tolerance_s: largest difference of the stamps of a cloud and its images. The default is half
+            a turn of a LiDAR at 10 Hz: streams of equal rates pair, whatever their phase.
+        stamps: ``header``, those of the sensors; or ``record``, when a message was recorded, for
+            sensors whose clocks differ.
+
+    Raises:
+        ValueError: if a value is out of range.
+    """
+
+    topics: Mapping[str, str] = field(default_factory=dict)
+    every_s: float | None = None
+    tolerance_s: float = 0.05
+    stamps: Stamps = "header"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "topics", MappingProxyType(dict(self.topics)))
+        if self.every_s is not None and not self.every_s > 0:
+            raise ValueError(f"every_s must be positive, found {self.every_s}")
+        if not self.tolerance_s >= 0:
+            raise ValueError(f"tolerance_s must not be negative, found {self.tolerance_s}")
+        if self.stamps not in get_args(Stamps):
+            raise ValueError(f"stamps {self.stamps!r}: known are {', '.join(get_args(Stamps))}")

@@ -1,0 +1,112 @@
+"""What is wrong with a dataset is found before it is solved."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibgraph import Diagnosis, diagnose, load_rig
+from tests.conftest import SAMPLE, Call
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the sample."""
+    return Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+
+
+def texts(found: Diagnosis, level: str) -> list[str]:
+    return [finding.text for finding in found.findings if finding.level == level]
+
+
+def test_the_sample_has_nothing_to_fix(tmp_path: Path) -> None:
+    found = diagnose([SAMPLE], pictures=tmp_path)
+    assert found.healthy
+    assert not texts(found, "warning")
+    assert found.frames == 6
+    assert all(count > 1000 for count in found.points_in_image.values())
+    assert sorted(path.name for path in found.pictures) == [
+        "guess_front_left.png", "guess_front_right.png", "guess_left.png",
+    ]  # fmt: skip
+    assert (
+        "cameras that see the same by the guess: front_left and front_right, front_left and "
+        in (texts(found, "note")[-1])
+    )
+
+
+def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Path) -> None:
+    (folder / "cameras/left/000002.jpg").unlink()
+    for name in ("000000", "000001"):
+        path = folder / f"cameras/front_left/{name}.jpg"
+        path.write_bytes(path.read_bytes()[:-50])
+    (folder / "lidar/000003.npy").write_bytes(b"nothing")
+    cv2.imwrite(str(folder / "cameras/left/000005.jpg"), np.zeros((360, 640, 3), np.uint8))
+    found = diagnose([folder], pictures=folder / "pictures")
+    errors = texts(found, "error")
+    assert not found.healthy
+    assert [finding.level for finding in found.findings[: len(errors)]] == ["error"] * len(errors)
+    for expected in (
+        "frame '000002' has a cloud but no image of camera 'left'",
+        "front_left/000000.jpg: is truncated or not an image of its kind; record or copy it "
+        "again; 1 more of its frames have errors",
+        "000003.npy: cannot be read",
+        "left/000005.jpg: all pixels are 0",
+    ):
+        assert sum(expected in error for error in errors) == 1, expected
+    assert found.frames == 5
+    assert not (folder / "pictures").exists()
+
+
+def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
+    shutil.copy(folder / "lidar/000001.npy", folder / "lidar/000004.npy")
+    for name in ("000003", "000005"):
+        shutil.copy(folder / "cameras/left/000002.jpg", folder / f"cameras/left/{name}.jpg")
+    found = diagnose([folder])
+    assert found.healthy
+    assert texts(found, "warning") == [
+        "frames 000001 and 000004 have the same cloud; leave repeats out",
+        "frames 000002 and 000003 have the same image of left, and 1 more repeat one; leave "
+        "repeats out",
+    ]
+    assert "4 frames give no error bar" in texts(diagnose([folder], frames="0:4"), "warning")[0]
+
+
+def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
+    for camera in (folder / "cameras").iterdir():
+        for name in ("000003", "000004"):
+            shutil.copy(camera / "000002.jpg", camera / f"{name}.jpg")
+    warnings = texts(diagnose([folder]), "warning")
+    assert warnings[-1].startswith(
+        "6 frames are of 4 places: the vehicle stands, as in 3 frames from 000002 to 000004;"
+    )
+
+
+def test_a_guess_that_sees_nothing_is_named_with_what_it_may_be() -> None:
+    rig = load_rig(SAMPLE)
+    T = rig.T_camera_lidar["left"].copy()
+    T[:3, 3] *= 1000.0  # 350 m
+    found = diagnose([SAMPLE], rig.moved_to({"left": T}))
+    assert found.points_in_image["left"] == 0
+    (error,) = texts(found, "error")
+    assert error.startswith("left: by the guess, no point of the cloud lies in the image; some ")
+    assert "a translation in millimetres" in error
+
+
+def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
+    call: Call, folder: Path
+) -> None:
+    code, out, err = call("doctor", folder)
+    assert (code, out) == (0, "")
+    assert "note     6 frames, 3 cameras\n" in err
+    (folder / "lidar/000003.npy").unlink()
+    code, out, _ = call("doctor", folder, "--json")
+    assert code == 1
+    assert json.loads(out)["healthy"] is False
+    code, _, err = call("doctor", folder / "missing")
+    assert code == 1
+    assert "no such folder or ROS bag" in err
