@@ -52,8 +52,8 @@ def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Pat
     assert [finding.level for finding in found.findings[: len(errors)]] == ["error"] * len(errors)
     for expected in (
         "frame '000002' has a cloud but no image of camera 'left'",
-        "front_left/000000.jpg: is truncated or not an image of its kind; record or copy it "
-        "again; 1 more of its frames have errors",
+        "front_left/000000.jpg: is damaged, or not an image of its kind (Premature end of JPEG "
+        "file); record or copy it again; 1 more of its frames have errors",
         "000003.npy: cannot be read",
         "left/000005.jpg: all pixels are 0",
     ):
