@@ -4,8 +4,9 @@
         [--sizes 640x480 1242x375 1920x1200] [--longest-s 600] [--folder DIR]
 
 Cameras of a ring and a 64-beam LiDAR in a rendered street, from a guess 2 degrees and 0.2 m off.
-More than 5 frames repeat these: they are matched like others, but in the solve they count as one. Each case is a process of its own, `speed.stages`: the whole command,
-with all frames (without `--frames` it would take 30 of more), up to the written report.
+More than 5 frames repeat these: they are matched like others, but in the solve count as one. Each
+case is a process of its own, `speed.stages`: the whole command, with all frames (without `--frames`
+it would take 30 of more), up to the written report.
 
 Finished cases are kept in --folder with the streets, so that the table can be run in parts: the
 same code does not run a case again. A case is skipped if it would take longer than --longest-s,
