@@ -41,8 +41,9 @@ _INNER = (
                  "/structure/visibility.py")),
     ("score", ("/structure/shift_scores.py", "/structure/score", ":_score_maps")),
     ("consensus", ("/structure/consensus.py",)),
-    ("search", ("/structure/correlation", "/structure/box_search.py", "/structure/epipolar.py",
-                "/structure/proposals.py")),
+    ("search", ("/structure/correlation", "/structure/box_search.py",
+                "/structure/common_features.py", "/structure/bodies.py")),
+    ("pairs", ("/matching/camera_pairs/",)),
     ("solve", ("/calibgraph/solver/", "/factors/")),
 )  # fmt: skip
 _OUTER = (
@@ -50,7 +51,9 @@ _OUTER = (
     ("report", ("/calibgraph/report/", ":_write_result")),
 )
 _ALWAYS = ("import", "compile")
-WORK = ("decode", "windows", "score", "consensus", "search", "solve", "checks", "report")
+WORK = (
+    "decode", "windows", "score", "consensus", "search", "pairs", "solve", "checks", "report",
+)  # fmt: skip
 STAGES = (*_ALWAYS, *WORK, OTHER)
 """In the order of a calibration. A stage is where the innermost function of a thread's stack that
 belongs to one is; but all that the checks or the report call is theirs."""
@@ -86,6 +89,7 @@ class StageSampler:
         self.wall_s = dict.fromkeys(STAGES, 0.0)
         self.cpu_s = dict.fromkeys(STAGES, 0.0)
         self._stop = threading.Event()
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._main = threading.get_ident()
         self._clocks: dict[int, float] = {}
@@ -107,11 +111,16 @@ class StageSampler:
         """Stop sampling."""
         self._stop.set()
         self._thread.join()
+        if self._error is not None and kind is None:
+            raise RuntimeError("the sampler failed; the times are not whole") from self._error
 
     def _run(self) -> None:
-        while not self._stop.wait(INTERVAL_S):
+        try:
+            while not self._stop.wait(INTERVAL_S):
+                self._sample()
             self._sample()
-        self._sample()
+        except Exception as error:  # noqa: BLE001 - of any kind: raised at the end
+            self._error = error
 
     def _sample(self) -> None:
         """Add the time since the last sample to the stages that used it."""
