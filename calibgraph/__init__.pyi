@@ -1,5 +1,9 @@
 """The public names and where they come from."""
 
+from .audit import Audit as Audit
+from .audit import CameraAudit as CameraAudit
+from .audit import LidarAudit as LidarAudit
+from .audit import check as check
 from .doctor import Diagnosis as Diagnosis
 from .doctor import Finding as Finding
 from .doctor import diagnose as diagnose

@@ -65,7 +65,7 @@ def match_in_rounds(
         config = config.changed(stage1="rig", learnt_weights=False)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("places"):
-        places = _same_places(data, guess)
+        places = find_same_places(data, guess)
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
     estimate, found = start.rig, start.findings.to_metadata() | places
@@ -95,7 +95,7 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     return (data if most_frames is None else data.spread_out(most_frames)), guess
 
 
-def _same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
+def find_same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
     """Which frames are of one place, as metadata of a table; empty if all are of their own."""
     try:
         places = same_places(data, rig)

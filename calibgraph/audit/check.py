@@ -1,0 +1,131 @@
+"""``check``: is the calibration that is deployed still right?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from calibgraph.audit.judgement import Tolerance, judge_camera, judge_lidar
+from calibgraph.audit.matching import Matching, match_from_deployed
+from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
+from calibgraph.errors import CorrespondenceError
+from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.matching.named import find_matcher
+from calibgraph.matching.protocol import FullMatcher
+from calibgraph.matching.run import MatchingRun
+from calibgraph.model.config import Config
+from calibgraph.model.rig import Rig
+from calibgraph.overlaps import tie_cameras
+from calibgraph.progress import Progress, Stopwatch, no_progress
+from calibgraph.rounds import AnyMatcher, Datasets
+from calibgraph.trust.cross_validation import competing_solution_checks
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.guess import point_distance_checks
+from calibgraph.trust.intrinsics import intrinsics_checks
+from calibgraph.trust.matcher_checks import matcher_checks
+from calibgraph.trust.pair_agreement import pair_agreement_checks
+from calibgraph.trust.rematch_checks import last_round_checks
+from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
+from calibgraph.trust.thresholds import threshold
+
+DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
+    point_distance_checks,
+    estimate_checks,
+    matcher_checks,
+    pair_agreement_checks,
+    competing_solution_checks,
+    outlier_frame_checks,
+    intrinsics_checks,
+)
+"""Checks of the measurement; a FAIL of one makes it unusable. None compares it with its guess."""
+
+
+def check(
+    rig: Rig,
+    dataset: Datasets,
+    *,
+    tolerance_deg: float = 0.5,
+    tolerance_cm: float = 10.0,
+    matcher: AnyMatcher = "structure",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Audit:
+    """Compare a deployed calibration with what images and clouds show. Nothing is replaced.
+
+    Matching begins at the deployed extrinsics, without a search; the rig's ``relative_poses`` take
+    no part, since they may be as outdated as the extrinsics.
+
+    Args:
+        rig: the deployed calibration.
+        dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
+        tolerance_deg: largest deviation about an axis of a camera that is OK.
+        tolerance_cm: largest deviation along an axis of a camera that is OK.
+        matcher: as of :func:`calibgraph.calibrate`.
+        seed: of everything random.
+        progress: called as the work goes on.
+
+    Returns:
+        Per camera OK, WRONG or CANNOT TELL, the deviation per axis and its error bar.
+
+    Raises:
+        FileError, DatasetError: if the data cannot be read or do not fit together.
+        ValueError: if a tolerance is not positive, or the matcher is unknown.
+    """
+    tolerance, report = Tolerance(tolerance_deg, tolerance_cm), progress or no_progress
+    full, watch = find_matcher(matcher, seed=seed), Stopwatch()
+    deployed = rig.model_copy(update={"relative_poses": ()})
+    data = _open(dataset, deployed, full)
+    matching = Matching(data, deployed, full, _config(full, seed), report)
+    try:
+        run = tie_cameras(match_from_deployed(matching, watch), report)
+        with watch("checks"):
+            cameras, lidar = _judge(run, tolerance)
+    except CorrespondenceError as error:
+        cameras, lidar = (
+            {name: CameraAudit("CANNOT TELL", f"{error}") for name in rig.cameras},
+            None,
+        )
+    finally:
+        full.release()
+    return Audit(cameras, lidar, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds)
+
+
+def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
+    """The frames that the matcher is given."""
+    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
+    return data if matcher.most_frames is None else data.spread_out(matcher.most_frames)
+
+
+def _config(matcher: FullMatcher, seed: int) -> Config:
+    """The preset ``auto``, for the Stage 1 of the matcher."""
+    config = Config().changed(seed=seed)
+    return config.changed(stage1="rig", learnt_weights=False) if matcher.stage1 == "rig" else config
+
+
+def _judge(
+    run: MatchingRun, tolerance: Tolerance
+) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
+    """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
+    evidence = Evidence(run.solution, run.guess)
+    doubts = _doubts(run, evidence)
+    cameras = {
+        name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
+    }
+    trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
+    return cameras, judge_lidar(evidence, cameras) if trusted else None
+
+
+def _doubts(run: MatchingRun, evidence: Evidence) -> dict[str, str]:
+    """Per camera, why its measurement cannot be trusted; empty if it can.
+
+    A z-score that would be a WARN of a calibration is a doubt: wrong results have them, too.
+    """
+    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
+    name_of_z = threshold("z_score").name
+    return {
+        name: "; ".join(
+            check.text
+            for check in checks
+            if check.status == "FAIL" or (check.name == name_of_z and check.status != "PASS")
+        )
+        for name, checks in concatenate(parts, evidence.cameras).items()
+    }

@@ -1,0 +1,189 @@
+"""From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
+
+Three statements about the deviation d of an axis with standard deviation sigma:
+
+* it is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has a
+  significant axis;
+* it is beyond the tolerance: |d| > tolerance;
+* it is certainly within: |d| + 1.64 sigma <= tolerance, with 95 % confidence.
+
+WRONG: an axis is significant and beyond the tolerance. OK: all axes are certainly within. Else the
+data cannot tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, ndtri
+
+from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
+from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.tracking.cause import Steps, find_cause
+from calibgraph.trust.evidence import Evidence
+
+Array = NDArray[np.float64]
+
+FALSE_ALARM_RATE = 1e-3
+"""Probability of a significant axis on a rig, of all its cameras, that has not changed."""
+
+POWER = 0.9
+"""Probability with which the smallest detectable change is significant."""
+
+CONFIDENCE = 0.95
+"""Probability that an axis that counts as within the tolerance is."""
+
+CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
+LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
+_DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
+_TOO_FEW_FRAMES = (
+    "too few frames for an error bar: record at least 5, better 30, at different places"
+)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The largest deviation per axis that is OK.
+
+    Raises:
+        ValueError: if one is not positive.
+    """
+
+    degrees: float
+    centimetres: float
+
+    def __post_init__(self) -> None:
+        for value, option in ((self.degrees, "tolerance_deg"), (self.centimetres, "tolerance_cm")):
+            if not 0 < value < np.inf:
+                raise ValueError(f"{option} must be positive and finite, found {value}")
+
+    @property
+    def twist(self) -> Array:
+        """(6,) rotation [rad], translation [m]."""
+        return np.repeat([self.degrees, self.centimetres], 3) / _DISPLAY
+
+
+def significant_sigmas(cameras: int) -> float:
+    """How many sigmas are significant, of the six axes of so many cameras."""
+    return float(ndtri(1 - FALSE_ALARM_RATE / (2 * 6 * cameras)))
+
+
+def detectable(sigma: Array, cameras: int) -> Array:
+    """(6,) the smallest change per axis that is significant with probability POWER."""
+    smallest: Array = (significant_sigmas(cameras) + float(ndtri(POWER))) * sigma
+    return smallest
+
+
+def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance) -> CameraAudit:
+    """The audit of one camera.
+
+    Args:
+        evidence: of the solution; its guess is the deployed rig.
+        name: of the camera.
+        doubt: why the measurement cannot be trusted; empty if it can.
+        tolerance: on each axis.
+    """
+    z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
+    if name in evidence.solution.held:
+        return CameraAudit("CANNOT TELL", doubt, z_score=z_score)
+    deviation = _deviation(evidence, name)
+    if covariance is None:
+        return CameraAudit("CANNOT TELL", doubt or _TOO_FEW_FRAMES, deviation, z_score=z_score)
+    sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
+    status, reason = _judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
+    if doubt:
+        status, reason = "CANNOT TELL", doubt
+    return CameraAudit(status, reason, deviation, sigma, detectable(sigma, cameras), z_score)
+
+
+def _deviation(evidence: Evidence, name: str) -> Array:
+    """(6,) xi in measured T_camera_lidar = exp(xi) deployed T_camera_lidar."""
+    solved, deployed = evidence.solution.T_camera_lidar, evidence.guess.T_camera_lidar
+    return twist_between(solved[name], deployed[name])
+
+
+def _judge_axes(
+    deviation: Array, sigma: Array, quantile: float, tolerance: Tolerance
+) -> tuple[AuditStatus, str]:
+    """The status of a trusted measurement, and its reason."""
+    size, significant = np.abs(deviation), np.abs(deviation) > quantile * sigma
+    wrong = significant & (size > tolerance.twist)
+    if wrong.any():
+        return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
+    unsure = size + ndtri(CONFIDENCE) * sigma > tolerance.twist
+    if unsure.any():
+        return "CANNOT TELL", _advise(deviation, sigma, unsure, tolerance)
+    if significant.any():
+        moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
+        return "OK", f"within the tolerance, though significant: {moved}"
+    return "OK", "no significant deviation, and all axes are within the tolerance"
+
+
+def _advise(deviation: Array, sigma: Array, unsure: NDArray[np.bool_], tolerance: Tolerance) -> str:
+    """What was found about the axes that may be beyond the tolerance, and what to record."""
+    found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
+    blind = unsure & (ndtri(CONFIDENCE) * sigma > tolerance.twist)
+    if not blind.any():
+        advice = "record more frames, at other places, or give another tolerance"
+    elif blind[3:].any():
+        advice = (
+            "too uncertain for this tolerance: record more frames, where walls, poles or vehicles "
+            "are within 10 m, or give a larger tolerance"
+        )
+    else:
+        advice = (
+            "too uncertain for this tolerance: record more frames, at more places with walls, "
+            "poles or vehicles all over the image, or give a larger tolerance"
+        )
+    return f"may be beyond the tolerance: {found}; {advice}"
+
+
+def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> LidarAudit | None:
+    """The motion of the LiDAR, if one explains the deviations of all cameras.
+
+    None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
+
+    Args:
+        evidence: of the solution; its guess is the deployed rig.
+        cameras: all of them, with trusted measurements.
+    """
+    wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
+    if evidence.joint_covariance is None or not wrong:
+        return None
+    deployed = evidence.guess.T_camera_lidar
+    steps = Steps(
+        cameras=tuple(range(len(cameras))),
+        step=-np.concatenate([_deviation(evidence, name) for name in cameras]),
+        covariance=evidence.joint_covariance,
+        limits=np.full(len(cameras), float(chdtri(6, FALSE_ALARM_RATE / len(cameras)))),
+        T_lidar_camera=tuple(to_T_lidar_camera(deployed[name]) for name in cameras),
+    )
+    lidar = find_cause(steps, wrong).lidar
+    if lidar is None:
+        return None
+    motion, sigma = -lidar[0], np.sqrt(np.diag(lidar[1]))
+    clear = np.abs(motion) > significant_sigmas(len(cameras)) * sigma
+    return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
+
+
+def describe_motion(
+    motion: Array, sigma: Array, which: NDArray[np.bool_], axes: tuple[str, ...]
+) -> str:
+    """A motion about and along some axes, in words.
+
+    Args:
+        motion: (6,) rotation [rad], translation [m].
+        sigma: (6,) its standard deviations.
+        which: (6,) the axes to name.
+        axes: (6) their names.
+    """
+    values, errors = motion * _DISPLAY, sigma * _DISPLAY
+    verbs = ["turned about"] * 3 + ["moved along"] * 3
+    units = ["deg"] * 3 + ["cm"] * 3
+    return ", ".join(
+        f"{verbs[k]} {axes[k]} by {values[k]:+.2f} {units[k]} (sigma {errors[k]:.2f})"
+        for k in np.flatnonzero(which)
+    )

@@ -1,0 +1,83 @@
+"""Rounds of matching that begin at a deployed rig, without a search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from calibgraph.io.dataset import Dataset
+from calibgraph.matching.protocol import FullMatcher
+from calibgraph.matching.run import MatchingRun, RoundSummary
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import pose_difference
+from calibgraph.model.rig import Rig
+from calibgraph.progress import Progress, Stopwatch
+from calibgraph.rounds import find_same_places, summarize_round
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.thresholds import threshold
+
+_REACH_DEG, _REACH_CM = 0.7, 20.0
+"""Errors of the start that the tracking rounds correct."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """What the rounds read.
+
+    Attributes:
+        data: images and clouds.
+        deployed: the rig that the rounds begin at.
+        matcher: its search is not used.
+        config: of the solves.
+        progress: called as the work goes on.
+    """
+
+    data: Dataset
+    deployed: Rig
+    matcher: FullMatcher
+    config: Config
+    progress: Progress
+
+
+def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
+    """The tracking rounds; where they do not settle within their reach, again after the first.
+
+    Raises:
+        CorrespondenceError: if no camera has enough correspondences.
+    """
+    tracking = matching.matcher.tracking_rounds
+    if not tracking:
+        return _run_rounds(matching, range(matching.matcher.rounds), watch)
+    run = _run_rounds(matching, tracking, watch)
+    return run if _has_settled(run) else _run_rounds(matching, (0, *tracking), watch)
+
+
+def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> MatchingRun:
+    data, matcher, config = matching.data, matching.matcher, matching.config
+    places = find_same_places(data, matching.deployed)
+    estimate, summaries = matching.deployed, list[RoundSummary]()
+    for index in rounds:
+        with watch("match"):
+            table = matcher.match(data, estimate, round_index=index, progress=matching.progress)
+            table = replace(table, metadata={**table.metadata, **places})
+        with watch("solve"):
+            solution = solve_joint(estimate, table, config, hold=True)
+        summaries.append(summarize_round(table, estimate, solution.solved_rig))
+        estimate = solution.solved_rig
+    return MatchingRun(data, matcher, matching.deployed, table, solution, tuple(summaries), watch)
+
+
+def _has_settled(run: MatchingRun) -> bool:
+    """Whether every camera ended within reach, with a good z-score, after a short last step."""
+    z_scores, last = run.correspondences.findings.z_score, run.rounds[-1]
+    deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
+    for name, T in deployed.items():
+        degrees, centimetres = pose_difference(ended[name], T)
+        grades = (
+            threshold("z_score").grade(z_scores.get(name, 0.0)),
+            threshold("last_round_rotation").grade(last[name]["moved_deg"]),
+            threshold("last_round_translation").grade(last[name]["moved_cm"]),
+        )
+        if degrees > _REACH_DEG or centimetres > _REACH_CM or set(grades) != {"PASS"}:
+            return False
+    return True

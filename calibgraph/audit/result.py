@@ -1,0 +1,97 @@
+"""The result of an audit: per camera and axis what was measured, and what follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
+
+_ORDER: tuple[AuditStatus, ...] = ("OK", "CANNOT TELL", "WRONG")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraAudit:
+    """The audit of one camera's extrinsic.
+
+    Attributes:
+        status: OK, CANNOT TELL or WRONG.
+        reason: one sentence: what was found and, where nothing can be told, what to record.
+        deviation: (6,) xi in measured T_camera_lidar = exp(xi) deployed T_camera_lidar, rotation
+            [rad] then translation [m], in the camera's axes; None if nothing was measured.
+        sigma: (6,) standard deviations of ``deviation``; None without an error bar.
+        detectable: (6,) smallest change per axis that these data show; None without an error bar.
+        z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
+    """
+
+    status: AuditStatus
+    reason: str
+    deviation: Array | None = None
+    sigma: Array | None = None
+    detectable: Array | None = None
+    z_score: float | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self.deviation, self.sigma, self.detectable)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarAudit:
+    """A motion of the LiDAR, which explains the deviations of all cameras.
+
+    Attributes:
+        reason: one sentence: by how much it moved.
+        motion: (6,) xi in T_deployed_now = exp(xi), the pose of the LiDAR now in the LiDAR frame
+            as deployed: rotation [rad], translation [m].
+        sigma: (6,) standard deviations of ``motion``.
+    """
+
+    reason: str
+    motion: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self.motion, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """The audit of a rig.
+
+    Attributes:
+        cameras: per camera.
+        lidar: its motion where it explains all deviations; None otherwise.
+        tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
+        frames: number of frames that were matched.
+        timings_s: wall time per stage.
+    """
+
+    cameras: Mapping[str, CameraAudit]
+    lidar: LidarAudit | None
+    tolerance_deg: float
+    tolerance_cm: float
+    frames: int
+    timings_s: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def status(self) -> AuditStatus:
+        """The worst of the cameras."""
+        return max((camera.status for camera in self.cameras.values()), key=_ORDER.index)
+
+    @property
+    def wrong(self) -> tuple[str, ...]:
+        """What is WRONG: the LiDAR alone, or the cameras by name."""
+        if self.lidar is not None:
+            return ("LiDAR",)
+        return tuple(name for name, camera in self.cameras.items() if camera.status == "WRONG")
+
+
+def _freeze(*arrays: Array | None) -> None:
+    for array in arrays:
+        if array is not None:
+            array.setflags(write=False)
