@@ -39,6 +39,10 @@ CONFIDENCE = 0.95
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
 _DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
+_RECORD = (
+    "too uncertain for this tolerance: record more frames, at more places, {}, or give a tolerance "
+    "above the sigmas"
+)
 _TOO_FEW_FRAMES = (
     "too few frames for an error bar: record at least 5, better 30, at different places"
 )
@@ -93,7 +97,7 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     if covariance is None:
         return CameraAudit("CANNOT TELL", doubt or _TOO_FEW_FRAMES, deviation, z_score=z_score)
     sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
-    status, reason = _judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
+    status, reason = judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
     if doubt:
         status, reason = "CANNOT TELL", doubt
     return CameraAudit(status, reason, deviation, sigma, detectable(sigma, cameras), z_score)
@@ -105,7 +109,7 @@ def _deviation(evidence: Evidence, name: str) -> Array:
     return twist_between(solved[name], deployed[name])
 
 
-def _judge_axes(
+def judge_axes(
     deviation: Array, sigma: Array, quantile: float, tolerance: Tolerance
 ) -> tuple[AuditStatus, str]:
     """The status of a trusted measurement, and its reason."""
@@ -127,17 +131,11 @@ def _advise(deviation: Array, sigma: Array, unsure: NDArray[np.bool_], tolerance
     found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
     blind = unsure & (ndtri(CONFIDENCE) * sigma > tolerance.twist)
     if not blind.any():
-        advice = "record more frames, at other places, or give another tolerance"
+        advice = "too near to the tolerance to decide: check another recording, of other places"
     elif blind[3:].any():
-        advice = (
-            "too uncertain for this tolerance: record more frames, where walls, poles or vehicles "
-            "are within 10 m, or give a larger tolerance"
-        )
+        advice = _RECORD.format("where walls, poles or vehicles are within 10 m")
     else:
-        advice = (
-            "too uncertain for this tolerance: record more frames, at more places with walls, "
-            "poles or vehicles all over the image, or give a larger tolerance"
-        )
+        advice = _RECORD.format("with walls, poles or vehicles all over the image")
     return f"may be beyond the tolerance: {found}; {advice}"
 
 

@@ -73,11 +73,11 @@ def _has_settled(run: MatchingRun) -> bool:
     deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
     for name, T in deployed.items():
         degrees, centimetres = pose_difference(ended[name], T)
-        grades = (
-            threshold("z_score").grade(z_scores.get(name, 0.0)),
+        still = (
             threshold("last_round_rotation").grade(last[name]["moved_deg"]),
             threshold("last_round_translation").grade(last[name]["moved_cm"]),
         )
-        if degrees > _REACH_DEG or centimetres > _REACH_CM or set(grades) != {"PASS"}:
+        good = threshold("z_score").grade(z_scores.get(name, 0.0)) == "PASS"
+        if not good or "FAIL" in still or degrees > _REACH_DEG or centimetres > _REACH_CM:
             return False
     return True

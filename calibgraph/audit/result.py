@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,3 +95,44 @@ def _freeze(*arrays: Array | None) -> None:
     for array in arrays:
         if array is not None:
             array.setflags(write=False)
+
+
+def audit_summary(audit: Audit) -> dict[str, Any]:
+    """An audit as plain values; every key names its unit, every list is x, y, z."""
+    return {
+        "status": audit.status,
+        "wrong": list(audit.wrong),
+        "tolerance_deg": audit.tolerance_deg,
+        "tolerance_cm": audit.tolerance_cm,
+        "frames": audit.frames,
+        "cameras": {name: _camera_summary(camera) for name, camera in audit.cameras.items()},
+        "lidar": None if audit.lidar is None else _lidar_summary(audit.lidar),
+        "timings_s": dict(audit.timings_s),
+    }
+
+
+def _camera_summary(camera: CameraAudit) -> dict[str, Any]:
+    return {
+        "status": camera.status,
+        "reason": camera.reason,
+        "z_score": camera.z_score,
+        **_by_unit("deviation", camera.deviation),
+        **_by_unit("sigma", camera.sigma),
+        **_by_unit("detectable", camera.detectable),
+    }
+
+
+def _lidar_summary(lidar: LidarAudit) -> dict[str, Any]:
+    return {
+        "reason": lidar.reason,
+        **_by_unit("motion", lidar.motion),
+        **_by_unit("sigma", lidar.sigma),
+    }
+
+
+def _by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
+    """A (6,) of rotations and translations in degrees and centimetres."""
+    return {
+        f"{name}_deg": None if twist is None else np.degrees(twist[:3]).tolist(),
+        f"{name}_cm": None if twist is None else (100.0 * twist[3:]).tolist(),
+    }

@@ -19,6 +19,7 @@ from calibgraph.cli import outputs
 from calibgraph.cli.bag import bag
 from calibgraph.cli.benchmark import bench, paper, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.inspect import evaluate, perturb, report
@@ -67,6 +68,7 @@ def _options(
 
 COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     calibrate: outputs.result,
+    check: outputs.nothing,
     match: outputs.table,
     solve: outputs.result,
     report: outputs.page,

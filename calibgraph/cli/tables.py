@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from calibgraph.matching.cmrnext.training.validation import Validation
 
 MAX_REASONS = 16  # the worst come first
+CAMERA_AXES_COLUMNS = (
+    "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
+)  # fmt: skip
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 
@@ -82,8 +85,8 @@ def print_validation(console: Console, validation: Validation) -> None:
 
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, change from the guess, residuals and matches."""
-    table = _table("Calibration", "camera", "verdict")
-    _add_number_columns(
+    table = empty_table("Calibration", "camera", "verdict")
+    add_number_columns(
         table, "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior"
     )
     for name, T in result.T_camera_lidar.items():
@@ -106,11 +109,8 @@ def result_table(result: Calibration) -> Table:
 
 def error_bar_table(result: Calibration) -> Table:
     """One row per camera and per pair of cameras: a standard deviation per axis."""
-    table = _table("Error bar, along the axes of the camera", "camera")
-    _add_number_columns(
-        table,
-        "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
-    )  # fmt: skip
+    table = empty_table("Error bar, along the axes of the camera", "camera")
+    add_number_columns(table, *CAMERA_AXES_COLUMNS)
     for name in (*result.covariance, *result.pair_covariance):
         table.add_row(escape(name), *_error_bar_cells(result, name))
     for name, covariance in result.bootstrap.items():
@@ -133,7 +133,7 @@ def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:
     return [f"{v:.3f}" for v in rotation_deg] + [f"{v:.2f}" for v in translation_cm]
 
 
-def _table(title: str, *names: str) -> Table:
+def empty_table(title: str, *names: str) -> Table:
     """An empty table, narrow enough not to cut numbers on 80 columns."""
     table = Table(title=title, box=SIMPLE, padding=0)
     for name in names:
@@ -141,7 +141,8 @@ def _table(title: str, *names: str) -> Table:
     return table
 
 
-def _add_number_columns(table: Table, *headings: str) -> None:
+def add_number_columns(table: Table, *headings: str) -> None:
+    """Add columns whose cells are aligned to the right."""
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
 
@@ -157,8 +158,8 @@ def print_evaluation(console: Console, errors: Evaluation, estimate: Path, refer
 
 def evaluation_table(errors: Evaluation) -> Table:
     """One row per camera and per pair of cameras."""
-    table = _table("Estimate - reference, in the axes of the camera", "camera")
-    _add_number_columns(
+    table = empty_table("Estimate - reference, in the axes of the camera", "camera")
+    add_number_columns(
         table,
         "E_R\ndeg", "E_t\ncm", "x\ncm", "y\ncm", "z\ncm",
         "roll\ndeg", "pitch\ndeg", "yaw\ndeg",
@@ -185,8 +186,8 @@ def print_bench(console: Console, report: Report) -> None:
     """Print, per number of frames and reference, the errors of the worst camera of every row."""
     for block in report.blocks:
         title = f"{report.data}, N = {block.frames}, {block.draws} draws, against {block.reference}"
-        table = _table(escape(title), "worst camera: median, 95 %")
-        _add_number_columns(table, "E_R deg", "", "E_t cm", "", "failed")
+        table = empty_table(escape(title), "worst camera: median, 95 %")
+        add_number_columns(table, "E_R deg", "", "E_t cm", "", "failed")
         for name, row in block.rows.items():
             cells = [*_worst(row, "rotation_error_deg", 3), *_worst(row, "translation_error_cm", 2)]
             table.add_row(escape(name), *cells, str(row.failed) if row.failed else "")
@@ -204,8 +205,8 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
 
 def print_tuned(console: Console, tuned: TuningResult) -> None:
     """Print the scores of the best settings, the paper's and ``auto``."""
-    table = _table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
-    _add_number_columns(table, "lambda", "mu", "delta", "tau", "tuning", "test")
+    table = empty_table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
+    add_number_columns(table, "lambda", "mu", "delta", "tau", "tuning", "test")
     for row in (tuned.best, *tuned.others):
         c = row.config
         values = (c.prior_weight, c.relative_prior_weight, c.loss_scale_px, c.gate_px)

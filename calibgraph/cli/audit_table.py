@@ -1,0 +1,58 @@
+"""An audit as a table for a terminal, in degrees and centimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from calibgraph.audit import Audit, CameraAudit
+from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
+from calibgraph.cli.terminal import print_plain
+
+_COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red"}
+
+
+def print_audit(console: Console, audit: Audit) -> None:
+    """Print the status with its reasons, and the deviations per axis."""
+    console.print(f"[bold {_COLOURS[audit.status]}]{audit.status}[/]", highlight=False)
+    if audit.lidar is not None:
+        print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
+    for name, camera in audit.cameras.items():
+        print_plain(console, f"  {camera.status} {name}: {camera.reason}")
+    console.print(audit_table(audit))
+    console.print(
+        "deviation: of what images and clouds show from the deployed T_camera_lidar, about and "
+        "along the camera's axes; sigma: its standard deviation; detectable: what would have been "
+        "seen with 90 % probability, at one false alarm in 1000 rigs"
+    )
+    time = f"{sum(audit.timings_s.values()):.1f} s"
+    text = f"tolerance {audit.tolerance_deg:g} deg, {audit.tolerance_cm:g} cm per axis"
+    print_plain(console, f"{text}; {audit.frames} frames; {time}; nothing was written")
+
+
+def audit_table(audit: Audit) -> Table:
+    """Three rows per camera: deviation, sigma, smallest detectable change."""
+    table = empty_table("Deviation from the deployed calibration", "camera", "")
+    add_number_columns(table, *CAMERA_AXES_COLUMNS)
+    for name, camera in audit.cameras.items():
+        for row, (label, cells) in enumerate(_rows(camera)):
+            table.add_row("" if row else escape(name), label, *cells)
+    return table
+
+
+def _rows(camera: CameraAudit) -> list[tuple[str, list[str]]]:
+    rows = (
+        ("deviation", camera.deviation, "+.2f"),
+        ("sigma", camera.sigma, ".2f"),
+        ("detectable", camera.detectable, ".2f"),
+    )
+    return [(label, _cells(twist, form)) for label, twist, form in rows]
+
+
+def _cells(twist: NDArray[np.float64] | None, form: str) -> list[str]:
+    if twist is None:
+        return ["-"] * 6
+    return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]

@@ -1,0 +1,63 @@
+"""The command that audits a deployed calibration: check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
+from calibgraph.cli.terminal import progress_bar, terminal
+
+_EXIT_CODES = {"OK": 0, "WRONG": 1, "CANNOT TELL": 3}
+
+
+def check(
+    rig: Annotated[
+        Path, typer.Argument(metavar="RIG", help="The deployed calibration: a result or a rig.")
+    ],
+    dataset: DatasetArgument,
+    tolerance_deg: Annotated[
+        float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
+    ] = 0.5,
+    tolerance_cm: Annotated[
+        float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
+    ] = 10.0,
+    frames: FramesOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
+
+    Compares it with images and clouds of a recent recording, per camera and axis. Writes no files.
+    """
+    from calibgraph.audit import check
+    from calibgraph.audit.judgement import Tolerance
+    from calibgraph.io.rigs import load_rig
+
+    with checked_arguments():
+        Tolerance(tolerance_deg, tolerance_cm)
+        matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
+    data = dataset_from(dataset, rig, frames)
+    with progress_bar() as progress:
+        audit = check(
+            load_rig(rig),
+            data,
+            tolerance_deg=tolerance_deg,
+            tolerance_cm=tolerance_cm,
+            matcher=matcher,
+            seed=seed,
+            progress=progress,
+        )
+    if as_json:
+        from calibgraph.audit import audit_summary
+        from calibgraph.report.as_json import print_json
+
+        print_json(audit_summary(audit))
+    else:
+        from calibgraph.cli.audit_table import print_audit
+
+        print_audit(terminal(), audit)
+    raise typer.Exit(_EXIT_CODES[audit.status])

@@ -1,0 +1,127 @@
+"""The audit of a deployed calibration, on the sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import calibgraph
+from calibgraph import Audit, Rig, simulate_correspondences
+from calibgraph.matching.structure.matcher import StructureMatcher
+from tests.conftest import SAMPLE, stereo_relative_pose
+from tests.matching.structure.data import with_noise_images
+
+TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+def motion(axis: int, degrees: float = 0.0, metres: float = 0.0) -> np.ndarray:
+    """(4, 4) about and along one axis."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
+    T[axis, 3] = metres
+    return T
+
+
+def with_camera_moved(rig: Rig, name: str, T: np.ndarray) -> Rig:
+    """The rig as deployed before this camera moved by T^-1, in its own axes."""
+    return rig.moved_to({**rig.T_camera_lidar, name: T @ rig.T_camera_lidar[name]})
+
+
+def with_lidar_moved(rig: Rig, T: np.ndarray) -> Rig:
+    """The rig as deployed before the LiDAR moved by T^-1, in its own axes."""
+    return rig.moved_to({name: old @ T for name, old in rig.T_camera_lidar.items()})
+
+
+def check_by_table(deployed: Rig, **options: float) -> Audit:
+    """The audit by simulated correspondences of the truth, and the sample's images."""
+    table = simulate_correspondences(TRUTH, frames=6)
+    return calibgraph.check(deployed, SAMPLE, matcher=table, **options)
+
+
+def test_a_right_rig_is_ok() -> None:
+    audit = check_by_table(TRUTH)
+    assert audit.status == "OK"
+    assert audit.wrong == ()
+    assert audit.lidar is None
+    assert audit.frames == 6
+    for camera in audit.cameras.values():
+        assert camera.deviation is not None
+        assert camera.sigma is not None
+        assert camera.detectable is not None
+        assert (camera.detectable > 4 * camera.sigma).all()
+        assert not camera.deviation.flags.writeable
+
+
+def test_the_camera_that_was_moved_is_wrong_and_the_others_are_ok() -> None:
+    audit = check_by_table(with_camera_moved(TRUTH, "front_right", motion(0, metres=0.2)))
+    assert audit.wrong == ("front_right",)
+    assert audit.lidar is None
+    assert audit.cameras["front_right"].reason.startswith("moved along x (right) by -")
+    np.testing.assert_allclose(audit.cameras["front_right"].deviation[3:], [-0.2, 0, 0], atol=0.02)
+    assert {n for n, c in audit.cameras.items() if c.status == "OK"} == {"front_left", "left"}
+
+
+def test_a_motion_of_the_lidar_is_told_from_that_of_all_cameras() -> None:
+    audit = check_by_table(with_lidar_moved(TRUTH, motion(2, degrees=1)))
+    assert audit.status == "WRONG"
+    assert audit.wrong == ("LiDAR",)
+    assert audit.lidar is not None
+    assert "turned about z by -1.0" in audit.lidar.reason
+    np.testing.assert_allclose(np.degrees(audit.lidar.motion[:3]), [0, 0, -1], atol=0.05)
+
+
+def test_all_cameras_moved_otherwise_are_not_taken_for_the_lidar() -> None:
+    deployed = TRUTH
+    for axis, name in enumerate(TRUTH.cameras):
+        deployed = with_camera_moved(deployed, name, motion(axis, degrees=1))
+    audit = check_by_table(deployed)
+    assert audit.lidar is None
+    assert audit.wrong == tuple(TRUTH.cameras)
+
+
+def test_a_deviation_within_a_larger_tolerance_is_ok() -> None:
+    deployed = with_camera_moved(TRUTH, "left", motion(1, degrees=1))
+    audit = check_by_table(deployed, tolerance_deg=2.0)
+    assert audit.status == "OK"
+    assert (
+        "within the tolerance, though significant: turned about y" in audit.cameras["left"].reason
+    )
+
+
+def test_relative_poses_of_the_deployed_rig_take_no_part() -> None:
+    """They hold what was deployed, which is what is in question."""
+    moved = with_camera_moved(TRUTH, "front_right", motion(1, degrees=1))
+    pose = stereo_relative_pose(moved, "front_left", "front_right")
+    audit = check_by_table(moved.model_copy(update={"relative_poses": (pose,)}))
+    assert audit.wrong == ("front_right",)
+
+
+def test_one_frame_cannot_tell() -> None:
+    data = calibgraph.load_dataset(SAMPLE, TRUTH, frames="0")
+    audit = calibgraph.check(TRUTH, data)
+    assert audit.status == "CANNOT TELL"
+    for camera in audit.cameras.values():
+        assert camera.status == "CANNOT TELL"
+        assert camera.sigma is None
+        assert "record" in camera.reason
+
+
+def test_images_without_structure_cannot_tell(tmp_path: Path) -> None:
+    data = calibgraph.load_dataset(SAMPLE, TRUTH)
+    audit = calibgraph.check(TRUTH, with_noise_images(data, "left", tmp_path))
+    assert audit.cameras["left"].status == "CANNOT TELL"
+    assert audit.cameras["front_left"].status == "OK"
+    assert audit.status == "CANNOT TELL"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [2.0, 4.0, 8.0, 15.0])
+def test_a_rig_that_is_wrong_by_degrees_is_never_ok(degrees: float) -> None:
+    data = calibgraph.load_dataset(SAMPLE, TRUTH)
+    for seed in range(2):
+        deployed = calibgraph.perturb(TRUTH, rotation_deg=degrees, translation_m=0.3, seed=seed)
+        audit = calibgraph.check(deployed, data, matcher=StructureMatcher(seed=seed))
+        assert "OK" not in {camera.status for camera in audit.cameras.values()}

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibgraph.audit.judgement import POWER, Tolerance, detectable, judge_axes, significant_sigmas
+
+TOLERANCE = Tolerance(0.5, 10.0)
+SIGMA = np.repeat([np.radians(0.09), 0.02], 3)
+QUANTILE = significant_sigmas(3)
+
+
+def deviation(axis: int, value: float) -> np.ndarray:
+    """A deviation in degrees or centimetres about or along one axis."""
+    twist = np.zeros(6)
+    twist[axis] = np.radians(value) if axis < 3 else value / 100
+    return twist
+
+
+def test_a_significant_deviation_beyond_the_tolerance_is_wrong_and_its_axis_is_named() -> None:
+    status, reason = judge_axes(deviation(1, -0.8), SIGMA, QUANTILE, TOLERANCE)
+    assert status == "WRONG"
+    assert reason == "turned about y (yaw) by -0.80 deg (sigma 0.09)"
+    status, reason = judge_axes(deviation(5, 15.0), SIGMA, QUANTILE, TOLERANCE)
+    assert status == "WRONG"
+    assert "moved along z (ahead) by +15.00 cm" in reason
+
+
+def test_a_significant_deviation_within_the_tolerance_is_ok_and_named() -> None:
+    sharp = SIGMA / 4
+    status, reason = judge_axes(deviation(0, 0.3), sharp, QUANTILE, TOLERANCE)
+    assert status == "OK"
+    assert "within the tolerance, though significant" in reason
+    assert "x (pitch) by +0.30 deg" in reason
+
+
+def test_a_deviation_near_the_tolerance_cannot_be_told() -> None:
+    status, reason = judge_axes(deviation(2, 0.45), SIGMA, QUANTILE, TOLERANCE)
+    assert status == "CANNOT TELL"
+    assert "check another recording" in reason
+
+
+@pytest.mark.parametrize(("axis", "words"), [(1, "all over the image"), (5, "within 10 m")])
+def test_no_deviation_with_a_wide_error_bar_cannot_be_told(axis: int, words: str) -> None:
+    wide = SIGMA.copy()
+    wide[axis] *= 10
+    status, reason = judge_axes(np.zeros(6), wide, QUANTILE, TOLERANCE)
+    assert status == "CANNOT TELL"
+    assert words in reason
+
+
+def test_a_large_deviation_that_is_not_significant_is_not_called_wrong() -> None:
+    wide = 10 * SIGMA
+    assert judge_axes(deviation(0, 2.0), wide, QUANTILE, TOLERANCE)[0] == "CANNOT TELL"
+
+
+def test_one_of_a_thousand_unchanged_rigs_has_a_significant_axis() -> None:
+    draws = np.random.default_rng(0).standard_normal((400_000, 6 * 3))
+    alarms = np.count_nonzero((np.abs(draws) > QUANTILE).any(axis=1))
+    assert abs(alarms - 400) < 4 * np.sqrt(400)  # a Poisson count
+
+
+def test_the_smallest_detectable_change_is_significant_with_the_stated_power() -> None:
+    sizes = detectable(np.ones(6), cameras=3)
+    draws = sizes[0] + np.random.default_rng(1).standard_normal(100_000)
+    found = np.mean(np.abs(draws) > QUANTILE)
+    assert abs(found - POWER) < 4 * np.sqrt(POWER * (1 - POWER) / 100_000)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_tolerance_must_be_positive_and_finite(value: float) -> None:
+    with pytest.raises(ValueError, match="tolerance_cm must be positive"):
+        Tolerance(0.5, value)
