@@ -115,17 +115,23 @@ def _judge(
 
 
 def _doubts(run: MatchingRun, evidence: Evidence) -> dict[str, str]:
-    """Per camera, why its measurement cannot be trusted; empty if it can.
-
-    A z-score that would be a WARN of a calibration is a doubt: wrong results have them, too.
-    """
+    """Per camera, why its measurement cannot be trusted; empty if it can."""
     parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
-    name_of_z = threshold("z_score").name
+    z_scores = evidence.findings.z_score
     return {
-        name: "; ".join(
-            check.text
-            for check in checks
-            if check.status == "FAIL" or (check.name == name_of_z and check.status != "PASS")
-        )
+        name: _doubt_by_z_score(z_scores.get(name))
+        or "; ".join(check.text for check in checks if check.status == "FAIL")
         for name, checks in concatenate(parts, evidence.cameras).items()
     }
+
+
+def _doubt_by_z_score(z_score: float | None) -> str:
+    """The doubt where a calibration would WARN already: wrong results have such z-scores, too."""
+    row = threshold("z_score")
+    if z_score is None or row.grade(z_score) == "PASS":
+        return ""
+    return (
+        f"images and clouds agree too little (z-score {z_score:.1f}, {row.warn:g} needed): if the "
+        "extrinsic may be off by more than 3 deg or 40 cm, `calibgraph calibrate` searches "
+        "farther; else record sharp images of more structure, and check the intrinsics"
+    )

@@ -43,8 +43,10 @@ _RECORD = (
     "too uncertain for this tolerance: record more frames, at more places, {}, or give a tolerance "
     "above the sigmas"
 )
+_NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 _TOO_FEW_FRAMES = (
-    "too few frames for an error bar: record at least 5, better 30, at different places"
+    "too few frames for an error bar (those of one place count as one): record at least 5, better "
+    "30, of different places"
 )
 
 
@@ -67,7 +69,8 @@ class Tolerance:
     @property
     def twist(self) -> Array:
         """(6,) rotation [rad], translation [m]."""
-        return np.repeat([self.degrees, self.centimetres], 3) / _DISPLAY
+        twist: Array = np.repeat([self.degrees, self.centimetres], 3) / _DISPLAY
+        return twist
 
 
 def significant_sigmas(cameras: int) -> float:
@@ -95,11 +98,15 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         return CameraAudit("CANNOT TELL", doubt, z_score=z_score)
     deviation = _deviation(evidence, name)
     if covariance is None:
-        return CameraAudit("CANNOT TELL", doubt or _TOO_FEW_FRAMES, deviation, z_score=z_score)
+        few = name in evidence.without_error_bar
+        reason = _TOO_FEW_FRAMES if few else doubt or _NO_ERROR_BAR
+        return CameraAudit("CANNOT TELL", reason, deviation, z_score=z_score)
     sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
     status, reason = judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
     if doubt:
         status, reason = "CANNOT TELL", doubt
+    elif status == "WRONG" and cameras == 1:
+        reason += "; a single camera cannot be told from the LiDAR: either has moved"
     return CameraAudit(status, reason, deviation, sigma, detectable(sigma, cameras), z_score)
 
 

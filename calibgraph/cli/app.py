@@ -1,8 +1,8 @@
 """The command line's frame: its commands, one-line errors, exit codes.
 
 Human output goes to stderr, machine output (``--json``) to stdout. Exit codes: 0 done (PASS or
-WARN), 1 the calibration FAILed (its files are written and marked FAIL), 2 bad input (one line),
-130 interrupted.
+WARN), 1 the calibration FAILed (its files are written and marked FAIL) or is WRONG (``check``),
+2 bad input (one line), 3 the data cannot tell (``check``), 130 interrupted.
 """
 
 from __future__ import annotations

@@ -82,6 +82,15 @@ def test_all_cameras_moved_otherwise_are_not_taken_for_the_lidar() -> None:
     assert audit.wrong == tuple(TRUTH.cameras)
 
 
+def test_a_single_camera_is_wrong_or_its_lidar_is() -> None:
+    deployed = with_camera_moved(TRUTH, "left", motion(1, degrees=1))
+    alone = deployed.model_copy(update={"cameras": {"left": deployed.cameras["left"]}})
+    table = simulate_correspondences(TRUTH, frames=6).of_camera("left")
+    audit = calibgraph.check(alone, SAMPLE, matcher=table)
+    assert audit.wrong == ("left",)
+    assert "a single camera cannot be told from the LiDAR" in audit.cameras["left"].reason
+
+
 def test_a_deviation_within_a_larger_tolerance_is_ok() -> None:
     deployed = with_camera_moved(TRUTH, "left", motion(1, degrees=1))
     audit = check_by_table(deployed, tolerance_deg=2.0)
