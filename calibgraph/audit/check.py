@@ -68,6 +68,7 @@ def check(
 
     Raises:
         FileError, DatasetError: if the data cannot be read or do not fit together.
+        CorrespondenceError: if a table given as matcher is wrong.
         ValueError: if a tolerance is not positive, or the matcher is unknown.
     """
     tolerance, report = Tolerance(tolerance_deg, tolerance_cm), progress or no_progress
@@ -80,6 +81,10 @@ def check(
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance)
     except CorrespondenceError as error:
+        if (
+            error.camera not in rig.cameras or error.row is not None
+        ):  # a wrong table, not few matches
+            raise
         cameras, lidar = (
             {name: CameraAudit("CANNOT TELL", f"{error}") for name in rig.cameras},
             None,

@@ -111,9 +111,9 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
 
 
 def _deviation(evidence: Evidence, name: str) -> Array:
-    """(6,) xi in measured T_camera_lidar = exp(xi) deployed T_camera_lidar."""
+    """(6,) log of the camera's pose now in its frame as deployed: T_deployed_now = exp(xi)."""
     solved, deployed = evidence.solution.T_camera_lidar, evidence.guess.T_camera_lidar
-    return twist_between(solved[name], deployed[name])
+    return twist_between(deployed[name], solved[name])
 
 
 def judge_axes(
@@ -161,7 +161,7 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
     deployed = evidence.guess.T_camera_lidar
     steps = Steps(
         cameras=tuple(range(len(cameras))),
-        step=-np.concatenate([_deviation(evidence, name) for name in cameras]),
+        step=np.concatenate([_deviation(evidence, name) for name in cameras]),
         covariance=evidence.joint_covariance,
         limits=np.full(len(cameras), float(chdtri(6, FALSE_ALARM_RATE / len(cameras)))),
         T_lidar_camera=tuple(to_T_lidar_camera(deployed[name]) for name in cameras),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
@@ -38,6 +39,11 @@ class Matching:
     config: Config
     progress: Progress
 
+    @cached_property
+    def places(self) -> dict[str, list[list[int]]]:
+        """Which frames are of one place, as metadata of a table."""
+        return find_same_places(self.data, self.deployed)
+
 
 def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
     """The tracking rounds; where they do not settle within their reach, again after the first.
@@ -54,12 +60,11 @@ def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
 
 def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> MatchingRun:
     data, matcher, config = matching.data, matching.matcher, matching.config
-    places = find_same_places(data, matching.deployed)
     estimate, summaries = matching.deployed, list[RoundSummary]()
     for index in rounds:
         with watch("match"):
             table = matcher.match(data, estimate, round_index=index, progress=matching.progress)
-            table = replace(table, metadata={**table.metadata, **places})
+            table = replace(table, metadata={**table.metadata, **matching.places})
         with watch("solve"):
             solution = solve_joint(estimate, table, config, hold=True)
         summaries.append(summarize_round(table, estimate, solution.solved_rig))

@@ -22,8 +22,8 @@ class CameraAudit:
     Attributes:
         status: OK, CANNOT TELL or WRONG.
         reason: one sentence: what was found and, where nothing can be told, what to record.
-        deviation: (6,) xi in measured T_camera_lidar = exp(xi) deployed T_camera_lidar, rotation
-            [rad] then translation [m], in the camera's axes; None if nothing was measured.
+        deviation: (6,) xi in T_deployed_now = exp(xi), the pose of the camera now in its frame as
+            deployed: rotation [rad], translation [m]; None if nothing was measured.
         sigma: (6,) standard deviations of ``deviation``; None without an error bar.
         detectable: (6,) smallest change per axis that these data show; None without an error bar.
         z_score: agreement of image and cloud at the measured extrinsic; None if unknown.

@@ -24,9 +24,9 @@ def print_audit(console: Console, audit: Audit) -> None:
         print_plain(console, f"  {camera.status} {name}: {camera.reason}")
     console.print(audit_table(audit))
     console.print(
-        "deviation: of what images and clouds show from the deployed T_camera_lidar, about and "
-        "along the camera's axes; sigma: its standard deviation; detectable: what would have been "
-        "seen with 90 % probability, at one false alarm in 1000 rigs"
+        "deviation: motion of the camera from where it is deployed, about and along its own axes; "
+        "sigma: its standard deviation; detectable: what would have been seen with 90 % "
+        "probability, at one false alarm in 1000 rigs"
     )
     time = f"{sum(audit.timings_s.values()):.1f} s"
     text = f"tolerance {audit.tolerance_deg:g} deg, {audit.tolerance_cm:g} cm per axis"

@@ -26,13 +26,13 @@ def motion(axis: int, degrees: float = 0.0, metres: float = 0.0) -> np.ndarray:
 
 
 def with_camera_moved(rig: Rig, name: str, T: np.ndarray) -> Rig:
-    """The rig as deployed before this camera moved by T^-1, in its own axes."""
+    """The rig as deployed before this camera moved by T, in its own axes."""
     return rig.moved_to({**rig.T_camera_lidar, name: T @ rig.T_camera_lidar[name]})
 
 
 def with_lidar_moved(rig: Rig, T: np.ndarray) -> Rig:
-    """The rig as deployed before the LiDAR moved by T^-1, in its own axes."""
-    return rig.moved_to({name: old @ T for name, old in rig.T_camera_lidar.items()})
+    """The rig as deployed before the LiDAR moved by T, in its own axes."""
+    return rig.moved_to({name: old @ np.linalg.inv(T) for name, old in rig.T_camera_lidar.items()})
 
 
 def check_by_table(deployed: Rig, **options: float) -> Audit:
@@ -59,8 +59,8 @@ def test_the_camera_that_was_moved_is_wrong_and_the_others_are_ok() -> None:
     audit = check_by_table(with_camera_moved(TRUTH, "front_right", motion(0, metres=0.2)))
     assert audit.wrong == ("front_right",)
     assert audit.lidar is None
-    assert audit.cameras["front_right"].reason.startswith("moved along x (right) by -")
-    np.testing.assert_allclose(audit.cameras["front_right"].deviation[3:], [-0.2, 0, 0], atol=0.02)
+    assert audit.cameras["front_right"].reason.startswith("moved along x (right) by +")
+    np.testing.assert_allclose(audit.cameras["front_right"].deviation[3:], [0.2, 0, 0], atol=0.02)
     assert {n for n, c in audit.cameras.items() if c.status == "OK"} == {"front_left", "left"}
 
 
@@ -69,8 +69,8 @@ def test_a_motion_of_the_lidar_is_told_from_that_of_all_cameras() -> None:
     assert audit.status == "WRONG"
     assert audit.wrong == ("LiDAR",)
     assert audit.lidar is not None
-    assert "turned about z by -1.0" in audit.lidar.reason
-    np.testing.assert_allclose(np.degrees(audit.lidar.motion[:3]), [0, 0, -1], atol=0.05)
+    assert "turned about z by +" in audit.lidar.reason
+    np.testing.assert_allclose(np.degrees(audit.lidar.motion[:3]), [0, 0, 1], atol=0.05)
 
 
 def test_all_cameras_moved_otherwise_are_not_taken_for_the_lidar() -> None:
@@ -83,10 +83,10 @@ def test_all_cameras_moved_otherwise_are_not_taken_for_the_lidar() -> None:
 
 
 def test_a_single_camera_is_wrong_or_its_lidar_is() -> None:
-    deployed = with_camera_moved(TRUTH, "left", motion(1, degrees=1))
-    alone = deployed.model_copy(update={"cameras": {"left": deployed.cameras["left"]}})
-    table = simulate_correspondences(TRUTH, frames=6).of_camera("left")
-    audit = calibgraph.check(alone, SAMPLE, matcher=table)
+    truth = TRUTH.model_copy(update={"cameras": {"left": TRUTH.cameras["left"]}})
+    table = simulate_correspondences(truth, frames=6)
+    deployed = with_camera_moved(truth, "left", motion(1, degrees=1))
+    audit = calibgraph.check(deployed, SAMPLE, matcher=table)
     assert audit.wrong == ("left",)
     assert "a single camera cannot be told from the LiDAR" in audit.cameras["left"].reason
 
@@ -106,6 +106,20 @@ def test_relative_poses_of_the_deployed_rig_take_no_part() -> None:
     pose = stereo_relative_pose(moved, "front_left", "front_right")
     audit = check_by_table(moved.model_copy(update={"relative_poses": (pose,)}))
     assert audit.wrong == ("front_right",)
+
+
+def test_a_table_of_another_rig_is_an_error() -> None:
+    """Not CANNOT TELL: no recording would help."""
+    alone = TRUTH.model_copy(update={"cameras": {"left": TRUTH.cameras["left"]}})
+    table = simulate_correspondences(TRUTH, frames=6)
+    with pytest.raises(calibgraph.CorrespondenceError, match="is not in the rig"):
+        calibgraph.check(alone, SAMPLE, matcher=table)
+
+
+def test_correspondences_that_determine_no_camera_cannot_tell() -> None:
+    few = simulate_correspondences(TRUTH, frames=6).select(slice(0, 5))
+    audit = calibgraph.check(TRUTH, SAMPLE, matcher=few)
+    assert {camera.status for camera in audit.cameras.values()} == {"CANNOT TELL"}
 
 
 def test_one_frame_cannot_tell() -> None:

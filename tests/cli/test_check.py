@@ -44,7 +44,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
     assert (code, out) == (1, "")
     lines = err.splitlines()
     assert lines[0] == "WRONG"
-    assert any(line.startswith("  WRONG left: turned about y (yaw) by -") for line in lines)
+    assert any(line.startswith("  WRONG left: turned about y (yaw) by +") for line in lines)
     assert sum(line.startswith("  OK front_") for line in lines) == 2
     assert deployed.read_bytes() == before
     assert list(tmp_path.iterdir()) == [deployed]
