@@ -85,7 +85,8 @@ def test_real_recordings_are_reported(realdata: Path, name: str, tmp_path: Path)
     guess = perturb(calibgraph.load_rig(realdata / name), rotation_deg=1, translation_m=0.1)
     result = calibgraph.calibrate(realdata / name, guess)
     text = write_page(result, tmp_path)
-    assert text.count("data:image/jpeg") == 4 * len(result.rig.cameras)
+    pairs = 0 if result.camera_matches is None else len(result.camera_matches.pairs())
+    assert text.count("data:image/jpeg") == 4 * len(result.rig.cameras) + pairs
     rendering = render(tmp_path / "report.html", tmp_path)
     assert (rendering.errors, rendering.requests) == ([], [])
 
