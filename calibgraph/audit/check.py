@@ -81,14 +81,11 @@ def check(
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance)
     except CorrespondenceError as error:
-        if (
-            error.camera not in rig.cameras or error.row is not None
-        ):  # a wrong table, not few matches
+        too_few_matches = error.camera in rig.cameras and error.row is None
+        if not too_few_matches:  # a wrong table
             raise
-        cameras, lidar = (
-            {name: CameraAudit("CANNOT TELL", f"{error}") for name in rig.cameras},
-            None,
-        )
+        cameras = {name: CameraAudit("CANNOT TELL", f"{error}") for name in rig.cameras}
+        lidar = None
     finally:
         full.release()
     return Audit(cameras, lidar, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds)

@@ -41,19 +41,8 @@ def write_overlays(
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
-    cloud = frame.load_cloud()[:, :3].astype(np.float64)
-    paths = []
-    for name, camera in initial.cameras.items():
-        image = frame.load_image(name, camera)
-        after = final.cameras[name]
-        panels = [
-            _titled(draw_points(image, cloud, camera), f"{name}, frame {frame.name}: before"),
-            _titled(draw_points(image, cloud, after), f"{mark}{name}, frame {frame.name}: after"),
-            _depth_bar(image.shape[1]),
-        ]
-        paths.append(folder / f"overlay_{name}.png")
-        write_image(paths[-1], _shrink(np.vstack(panels)))
-    return paths
+    titles = f"{{name}}, frame {frame.name}: before", f"{mark}{{name}}, frame {frame.name}: after"
+    return _write_overlays(frame, (initial, final), titles, folder / "overlay_{name}.png")
 
 
 def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
@@ -65,13 +54,25 @@ def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
+    return _write_overlays(
+        frame, (guess,), (f"{{name}}, frame {frame.name}: guess",), folder / "guess_{name}.png"
+    )
+
+
+def _write_overlays(
+    frame: Frame, rigs: tuple[Rig, ...], titles: tuple[str, ...], path: Path
+) -> list[Path]:
+    """Per camera, the points as each rig places them, below each other."""
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
     paths = []
-    for name, camera in guess.cameras.items():
-        image = draw_points(frame.load_image(name, camera), cloud, camera)
-        panels = [_titled(image, f"{name}, frame {frame.name}: guess"), _depth_bar(image.shape[1])]
-        paths.append(folder / f"guess_{name}.png")
-        write_image(paths[-1], _shrink(np.vstack(panels)))
+    for name, camera in rigs[0].cameras.items():
+        image = frame.load_image(name, camera)
+        panels = [
+            _titled(draw_points(image, cloud, rig.cameras[name]), title.replace("{name}", name))
+            for rig, title in zip(rigs, titles, strict=True)
+        ]
+        paths.append(path.with_name(path.name.replace("{name}", name)))
+        write_image(paths[-1], _shrink(np.vstack([*panels, _depth_bar(image.shape[1])])))
     return paths
 
 
