@@ -76,8 +76,11 @@ class PoseSearch:
         return CommonFeatures(self.rig, self._frames, seed=self._seed)
 
     def near(self, body: Body) -> Candidate:
-        """The body about its guess, refined on."""
-        return self._settle(self.from_afar(body))
+        """The body about its guess, refined on: from there, and from what an approach leads to."""
+        direct = refine(self._frames, body)
+        if direct.z_score >= CONFIDENT or self.out_of_time():
+            return direct
+        return self._settle(max(direct, self.from_afar(body), key=_by_z_score))
 
     def from_afar(self, body: Body) -> Candidate:
         """The body near a pose that may be off by some degrees."""

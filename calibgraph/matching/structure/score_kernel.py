@@ -24,6 +24,9 @@ OPPOSITE = np.float32(0.5)
 """Weight of an image that is dark where the intensity is high. Leaves are bright in the near
 infrared, and markings are bright in both: on recordings with much of the former, a weight of -1
 cost a third of the z-score and up to 50 cm, with much of the latter, 1 cost a tenth."""
+CHANCE_DEPTH, CHANCE_INTENSITY = np.float32(0.13), np.float32(0.05)
+"""Shares of a structured image's variation that an unrelated window explains. Without them,
+windows would rather lie on any structure than on the flat image that they belong to."""
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
 
 
@@ -41,8 +44,9 @@ def score_windows(
 
     The score is d_D^2 + w d_I^2, with d the image's components along the columns of the basis, over
     the image's own variation. The sign of depth in an image is unknown, that of intensity likely:
-    w is 1, or OPPOSITE if d_I < 0. It is a share r of explained variance, or (likelihood) the
-    -log(1 - r) of a Gaussian window. Shifts at which a window leaves the image count 0.
+    w is 1, or OPPOSITE if d_I < 0. It is a share r of explained variance, above that of an
+    unrelated window, or (likelihood) the -log(1 - r) of a Gaussian window. Shifts at which a window
+    leaves the image count 0.
 
     Args:
         image: (h, w).
@@ -94,7 +98,9 @@ def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, gr
                 for k in range(stride):
                     patch[row * stride + k] = whole[corner + row * width + k]
             corner = 0
+        chance = np.float32(0)
         for p in range(n):
+            chance += CHANCE_DEPTH * basis[w, p, 0] ** 2 + CHANCE_INTENSITY * basis[w, p, 1] ** 2
             start[p] = corner + (places[w, p, 1] - top) * stride + places[w, p, 0] - left
         for shift in range(above, end, at_once):
             lines = min(at_once, end - shift)
@@ -105,10 +111,10 @@ def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, gr
                 row, column = shift + line - origin[1], first - origin[0]
                 if likelihood:
                     out = factors[row, column : column + size]
-                    _multiply_factors(sums, line * stride, n, out)
+                    _multiply_factors(sums, line * stride, n, chance, out)
                 else:
                     out = grids[group[w], row, column : column + size]
-                    _add_shares(sums, line * stride, n, out)
+                    _add_shares(sums, line * stride, n, chance, out)
         multiplied += int(likelihood)
     if multiplied:
         _take_logarithms(factors, grids[group[-1]])
@@ -179,23 +185,29 @@ def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: i
 
 
 @compiled(fastmath=True, nogil=True, error_model="numpy")
-def _add_shares(sums, at, n, grid):  # type: ignore[no-untyped-def]
+def _add_shares(sums, at, n, chance, grid):  # type: ignore[no-untyped-def]
     """Add the share of explained variance at each shift of a row."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
     trend_u, trend_v = sums[4][at:], sums[5][at:]
+    by_chance = chance * np.float32(n * GRAY_NOISE**2)
     for k in range(len(grid)):
         variation = power[k] - total[k] * total[k] / np.float32(n)
         variation -= trend_u[k] * trend_u[k] + trend_v[k] * trend_v[k]
-        grid[k] += (depth[k] * depth[k] + intensity[k] * max(intensity[k], OPPOSITE * intensity[k])) / variation
+        explained = depth[k] * depth[k]
+        explained += intensity[k] * max(intensity[k], OPPOSITE * intensity[k])
+        grid[k] += (explained + by_chance) / variation - chance
 
 
 @compiled(fastmath=True, nogil=True, error_model="numpy")
-def _multiply_factors(sums, at, n, factors):  # type: ignore[no-untyped-def]
+def _multiply_factors(sums, at, n, chance, factors):  # type: ignore[no-untyped-def]
     """Multiply by the residual share at each shift of a row."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
+    by_chance = chance * np.float32(n * GRAY_NOISE**2)
     for k in range(len(factors)):
         variation = power[k] - total[k] * total[k] / np.float32(n)
-        share = (depth[k] * depth[k] + intensity[k] * max(intensity[k], OPPOSITE * intensity[k])) / variation
+        explained = depth[k] * depth[k]
+        explained += intensity[k] * max(intensity[k], OPPOSITE * intensity[k])
+        share = (explained + by_chance) / variation - chance
         factors[k] *= np.float32(1) - share / np.float32(1 + MIN_RESIDUAL_SHARE)
 
 
