@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,8 +10,11 @@ from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import (
+    CHANCE_DEPTH,
+    CHANCE_INTENSITY,
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
+    OPPOSITE,
     score_windows,
 )
 from calibgraph.matching.structure.shift_scores import score_frame
@@ -24,9 +28,12 @@ def orthonormal(points: int, columns: int, rng: np.random.Generator) -> np.ndarr
 
 
 @pytest.mark.parametrize("likelihood", [False, True])
-def test_the_score_of_a_window_is_its_share_of_the_images_variance(likelihood: bool) -> None:
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_score_of_a_window_is_its_share_of_the_images_variance(
+    likelihood: bool, sign: int
+) -> None:
     rng = np.random.default_rng(0)
-    image = rng.standard_normal((20, 30)).astype(np.float32)
+    image = sign * rng.standard_normal((20, 30)).astype(np.float32)
     places = rng.integers([10, 8], [18, 14], (12, 2)).astype(np.int32)
     basis = orthonormal(12, 4, rng).astype(np.float32)
     basis[:, 2:] *= not likelihood
@@ -38,10 +45,30 @@ def test_the_score_of_a_window_is_its_share_of_the_images_variance(likelihood: b
     seen = image[places[:, 1] - 1, places[:, 0] + 2]  # at the shift (2, -1)
     depth, intensity, *trend = basis.T @ seen
     variance = 12 * seen.var() - np.square(trend).sum() + 12 * GRAY_NOISE**2
-    share = (depth**2 + intensity * abs(intensity)) / variance
-    largest = 1 + MIN_RESIDUAL_SHARE
-    log = np.sign(share) * np.log(largest / (largest - abs(share)))
+    weight = 1 if intensity > 0 else OPPOSITE
+    structured = 1 - 12 * GRAY_NOISE**2 / variance
+    chance = (CHANCE_DEPTH + CHANCE_INTENSITY) * structured
+    share = (depth**2 + weight * intensity**2) / variance - chance
+    log = -np.log(1 - share / (1 + MIN_RESIDUAL_SHARE))
     assert grids[0, 1, 4] == pytest.approx(log if likelihood else share, rel=1e-4)
+
+
+def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -> None:
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.standard_normal((60, 60)), (0, 0), 1.0).astype(np.float32)
+    image[:, :30] = image.mean()
+    places = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(1, 25, 2)
+    grids = np.zeros((1, 60, 60), np.float32)
+    for angle in rng.uniform(0, 2 * np.pi, 400):  # a silhouette each
+        near = np.sign(places[0] @ [np.cos(angle), np.sin(angle)] + rng.uniform(-1, 1))
+        basis = np.zeros((1, 25, 4), np.float32)
+        basis[0, :, 0] = (near - near.mean()) / np.linalg.norm(near - near.mean())
+        score_windows(
+            image, places.astype(np.int32), np.array([25], np.int32), basis,
+            np.zeros(1, np.int32), np.zeros(2, np.int64), False, grids,
+        )  # fmt: skip
+    flat, structured = grids[0, 5:55, 5:25].mean() / 400, grids[0, 5:55, 35:55].mean() / 400
+    assert abs(structured - flat) < 0.5 * CHANCE_DEPTH
 
 
 def test_shifts_at_which_a_window_leaves_the_image_score_zero() -> None:
