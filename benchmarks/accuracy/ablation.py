@@ -150,7 +150,11 @@ def _without_trend(cloud: Any, members: Any, counts: Any, _: bool, *others: Any)
 
 
 def _shares(*arguments: Any) -> None:
-    _SCORE_WINDOWS(*arguments[:6], False, arguments[7])
+    _SCORE_WINDOWS(*arguments[:6], False, *arguments[7:])
+
+
+def _with_chance(*arguments: Any) -> None:
+    _SCORE_WINDOWS(*arguments[:8], 0.0)
 
 
 _SCORE_WINDOWS = shift_scores.score_windows
@@ -170,6 +174,9 @@ ROUNDS: Mapping[str, Part] = {
     ),
     "linear parts removed": lambda: patch.object(windows, "describe_windows", _without_trend),
     "shares, not likelihoods": lambda: patch.object(shift_scores, "score_windows", _shares),
+    "share of unrelated windows kept": lambda: patch.object(
+        shift_scores, "score_windows", _with_chance
+    ),
     "without round 4": _levels(LEVELS[4:]),
     "without round 6": _levels(LEVELS[3:5]),
     "without rounds 5 and 6": _levels(LEVELS[3:4]),

@@ -36,6 +36,7 @@ GROUP_RAD = np.radians(2.5)
 OCTAVES_PER_BIN = 0.25
 MIN_VARIANCE_SHARE = 0.1  # of all groups' variance: z-scores of poses that see less do not rise
 MAX_CELLS = 40_000_000  # of all maps together: bounds the memory to some hundred megabytes
+CHANCE = 0.4  # of an unrelated window's share: the mean score of all windows is subtracted as well
 MARGIN_RAD = np.radians(3.0)  # beyond the image and the range: translations move points too
 
 
@@ -215,7 +216,10 @@ def _score_maps(
     inside = image.inside
     maps = np.zeros((groups, *inside.shape), np.float32)
     first = np.zeros(2, np.int64)
-    score_windows(image.log_gray, places, windows.counts, windows.basis, group, first, False, maps)
+    score_windows(
+        image.log_gray, places, windows.counts, windows.basis, group, first, False, maps,
+        CHANCE,
+    )  # fmt: skip
     maps *= inside
     maps -= (maps.sum(axis=(1, 2)) / inside.sum())[:, None, None]
     counts = np.bincount(group).astype(np.float32)[:, None, None]

@@ -24,7 +24,7 @@ OPPOSITE = np.float32(0.5)
 """Weight of an image that is dark where the intensity is high. Leaves are bright in the near
 infrared, and markings are bright in both: on recordings with much of the former, a weight of -1
 cost a third of the z-score and up to 50 cm, with much of the latter, 1 cost a tenth."""
-CHANCE_DEPTH, CHANCE_INTENSITY = np.float32(0.13), np.float32(0.05)
+CHANCE_DEPTH, CHANCE_INTENSITY = 0.13, 0.05
 """Shares of a structured image's variation that an unrelated window explains. Without them,
 windows would rather lie on any structure than on the flat image that they belong to."""
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
@@ -39,6 +39,7 @@ def score_windows(
     origin: NDArray[np.int64],
     likelihood: bool,
     grids: NDArray[np.float32],
+    chance: float = 1.0,
 ) -> None:
     """Add every window's score at all shifts to its group's grid.
 
@@ -57,6 +58,7 @@ def score_windows(
         origin: (2,) the first shift (u, v) of the grids.
         likelihood: of the kind of score.
         grids: (g, s, s).
+        chance: how much of an unrelated window's share to subtract.
     """
     height, width = image.shape
     pixels = np.zeros((2, height * width + LANES), np.float32)  # whole image, patch
@@ -65,12 +67,12 @@ def score_windows(
     factors = np.ones(grids.shape[1:], np.float32)
     _score_windows(
         image.shape, (*pixels,), (places, counts, basis, group), origin, likelihood, sums, factors,
-        grids,
+        grids, (chance * CHANCE_DEPTH, chance * CHANCE_INTENSITY),
     )  # fmt: skip
 
 
 @compiled(fastmath=True, nogil=True, error_model="numpy")
-def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, grids):  # type: ignore[no-untyped-def]
+def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, grids, shares):  # type: ignore[no-untyped-def]
     """See :func:`score_windows`; sums and factors: room for intermediate values."""
     height, width = shape
     whole, patch = pixels
@@ -98,9 +100,9 @@ def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, gr
                 for k in range(stride):
                     patch[row * stride + k] = whole[corner + row * width + k]
             corner = 0
-        chance = np.float32(0)
+        chance = 0.0
         for p in range(n):
-            chance += CHANCE_DEPTH * basis[w, p, 0] ** 2 + CHANCE_INTENSITY * basis[w, p, 1] ** 2
+            chance += shares[0] * basis[w, p, 0] ** 2 + shares[1] * basis[w, p, 1] ** 2
             start[p] = corner + (places[w, p, 1] - top) * stride + places[w, p, 0] - left
         for shift in range(above, end, at_once):
             lines = min(at_once, end - shift)
@@ -111,10 +113,10 @@ def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, gr
                 row, column = shift + line - origin[1], first - origin[0]
                 if likelihood:
                     out = factors[row, column : column + size]
-                    _multiply_factors(sums, line * stride, n, chance, out)
+                    _multiply_factors(sums, line * stride, n, np.float32(chance), out)
                 else:
                     out = grids[group[w], row, column : column + size]
-                    _add_shares(sums, line * stride, n, chance, out)
+                    _add_shares(sums, line * stride, n, np.float32(chance), out)
         multiplied += int(likelihood)
     if multiplied:
         _take_logarithms(factors, grids[group[-1]])
