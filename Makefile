@@ -18,7 +18,7 @@ $(VENV)/base: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/base
-	$(INSTALL) --editable '.[test,pointcloud,learned,ros]'
+	$(INSTALL) --editable '.[test,pointcloud,learned,ros,ray,dask]'
 	@touch $@
 
 install: $(VENV)/base ## Install into .venv

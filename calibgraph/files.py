@@ -141,7 +141,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return parse_yaml(read_text(path), path)
 
 
-def parse_yaml(text: str, path: Path) -> dict[str, Any]:
+def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
     """The mapping in the text of a YAML file.
 
     Raises:

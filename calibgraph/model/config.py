@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -149,7 +150,18 @@ def load_config(path: Path | str) -> Config:
     Raises:
         FileError: if the file is missing, has an unknown key or a wrong value.
     """
-    path = Path(path)
-    content = read_yaml(path)
+    return config_from(read_yaml(Path(path)), path)
+
+
+def config_from(content: Mapping[str, Any], path: Path | str) -> Config:
+    """The settings in a mapping; its ``preset`` gives the values that it leaves out.
+
+    Args:
+        content: by name.
+        path: where it is from.
+
+    Raises:
+        FileError: if it has an unknown key or a wrong value.
+    """
     name = content.get("preset", "auto")
     return checked_model(Config, {**_PRESETS.get(str(name), {}), **content}, path)

@@ -1,0 +1,163 @@
+"""The rows of a fleet: one per vehicle and camera, in Parquet files at a URI.
+
+A vehicle's rows are in the file of its bucket, ``bucket=HH/rows.parquet``, which is replaced as a
+whole: a reader finds every row once, whatever ends the writer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import compute, dataset, parquet
+
+from calibgraph.errors import FileError
+from calibgraph.files import require_place_for_folder, write_bytes
+from calibgraph.fleet.uris import is_local, locate
+
+FLEET_FORMAT = "calibgraph-fleet/1"
+BUCKETS = 256
+JOB_KEY = ("vehicle", "recording")
+"""A job of a manifest is known by its vehicle and its recordings."""
+
+SCHEMA = pa.schema(
+    [
+        ("vehicle", pa.string()),
+        ("camera", pa.string()),
+        ("status", pa.string()),
+        ("verdict", pa.string()),
+        ("reasons", pa.list_(pa.string())),
+        ("T_camera_lidar", pa.list_(pa.float64(), 16)),
+        ("covariance", pa.list_(pa.float64(), 36)),
+        ("error_kind", pa.string()),
+        ("error", pa.string()),
+        ("seconds", pa.float64()),
+        ("recording", pa.string()),
+        ("input_hash", pa.string()),
+        ("versions", pa.string()),
+    ],
+    metadata={"format": FLEET_FORMAT},
+)
+"""T_camera_lidar: (4, 4) by rows, null when failed; covariance: (6, 6) of xi in
+T_camera_lidar = exp(xi) estimate, null without an error bar. A vehicle that failed before its
+cameras were known has one row with an empty camera."""
+
+
+def read_rows(uri: str, storage_options: Mapping[str, Any] | None = None) -> pa.Table:
+    """All rows at a URI.
+
+    Args:
+        uri: a Parquet file, or a folder of them, hive-partitioned or not; local or of fsspec.
+        storage_options: of fsspec.
+
+    Raises:
+        FileError: if nothing is there, or it cannot be read.
+    """
+    import fsspec
+
+    try:
+        filesystem, path = fsspec.core.url_to_fs(uri, **dict(storage_options or {}))
+        files = dataset.dataset(path, filesystem=filesystem, format="parquet")
+        # A manifest of a later run may have further columns.
+        schemas = [fragment.physical_schema for fragment in files.get_fragments()]
+        if not schemas:
+            raise FileNotFoundError("no Parquet file is there")
+        schema = pa.unify_schemas(schemas, promote_options="permissive")
+        return files.replace_schema(schema).to_table()
+    except (OSError, ValueError, ImportError, pa.ArrowException) as error:
+        raise FileError(
+            uri, f"cannot be read as a fleet's rows ({error}); give what calibgraph fleet wrote"
+        ) from error
+
+
+def bucket_of(vehicle: str) -> int:
+    """The bucket of a vehicle, from 0 to 255: by the hash of its name."""
+    return hashlib.sha256(vehicle.encode()).digest()[0]
+
+
+class RowStore:
+    """The rows at a URI, for one writer per bucket at a time.
+
+    Args:
+        uri: of a folder, local or of fsspec.
+
+    Raises:
+        FileError: if nothing can be written there.
+    """
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self._filesystem, self._path = locate(uri)
+        self._is_local = is_local(self._filesystem)
+        if self._is_local:
+            require_place_for_folder(Path(self._path))
+
+    def read(self, bucket: int, columns: Sequence[str] | None = None) -> pa.Table | None:
+        """The rows of a bucket, None if there are none.
+
+        Raises:
+            FileError: if a file is there that is not of a fleet of this format.
+        """
+        path = self._file(bucket)
+        if not self._filesystem.exists(path):
+            return None
+        with self._filesystem.open(path, "rb") as stored:
+            try:
+                file = parquet.ParquetFile(stored)
+                found = (file.schema_arrow.metadata or {}).get(b"format", b"").decode()
+                if found == FLEET_FORMAT:
+                    return file.read(columns=None if columns is None else list(columns))
+            except (pa.ArrowException, OSError) as error:
+                found = str(error)
+        raise FileError(
+            path, f"is not of a fleet of format {FLEET_FORMAT} ({found or 'no format'}); "
+            "choose another --out"
+        )  # fmt: skip
+
+    def publish(self, rows: pa.Table) -> None:
+        """Add rows; those of the same vehicle and recordings are replaced.
+
+        Each bucket's file is replaced in one step: by a rename of a synced file, or on an object
+        store by one put.
+        """
+        numbers = pa.array([bucket_of(name.as_py()) for name in rows["vehicle"]])
+        for number in compute.unique(numbers).to_pylist():
+            self._replace(number, rows.filter(compute.equal(numbers, number)))
+
+    def _replace(self, bucket: int, rows: pa.Table) -> None:
+        before = self.read(bucket)
+        if before is not None:
+            new = set(job_keys(rows))
+            kept = pa.array([key not in new for key in job_keys(before)], pa.bool_())
+            rows = pa.concat_tables([before.filter(kept), rows], promote_options="permissive")
+        self.put(f"bucket={bucket:02x}/rows.parquet", _encode(rows))
+
+    def put(self, name: str, content: bytes) -> None:
+        """Write a file below the URI in one step."""
+        path = f"{self._path}/{name}"
+        if self._is_local:
+            write_bytes(Path(path), content)
+        else:
+            self._filesystem.pipe_file(path, content)
+
+    def _file(self, bucket: int) -> str:
+        return f"{self._path}/bucket={bucket:02x}/rows.parquet"
+
+
+def job_keys(rows: pa.Table) -> Iterable[tuple[str, ...]]:
+    """Per row, the key of its job."""
+    return zip(*(rows[name].to_pylist() for name in JOB_KEY), strict=True)
+
+
+def _encode(rows: pa.Table) -> bytes:
+    """Rows as a Parquet file, those of a job together."""
+    metadata = {**(rows.schema.metadata or {}), "format": FLEET_FORMAT}
+    sink = io.BytesIO()
+    parquet.write_table(
+        rows.replace_schema_metadata(metadata), sink, write_statistics=False, compression="zstd"
+    )
+    return sink.getvalue()

@@ -1,0 +1,129 @@
+"""Addresses of files: local paths, or URIs of fsspec such as ``s3://bucket/drive``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.files import sha256
+
+_CHANGES = ("ETag", "etag", "generation", "md5Hash", "crc32c", "CRC", "size", "mtime", "LastModified",
+            "last_modified", "created")  # fmt: skip
+
+
+def locate(uri: str) -> tuple[Any, str]:
+    """The filesystem of a URI, and the path in it.
+
+    Raises:
+        FileError: if there is no such kind of URI, or its package is not installed.
+    """
+    import fsspec
+
+    try:
+        filesystem, path = fsspec.core.url_to_fs(uri)
+    except (ImportError, ValueError, OSError) as error:
+        raise FileError(uri, f"cannot be opened ({error})") from error
+    return filesystem, str(path)
+
+
+def is_local(filesystem: Any) -> bool:
+    """Whether the files of a filesystem are read in place."""
+    from fsspec.implementations.local import LocalFileSystem
+
+    return isinstance(filesystem, LocalFileSystem)
+
+
+def join(folder: str, uri: str) -> str:
+    """A URI; a relative path is below the folder."""
+    if "://" in uri or "::" in uri or Path(uri).is_absolute():
+        return uri
+    return f"{folder}/{uri}" if folder else uri
+
+
+def read_bytes(uri: str, most: int) -> bytes:
+    """A whole file.
+
+    Raises:
+        FileError: if it is missing, cannot be read, or has more bytes than these.
+    """
+    filesystem, path = locate(uri)
+    try:
+        size = filesystem.size(path)
+        if size is not None and size > most:
+            raise FileError(uri, f"{size} bytes is too large, expected up to {most}")
+        return bytes(filesystem.cat_file(path))
+    except FileNotFoundError as error:
+        raise FileError(uri, "no such file; check the path") from error
+    except IsADirectoryError as error:
+        raise FileError(uri, "is a folder, expected a file") from error
+    except CalibrationError:
+        raise
+    except Exception as error:  # of any store's client
+        raise FileError(uri, f"cannot be read ({error})") from error
+
+
+def fingerprint(uri: str) -> str:
+    """SHA-256 of what is at a URI.
+
+    Of the contents of local files; of the ETag, size and time of remote ones, which needs one
+    listing and no byte of them.
+
+    Raises:
+        FileNotFoundError: if nothing is there.
+    """
+    filesystem, path = locate(uri)
+    digest = hashlib.sha256()
+    entries = _local_entries(Path(path)) if is_local(filesystem) else _entries(filesystem, path)
+    for name, state in entries:
+        digest.update(json.dumps([name, state]).encode())
+    return digest.hexdigest()
+
+
+def _local_entries(path: Path) -> Iterator[tuple[str, str]]:
+    if not path.exists():
+        raise FileNotFoundError(path)
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        yield file.relative_to(path).as_posix(), sha256(file)
+
+
+def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
+    found = filesystem.find(path, detail=True)
+    if not found:
+        raise FileNotFoundError(path)
+    for name in sorted(found):
+        info = found[name]
+        state = {key: str(info[key]) for key in _CHANGES if info.get(key) is not None}
+        yield name.removeprefix(path), json.dumps(state, sort_keys=True)
+
+
+def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
+    """The local path of a URI; what is remote is copied into a folder.
+
+    Args:
+        uri: of a file or folder.
+        folder: for the copy, which keeps the name.
+        most_bytes: that are copied.
+
+    Raises:
+        FileError: if there are more bytes than these.
+    """
+    filesystem, path = locate(uri)
+    if is_local(filesystem):
+        return Path(path)
+    size = sum(filesystem.du(path, total=False).values())
+    if size > most_bytes:
+        raise FileError(
+            uri, f"{size / 1e9:.3g} GB, expected up to {most_bytes / 1e9:.3g}; see --fetch-gb"
+        )
+    name = path.rstrip("/").rsplit("/", 1)[-1] or "recording"
+    target = folder / name
+    if filesystem.isdir(path):
+        filesystem.get(path.rstrip("/") + "/", f"{target}/", recursive=True)
+    else:
+        filesystem.get_file(path, str(target))
+    return target
