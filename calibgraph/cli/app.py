@@ -22,6 +22,7 @@ from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
+from calibgraph.cli.fleet import fleet
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
@@ -83,6 +84,7 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     train: outputs.training,
     tune: outputs.settings,
     track: outputs.result,
+    fleet: outputs.nothing,
 }
 """Every command, and the files that it writes."""
 

@@ -71,6 +71,11 @@ class Job:
         return SEPARATOR.join(self.recordings)
 
     @property
+    def key(self) -> tuple[str, str]:
+        """What the job is known by in the rows."""
+        return self.vehicle, self.recording
+
+    @property
     def bucket(self) -> int:
         """See :func:`calibgraph.fleet.rows.bucket_of`."""
         return bucket_of(self.vehicle)

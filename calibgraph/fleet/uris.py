@@ -11,8 +11,11 @@ from typing import Any
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import sha256
 
-_CHANGES = ("ETag", "etag", "generation", "md5Hash", "crc32c", "CRC", "size", "mtime", "LastModified",
-            "last_modified", "created")  # fmt: skip
+_CHANGES = (
+    "ETag", "etag", "generation", "md5Hash", "crc32c", "CRC", "size", "mtime", "LastModified",
+    "last_modified", "created",
+)  # fmt: skip
+"""What stores report of a file that differs when the file does."""
 
 
 def locate(uri: str) -> tuple[Any, str]:

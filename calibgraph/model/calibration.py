@@ -43,7 +43,7 @@ PAIR_TANGENT_SENTENCE = (
 )
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of this package and of the libraries that results depend on."""
     packages = ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy")
     return {"python": platform.python_version()} | {name: _version(name) for name in packages}
@@ -129,7 +129,7 @@ class Calibration:
     correspondences: Correspondences | None = None
     camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=package_versions)
 
     @property
     def verdict(self) -> Verdict:

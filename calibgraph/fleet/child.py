@@ -1,0 +1,199 @@
+"""A process of its own for jobs: a crash, a leak or an endless loop ends it, and nothing else.
+
+It is kept from job to job, because loading the libraries takes longer than a small solve. It is no
+process of ``multiprocessing``: workers of Dask may not have such children.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from calibgraph.errors import CalibrationError
+from calibgraph.fleet.task import Outcome, Task, release
+
+_LOG, _MOST_LOG = "log.txt", 2**16
+_ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+"""The jobs share the cores, so that each needs one thread only."""
+
+
+class Child:
+    """A process that runs one job at a time; it is started when needed, and again after a crash."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+        self._is_closed = False
+
+    def run(self, task: Task) -> Outcome:
+        """Run a job.
+
+        Raises:
+            CalibrationError: if this process and the one that made the task have different
+                versions of the package.
+        """
+        if task.release != release():
+            raise CalibrationError(
+                f"a worker has calibgraph {release()}, the command {task.release}; install the "
+                "same version on all machines"
+            )
+        start = time.perf_counter()
+        with TemporaryDirectory(prefix="calibgraph-fleet-") as folder:
+            outcome = self._run(task, Path(folder))
+            log = _tail(Path(folder) / _LOG)
+        return replace(outcome, seconds=time.perf_counter() - start, log=log)
+
+    def _run(self, task: Task, folder: Path) -> Outcome:
+        try:
+            process, connection = self._start()
+        except OSError as error:
+            return Outcome(error_kind="worker died", error=f"no process can be started ({error})")
+        try:
+            connection.send((task, folder))
+            if not connection.poll(task.limits.timeout_s):
+                self._stop()
+                limit = f"{task.limits.timeout_s:g} s"
+                return Outcome(error_kind="timeout", error=f"took over {limit}; see --timeout-s")
+            outcome: Outcome = connection.recv()
+            return outcome
+        except (EOFError, OSError):
+            self._stop()
+            return Outcome(error_kind="worker died", error=_how_it_ended(process.wait()))
+
+    def _start(self) -> tuple[subprocess.Popen[bytes], Connection]:
+        """The process that runs, or a new one."""
+        if self._is_closed:
+            raise OSError("closed")
+        if self._process is not None and self._connection is not None:
+            if self._process.poll() is None:
+                return self._process, self._connection
+            self._stop()
+        ours, theirs = Pipe()
+        self._connection, self._process = (
+            ours,
+            subprocess.Popen(
+                [sys.executable, "-m", __name__, str(theirs.fileno())],
+                stdin=subprocess.PIPE,  # it ends with this process
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **_ONE_THREAD},
+                start_new_session=True,  # Ctrl-C is for the command
+            ),
+        )
+        theirs.close()
+        return self._process, ours
+
+    def _stop(self) -> None:
+        process, connection = self._process, self._connection
+        self._process = self._connection = None
+        if process is not None:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        if connection is not None:
+            connection.close()
+
+    def close(self) -> None:
+        """End the process, and with it the job that runs, and start no other."""
+        self._is_closed = True
+        if self._process is not None:
+            self._process.kill()  # upon which the thread that waits for it ends the rest
+
+
+def _how_it_ended(code: int) -> str:
+    """An exit code of a process in words."""
+    if code >= 0:
+        return f"the job's process ended with exit code {code}"
+    name = signal.Signals(-code).name
+    memory = "; was the memory enough?" if -code == signal.SIGKILL else ""
+    return f"the job's process was ended by {name}{memory}"
+
+
+_kept = threading.local()
+
+
+def run_in_kept_child(task: Task) -> Outcome:
+    """Run a job in the child of this thread, which lives as long as the thread's process."""
+    if not hasattr(_kept, "child"):
+        _kept.child = Child()
+    child: Child = _kept.child
+    return child.run(task)
+
+
+def _tail(path: Path) -> str:
+    """The end of a log."""
+    if not path.exists():
+        return ""
+    return path.read_bytes()[-_MOST_LOG:].decode(errors="replace")
+
+
+def main() -> None:
+    """The child's side: run what comes through the pipe until it closes."""
+    from calibgraph.fleet.execute import execute
+
+    place: list[Path] = []
+    threading.Thread(target=_end_with_parent, args=(place,), daemon=True).start()
+    connection = Connection(int(sys.argv[1]))
+    while True:
+        try:
+            task, folder = connection.recv()
+        except EOFError:
+            return
+        place[:] = [folder]
+        with _output_to(folder / _LOG), _memory_limit(task.limits.memory_bytes):
+            outcome = execute(task, folder)
+        connection.send(outcome)
+
+
+def _end_with_parent(place: list[Path]) -> None:
+    """End this process, and remove what it fetched, when the parent is gone."""
+    sys.stdin.buffer.read()
+    for folder in place:
+        shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
+@contextmanager
+def _output_to(path: Path) -> Iterator[None]:
+    """Send all output into a file, that of compiled libraries too."""
+    with path.open("ab") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+
+@contextmanager
+def _memory_limit(most: int | None) -> Iterator[None]:
+    """Let allocations beyond this number of bytes fail, where the system can."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    if most is not None:
+        resource.setrlimit(resource.RLIMIT_DATA, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+if __name__ == "__main__":
+    main()

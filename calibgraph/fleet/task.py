@@ -1,0 +1,103 @@
+"""What a worker gets and what it returns: a job with its limits, and the job's outcome."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from typing import Literal
+
+from calibgraph.fleet.manifest import Job
+
+ErrorKind = Literal[
+    "bad input", "io", "out of memory", "timeout", "worker died", "internal error"
+]  # fmt: skip
+
+RETRIES: dict[ErrorKind, int] = {
+    "bad input": 0,
+    "io": 3,
+    "out of memory": 0,
+    "timeout": 1,
+    "worker died": 3,
+    "internal error": 0,
+}
+"""How often a job is tried again in one run. A later run tries all failures again but bad input."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one job.
+
+    Attributes:
+        timeout_s: wall time, with fetching.
+        memory_bytes: that the job may allocate; None: no limit.
+        fetch_bytes: of remote recordings that are copied to the worker's disk.
+    """
+
+    timeout_s: float = 3600.0
+    memory_bytes: int | None = None
+    fetch_bytes: float = 50e9
+
+
+@dataclass(frozen=True)
+class Task:
+    """One try of a job.
+
+    Attributes:
+        job: of the manifest.
+        limits: of the try.
+        release: of this package in the process that made the task.
+    """
+
+    job: Job
+    limits: Limits
+    release: str
+
+
+@dataclass(frozen=True)
+class CameraResult:
+    """The result of one camera.
+
+    Attributes:
+        camera: its name.
+        verdict: PASS, WARN or FAIL.
+        reasons: of the verdict.
+        T_camera_lidar: 16 numbers by rows.
+        covariance: 36 numbers by rows; None without an error bar.
+    """
+
+    camera: str
+    verdict: str
+    reasons: tuple[str, ...]
+    T_camera_lidar: tuple[float, ...]
+    covariance: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a try ended.
+
+    Attributes:
+        cameras: the results, none if it failed.
+        error_kind: None if it did not fail.
+        error: the failure, in one line.
+        seconds: wall time.
+        versions: of the packages in the process that ran it, as JSON; empty if it died.
+        log: what the job printed.
+    """
+
+    cameras: tuple[CameraResult, ...] = ()
+    error_kind: ErrorKind | None = None
+    error: str | None = None
+    seconds: float = 0.0
+    versions: str = ""
+    log: str = ""
+
+
+@cache
+def release() -> str:
+    """The version of this package."""
+    try:
+        return version("calibgraph")
+    except PackageNotFoundError:
+        return "not installed as a package"

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from calibgraph import FileError
+from calibgraph.fleet.manifest import load_manifest
+
+HEAD = "vehicle,recording,rig,settings,mileage_km\n"
+
+
+def write(folder: Path, text: str, name: str = "fleet.csv") -> str:
+    (folder / name).write_text(text)
+    return str(folder / name)
+
+
+def test_csv_yaml_and_parquet_give_the_same_jobs(tmp_path: Path) -> None:
+    csv = write(tmp_path, HEAD + '001,a;b,rig.yaml,"{seed: 3, search_deg: 5}",12.5\n')
+    yaml = write(
+        tmp_path,
+        "vehicles:\n- {vehicle: '001', recording: [a, b], rig: rig.yaml, "
+        "settings: {seed: 3, search_deg: 5}, mileage_km: 12.5}\n",
+        "fleet.yaml",
+    )
+    cells = {"vehicle": ["001"], "recording": [["a", "b"]], "rig": ["rig.yaml"],
+             "settings": [{"seed": 3, "search_deg": 5}], "mileage_km": [12.5]}  # fmt: skip
+    parquet.write_table(pa.table(cells), tmp_path / "fleet.parquet")
+    found = [load_manifest(uri) for uri in (csv, yaml, str(tmp_path / "fleet.parquet"))]
+    assert found[0].jobs == found[1].jobs == found[2].jobs
+    (job,) = found[0].jobs
+    assert job.vehicle == "001"
+    assert job.recordings == (f"{tmp_path}/a", f"{tmp_path}/b")
+    assert (job.settings.config.seed, job.settings.search_deg) == (3, 5.0)
+    assert all(each.others.to_pylist() == [{"mileage_km": 12.5}] for each in found)
+
+
+def test_settings_may_be_a_file(tmp_path: Path) -> None:
+    write(tmp_path, "preset: kitti\nframes: '0:4'\n", "settings.yaml")
+    (job,) = load_manifest(write(tmp_path, HEAD + "a,b,,settings.yaml,1\n")).jobs
+    assert job.settings.config.preset == "kitti"
+    assert job.settings.config.gate_px == 3.0
+    assert job.settings.frames == "0:4"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("vehicle,rig\na,b\n", "column 'recording' is missing, found vehicle, rig"),
+        ("vehicle,recording,status\na,b,c\n", "column 'status' is one of the results' own"),
+        (HEAD, "holds no rows"),
+        (HEAD + ",b,,,1\n", "row 0: vehicle None: expected a name"),
+        (HEAD + "a,,,,1\n", "row 0: recording None: expected a path or URI"),
+        (HEAD + "a,b;,,,1\n", "row 0: recording 'b;': expected"),
+        (HEAD + "a,b.parquet,,,1\n", "row 0: vehicle 'a': a table of correspondences needs"),
+        (HEAD + "a,b.csv;c.csv,r,,1\n", "row 0: vehicle 'a': several tables"),
+        (HEAD + "a,b,,,1\na,b,,,2\n", "row 1: vehicle 'a' with this recording is in row 0 too"),
+        (HEAD + "a,b,,{gate: 3},1\n", "row 0: settings: unknown key 'gate'"),
+        (HEAD + "a,b,,{search_deg: -1},1\n", "row 0: settings: search_deg:"),
+        (HEAD + "a,b,,none.yaml,1\n", "none.yaml: no such file"),
+        (HEAD + "a,b\n", "cannot be read as csv"),
+    ],
+)
+def test_a_wrong_manifest_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(FileError) as caught:
+        load_manifest(write(tmp_path, text))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_suffixes_and_missing_manifests_are_one_line(tmp_path: Path) -> None:
+    for name, message in (("none.csv", "no such file"), ("x.txt", "must end in"),
+                          ("y.yaml", "expected the key 'vehicles'")):  # fmt: skip
+        if name != "none.csv":
+            write(tmp_path, "a: 1\n", name)
+        with pytest.raises(FileError, match=message):
+            load_manifest(str(tmp_path / name))
+    with pytest.raises(FileError, match="cannot be opened"):
+        load_manifest("nonsense://fleet.csv")
+
+
+@pytest.mark.parametrize("change", ["recording", "rig", "settings"])
+def test_the_input_hash_changes_with_every_input(
+    tmp_path: Path, change: str, write_input: Callable[[Path], str]
+) -> None:
+    uri = write_input(tmp_path)
+    (job,) = load_manifest(uri).jobs
+    before = job.input_hash()
+    assert load_manifest(uri).jobs[0].input_hash() == before
+    if change == "recording":
+        (tmp_path / "drive" / "lidar" / "0.npy").write_bytes(b"others")
+    elif change == "rig":
+        (tmp_path / "rig.yaml").write_text("b")
+    else:
+        write(tmp_path, HEAD + "a,drive,rig.yaml,{seed: 1},1\n")
+    assert load_manifest(uri).jobs[0].input_hash() != before
+
+
+@pytest.fixture
+def write_input() -> Callable[[Path], str]:
+    def write_it(folder: Path) -> str:
+        (folder / "drive" / "lidar").mkdir(parents=True)
+        (folder / "drive" / "lidar" / "0.npy").write_bytes(b"cloud")
+        (folder / "rig.yaml").write_text("a")
+        return write(folder, HEAD + "a,drive,rig.yaml,,1\n")
+
+    return write_it
