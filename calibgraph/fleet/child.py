@@ -24,6 +24,8 @@ from tempfile import TemporaryDirectory
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.task import Outcome, Task, release
 
+Process = subprocess.Popen[bytes]
+
 _LOG, _MOST_LOG = "log.txt", 2**16
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -35,7 +37,7 @@ class Child:
     """A process that runs one job at a time; it is started when needed, and again after a crash."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Process | None = None
         self._connection: Connection | None = None
         self._is_closed = False
 
@@ -51,17 +53,21 @@ class Child:
                 f"a worker has calibgraph {release()}, the command {task.release}; install the "
                 "same version on all machines"
             )
-        start = time.perf_counter()
         with TemporaryDirectory(prefix="calibgraph-fleet-") as folder:
-            outcome = self._run(task, Path(folder))
-            log = _tail(Path(folder) / _LOG)
-        return replace(outcome, seconds=time.perf_counter() - start, log=log)
+            start = time.perf_counter()
+            try:
+                process, connection = self._start()
+                start = time.perf_counter()  # the libraries' loading is not the job's time
+                outcome = self._converse(task, Path(folder), process, connection)
+            except (OSError, EOFError) as error:
+                outcome = _death(f"no process can be started ({error})")
+            seconds, log = time.perf_counter() - start, _tail(Path(folder) / _LOG)
+        return replace(outcome, seconds=seconds, log=log)
 
-    def _run(self, task: Task, folder: Path) -> Outcome:
-        try:
-            process, connection = self._start()
-        except OSError as error:
-            return Outcome(error_kind="worker died", error=f"no process can be started ({error})")
+    def _converse(
+        self, task: Task, folder: Path, process: Process, connection: Connection
+    ) -> Outcome:
+        """Give the job to the process, and wait for its outcome."""
         try:
             connection.send((task, folder))
             if not connection.poll(task.limits.timeout_s):
@@ -72,9 +78,9 @@ class Child:
             return outcome
         except (EOFError, OSError):
             self._stop()
-            return Outcome(error_kind="worker died", error=_how_it_ended(process.wait()))
+            return _death(_how_it_ended(process.wait()))
 
-    def _start(self) -> tuple[subprocess.Popen[bytes], Connection]:
+    def _start(self) -> tuple[Process, Connection]:
         """The process that runs, or a new one."""
         if self._is_closed:
             raise OSError("closed")
@@ -83,19 +89,20 @@ class Child:
                 return self._process, self._connection
             self._stop()
         ours, theirs = Pipe()
-        self._connection, self._process = (
-            ours,
-            subprocess.Popen(
-                [sys.executable, "-m", __name__, str(theirs.fileno())],
-                stdin=subprocess.PIPE,  # it ends with this process
-                stdout=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                env={**os.environ, **_ONE_THREAD},
-                start_new_session=True,  # Ctrl-C is for the command
-            ),
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__, str(theirs.fileno())],
+            stdin=subprocess.PIPE,  # it ends with this process
+            stdout=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, **_ONE_THREAD},
+            start_new_session=True,  # Ctrl-C is for the command
         )
         theirs.close()
-        return self._process, ours
+        self._process, self._connection = process, ours
+        ours.recv()  # it is ready
+        if self._is_closed:
+            raise OSError("closed")
+        return process, ours
 
     def _stop(self) -> None:
         process, connection = self._process, self._connection
@@ -108,11 +115,20 @@ class Child:
         if connection is not None:
             connection.close()
 
-    def close(self) -> None:
-        """End the process, and with it the job that runs, and start no other."""
+    def interrupt(self) -> None:
+        """End the process, and with it the job that runs in another thread; start no other."""
         self._is_closed = True
         if self._process is not None:
-            self._process.kill()  # upon which the thread that waits for it ends the rest
+            self._process.kill()
+
+    def close(self) -> None:
+        """End the process, when no other thread uses it."""
+        self.interrupt()
+        self._stop()
+
+
+def _death(error: str) -> Outcome:
+    return Outcome(error_kind="worker died", error=error)
 
 
 def _how_it_ended(code: int) -> str:
@@ -144,11 +160,13 @@ def _tail(path: Path) -> str:
 
 def main() -> None:
     """The child's side: run what comes through the pipe until it closes."""
+    import calibgraph.pipeline  # noqa: F401 - it takes seconds, which are not the first job's
     from calibgraph.fleet.execute import execute
 
     place: list[Path] = []
     threading.Thread(target=_end_with_parent, args=(place,), daemon=True).start()
     connection = Connection(int(sys.argv[1]))
+    connection.send("ready")
     while True:
         try:
             task, folder = connection.recv()

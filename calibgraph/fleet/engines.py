@@ -63,8 +63,10 @@ class ProcessEngine:
         """End all children."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for child in self._children:
-            child.close()
+            child.interrupt()
         self._threads.shutdown()
+        for child in self._children:
+            child.close()
 
 
 class RayEngine:

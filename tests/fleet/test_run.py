@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from benchmarks.fleet.tables import write_fleet
+from calibgraph import load_correspondences, load_rig, solve
+from calibgraph.errors import FileError
+from calibgraph.fleet.rows import read_rows
+from calibgraph.fleet.run import Summary, run_fleet
+from calibgraph.fleet.task import RETRIES, Limits
+
+POISON = Path(__file__).parent / "poison"
+GOOD, ILL = ("car-00000", "car-00001"), ("segfault", "hungry", "endless", "bug")
+BROKEN = "broken"
+# 3 GB: a child's libraries reserve under 1 GB, the hungry one takes 8 GB.
+LIMITS = Limits(timeout_s=4.0, memory_bytes=3 * 10**9)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    folder: Path
+    manifest: str
+    out: str
+    summary: Summary
+    starts: Counter[str]
+
+    @property
+    def rows(self) -> dict[tuple[str, str], dict[str, object]]:
+        rows = read_rows(self.out).to_pylist()
+        found = {(row["vehicle"], row["camera"]): row for row in rows}
+        assert len(found) == len(rows)
+        return found
+
+
+def count_starts(folder: Path) -> Counter[str]:
+    return Counter({path.name: path.read_text().count("start") for path in folder.iterdir()})
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """Two good vehicles, four whose process comes to grief, and one with a broken table."""
+    folder = tmp_path_factory.mktemp("fleet")
+    manifest = write_fleet(folder / "in", 2)
+    text = manifest.read_text()
+    for number, name in enumerate((*ILL, BROKEN)):
+        shutil.copy(folder / "in" / f"{GOOD[0]}.parquet", folder / "in" / f"{name}.parquet")
+        text += f'"{name}","{name}.parquet","nominal.yaml","{number}",7\n'
+    (folder / "in" / f"{BROKEN}.parquet").write_bytes(b"PAR1 and no more")
+    manifest.write_text(text)
+    (folder / "starts").mkdir()
+    out = str(folder / "out")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(POISON), prepend=":")
+        patch.setenv("COUNT_STARTS", str(folder / "starts"))
+        summary = run_fleet(str(manifest), out, limits=LIMITS, slots=2)
+    return Fleet(folder, str(manifest), out, summary, count_starts(folder / "starts"))
+
+
+def test_poison_stops_no_other_vehicle_and_becomes_rows(fleet: Fleet) -> None:
+    rows = fleet.rows
+    good = {(name, camera) for name in GOOD for camera in ("image_2", "image_3")}
+    assert set(rows) == good | {(name, "") for name in (*ILL, BROKEN)}
+    kinds = {name: rows[name, ""]["error_kind"] for name in (*ILL, BROKEN)}
+    assert kinds == {
+        "segfault": "worker died",
+        "hungry": "out of memory",
+        "endless": "timeout",
+        "bug": "internal error",
+        "broken": "bad input",
+    }
+    assert "ended by SIGSEGV" in str(rows["segfault", ""]["error"])
+    assert "is it complete? write it again" in str(rows[BROKEN, ""]["error"])
+    assert fleet.summary.failures == Counter(kinds.values())
+
+
+def test_each_kind_of_failure_is_tried_as_often_as_its_limit(fleet: Fleet) -> None:
+    kinds = {name: fleet.rows[name, ""]["error_kind"] for name in (*ILL, BROKEN)}
+    expected = {name: 1 + RETRIES[kind] for name, kind in kinds.items()}  # type: ignore[index]
+    assert fleet.starts == {**dict.fromkeys(GOOD, 1), **expected}
+    assert fleet.summary.retries == sum(expected.values()) - len(expected)
+
+
+def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
+    folder = Path(fleet.manifest).parent
+    name = GOOD[1]
+    rig = load_rig(folder / "nominal.yaml")
+    result = solve(rig, load_correspondences(folder / f"{name}.parquet"))
+    for camera, T in result.T_camera_lidar.items():
+        row = fleet.rows[name, camera]
+        assert row["verdict"] == result.camera_verdicts[camera].status
+        # The sums of one thread and of several differ in their rounding.
+        np.testing.assert_allclose(np.reshape(row["T_camera_lidar"], (4, 4)), T, atol=1e-9)
+        np.testing.assert_allclose(
+            np.reshape(row["covariance"], (6, 6)), result.covariance[camera], rtol=1e-6, atol=1e-12
+        )
+
+
+def test_columns_of_the_manifest_are_carried(fleet: Fleet) -> None:
+    assert {row["mileage_km"] for (name, _), row in fleet.rows.items() if name in GOOD} == {0, 1000}
+    assert pa.types.is_string(read_rows(fleet.out).schema.field("batch").type)
+
+
+def test_a_log_per_vehicle_holds_its_tries(fleet: Fleet) -> None:
+    (log,) = (Path(fleet.out) / "_logs").glob("segfault-*.log")
+    assert log.read_text().count("failed: worker died") == RETRIES["worker died"]
+    (log,) = (Path(fleet.out) / "_logs").glob("bug-*.log")
+    assert "KeyError" in log.read_text()
+
+
+def test_a_second_run_does_only_what_may_succeed_now(fleet: Fleet) -> None:
+    before = read_rows(fleet.out)
+    summary = run_fleet(fleet.manifest, fleet.out, limits=LIMITS, slots=2)
+    assert summary.skipped == len(GOOD) + 1
+    assert summary.failures == {"bad input": 1}
+    after = fleet.rows
+    assert {key[0] for key, row in after.items() if row["status"] == "done"} == {*GOOD, *ILL}
+    for row in before.to_pylist():
+        if row["status"] == "done":
+            assert after[row["vehicle"], row["camera"]] == row
+
+
+def test_rows_of_another_version_are_not_mixed(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibgraph.fleet.run.release", lambda: "9.9")
+    with pytest.raises(FileError, match=r"holds rows of calibgraph .*, this is 9.9; choose"):
+        run_fleet(fleet.manifest, fleet.out)
+
+
+def test_missing_recordings_are_refused_or_become_rows(fleet: Fleet, tmp_path: Path) -> None:
+    manifest = tmp_path / "fleet.csv"
+    manifest.write_text("vehicle,recording\na,none\nb,neither\n")
+    out = tmp_path / "out"
+    with pytest.raises(FileError, match=r"row 0: .*none: nothing is there \(and 1 more\)"):
+        run_fleet(str(manifest), str(out))
+    assert not out.exists()
+    summary = run_fleet(str(manifest), str(out), allow_missing=True)
+    assert summary.failures == {"bad input": 2}
+    assert run_fleet(str(manifest), str(out), allow_missing=True).skipped == 0
