@@ -59,7 +59,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(POISON), prepend=":")
         patch.setenv("COUNT_STARTS", str(folder / "starts"))
-        summary = run_fleet(str(manifest), out, limits=LIMITS, slots=2)
+        summary = run_fleet(str(manifest), out, limits=LIMITS, slots=3)
     return Fleet(folder, str(manifest), out, summary, count_starts(folder / "starts"))
 
 
@@ -116,7 +116,7 @@ def test_a_log_per_vehicle_holds_its_tries(fleet: Fleet) -> None:
 
 def test_a_second_run_does_only_what_may_succeed_now(fleet: Fleet) -> None:
     before = read_rows(fleet.out)
-    summary = run_fleet(fleet.manifest, fleet.out, limits=LIMITS, slots=2)
+    summary = run_fleet(fleet.manifest, fleet.out, limits=LIMITS, slots=3)
     assert summary.skipped == len(GOOD) + 1
     assert summary.failures == {"bad input": 1}
     after = fleet.rows

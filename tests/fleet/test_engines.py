@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from pathlib import Path
+
+import psutil
+import pytest
+
+from benchmarks.fleet.tables import write_fleet
+from calibgraph import CalibrationError
+from calibgraph.fleet.engines import ProcessEngine, open_engine
+from calibgraph.fleet.manifest import load_manifest
+from calibgraph.fleet.rows import read_rows
+from calibgraph.fleet.run import run_fleet
+from calibgraph.fleet.task import Limits, Outcome, Task, release
+
+
+
+@pytest.fixture(scope="module")
+def manifest(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(write_fleet(tmp_path_factory.mktemp("fleet"), 12))
+
+
+@pytest.fixture
+def engine() -> Iterator[ProcessEngine]:
+    made = ProcessEngine(2)
+    yield made
+    made.close()
+
+
+def rows_without_seconds(out: Path) -> list[dict[str, object]]:
+    rows = read_rows(str(out)).drop_columns(["seconds"]).to_pylist()
+    return sorted(rows, key=lambda row: (row["vehicle"], row["camera"]))
+
+
+def test_a_worker_of_another_version_is_refused(manifest: str, engine: ProcessEngine) -> None:
+    job = load_manifest(manifest).jobs[0]
+    error = engine.submit(Task(job, Limits(), "9.9")).exception()
+    assert isinstance(error, CalibrationError)
+    assert f"a worker has calibgraph {release()}, the command 9.9" in str(error)
+
+
+def test_closing_ends_jobs_and_processes(manifest: str) -> None:
+    engine = ProcessEngine(1)
+    job = load_manifest(manifest).jobs[0]
+    futures = [engine.submit(Task(job, Limits(), release())) for _ in range(50)]
+    engine.close()
+    assert all(future.done() for future in futures)
+    assert not children_of(os.getpid())
+
+
+def test_no_more_is_submitted_than_twice_the_slots(manifest: str, tmp_path: Path) -> None:
+    class Counting:
+        slots, most = 2, 0
+
+        def __init__(self) -> None:
+            self.open: list[Future[Outcome]] = []
+
+        def submit(self, task: Task) -> Future[Outcome]:
+            future: Future[Outcome] = Future()
+            self.open.append(future)
+            self.most = max(self.most, sum(not each.done() for each in self.open))
+            outcome = Outcome(error_kind="bad input", error="none")
+            threading.Timer(0.01, future.set_result, (outcome,)).start()
+            return future
+
+        def close(self) -> None:
+            """Nothing to release."""
+
+    counting = Counting()
+    assert run_fleet(manifest, str(tmp_path), engine=counting).failures == {"bad input": 12}
+    assert counting.most == 4
+
+
+@pytest.mark.parametrize("name", ["threads", "ray2", "processes:4"])
+def test_an_unknown_engine_is_one_line(name: str) -> None:
+    with pytest.raises(CalibrationError, match=f"--engine {name}: known are processes, ray"):
+        open_engine(name)
+
+
+@pytest.mark.parametrize(("name", "module"), [("ray", "ray"), ("dask", "distributed")])
+def test_a_missing_package_names_its_extra(
+    name: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(CalibrationError, match=rf"pip install 'calibgraph\[{name}\]'"):
+        open_engine(name)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", ["ray", "dask"])
+def test_clusters_give_the_rows_of_processes(name: str, manifest: str, tmp_path: Path) -> None:
+    run_fleet(manifest, str(tmp_path / "processes"), slots=2)
+    run_fleet(manifest, str(tmp_path / name), engine=name, slots=2)
+    expected = rows_without_seconds(tmp_path / "processes")
+    assert len(expected) == 24
+    assert rows_without_seconds(tmp_path / name) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", ["processes", "ray", "dask"])
+def test_every_row_is_there_once_though_workers_are_killed(
+    name: str, manifest: str, tmp_path: Path
+) -> None:
+    killed = kill_workers_of(os.getpid(), every_s=2.0, count=6)
+    run_fleet(manifest, str(tmp_path), engine=name, slots=2)
+    run_fleet(manifest, str(tmp_path), slots=2)
+    assert killed
+    rows = rows_without_seconds(tmp_path)
+    assert len(rows) == len({(row["vehicle"], row["camera"]) for row in rows}) == 24
+
+
+@pytest.mark.slow
+def test_a_killed_command_leaves_rows_that_the_next_one_keeps(
+    manifest: str, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "calibgraph", "fleet", manifest, "--out", str(tmp_path)]
+    for stop, code in ((signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        time.sleep(5.0)
+        below = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(stop)
+        assert process.wait(30) in (code, 0)
+        psutil.wait_procs(below, timeout=10)
+        assert not any(child.is_running() for child in below)
+    before = {row["vehicle"]: row["seconds"] for row in read_rows(str(tmp_path)).to_pylist()}
+    assert run_fleet(manifest, str(tmp_path), slots=2).skipped == len(before) > 0
+    rows = read_rows(str(tmp_path)).to_pylist()
+    assert len(rows) == 24
+    assert before.items() <= {row["vehicle"]: row["seconds"] for row in rows}.items()
+
+
+def children_of(pid: int) -> list[psutil.Process]:
+    """The processes of jobs below a process."""
+    found = []
+    for child in psutil.Process(pid).children(recursive=True):
+        try:
+            if "calibgraph.fleet.child" in child.cmdline():
+                found.append(child)
+        except psutil.Error:
+            continue
+    return found
+
+
+def kill_workers_of(pid: int, *, every_s: float, count: int) -> list[int]:
+    """Kill random processes of jobs from now on, in a thread; those that were killed."""
+    rng, killed = random.Random(0), list[int]()
+
+    def kill() -> None:
+        for _ in range(count):
+            time.sleep(every_s)
+            if found := children_of(pid):
+                victim = rng.choice(found)
+                victim.kill()
+                killed.append(victim.pid)
+
+    threading.Thread(target=kill, daemon=True).start()
+    return killed
