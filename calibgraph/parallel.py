@@ -15,8 +15,15 @@ Value = TypeVar("Value")
 Result = TypeVar("Result")
 
 
+THREADS_VARIABLE = "CALIBGRAPH_THREADS"
+"""In the environment: how many cores a process uses that shares them with others."""
+
+
 def count_cores() -> int:
     """The number of cores that this process may use."""
+    given = os.environ.get(THREADS_VARIABLE, "")
+    if given.isdecimal() and int(given):
+        return int(given)
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux

@@ -23,12 +23,13 @@ from tempfile import TemporaryDirectory
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.task import Outcome, Task, release
+from calibgraph.parallel import THREADS_VARIABLE
 
 Process = subprocess.Popen[bytes]
 
 _LOG, _MOST_LOG = "log.txt", 2**16
 _ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+    (THREADS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
 """The jobs share the cores, so that each needs one thread only."""
 

@@ -152,6 +152,8 @@ def _first_try(job: Job) -> Try:
     except FileNotFoundError as error:
         text = f"{error.args[0]}: nothing is there"
         return Try(job, "", known=Outcome(error_kind="bad input", error=text))
+    except FileError as error:  # no such kind of URI
+        return Try(job, "", known=Outcome(error_kind="bad input", error=str(error)))
     except Exception:  # of any store's client: the job will fail by it, or not
         return Try(job, "")
 

@@ -23,7 +23,6 @@ from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.task import Limits, Outcome, Task, release
 
 
-
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(write_fleet(tmp_path_factory.mktemp("fleet"), 12))

@@ -26,7 +26,11 @@ def test_every_bucket_is_in_one_shard() -> None:
         ),
         (
             None,
-            {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_COUNT": "3"},
+            {
+                "SLURM_ARRAY_TASK_ID": "3",
+                "SLURM_ARRAY_TASK_MIN": "1",
+                "SLURM_ARRAY_TASK_COUNT": "3",
+            },
             Shard(2, 3),
         ),
     ],

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fleet.tables import write_fleet
+from calibgraph.fleet.rows import read_rows
+from tests.cli.conftest import error_line
+from tests.conftest import Call
+
+
+def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(call: Call, tmp_path: Path) -> None:
+    manifest, out = str(write_fleet(tmp_path / "in", 2)), str(tmp_path / "out")
+    code, printed, _ = call("fleet", manifest, "--out", out, "--json")
+    assert code == 0
+    first = json.loads(printed)
+    assert (first["jobs"], first["skipped"], first["failures"]) == (2, 0, {})
+    assert sum(first["verdicts"].values()) == len(read_rows(out)) == 4
+    code, _, err = call("fleet", manifest, "--out", out)
+    assert code == 0
+    assert "2 jobs, 2 finished before; cameras: 4 PASS, 0 WARN, 0 FAIL" in err
+
+
+def test_failed_jobs_exit_1(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "fleet.csv").write_text("vehicle,recording\na,drive\n")
+    code, _, err = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "out"))
+    assert code == 1
+    assert "failed: 1 (bad input); see the column error, and _logs" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("vehicle\na\n", [], "column 'recording' is missing"),
+        ("vehicle,recording\na,none\n", [], "row 0: "),
+        ("vehicle,recording\na,.\n", ["--engine", "spark"], "--engine spark: known are"),
+        ("vehicle,recording\na,.\n", ["--shard", "8/8"], "shard 8/8: expected"),
+        ("vehicle,recording\na,xy://b\n", [], "row 0: xy://b: cannot be opened"),
+    ],
+)
+def test_wrong_input_is_one_line_and_writes_nothing(
+    call: Call, tmp_path: Path, text: str, options: list[str], message: str
+) -> None:
+    (tmp_path / "fleet.csv").write_text(text)
+    out = tmp_path / "out"
+    result = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(out), *options)
+    assert message in error_line(*result)
+    assert not out.exists()
+
+
+def test_a_place_that_is_a_file_is_refused(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "fleet.csv").write_text("vehicle,recording\na,.\n")
+    out = str(tmp_path / "fleet.csv")
+    assert "is a file" in error_line(*call("fleet", out, "--out", out))
