@@ -12,6 +12,7 @@ from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError
 from .errors import FileError as FileError
 from .errors import RigError as RigError
+from .fleet.run import run_fleet as run_fleet
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.calibrations import load_calibration as load_calibration

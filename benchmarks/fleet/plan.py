@@ -90,7 +90,7 @@ def _constants(folder: Path, driver_s: float, drives: Seconds) -> Table:
     sample = [path for path in (ROOT / "data" / "sample").rglob("*") if path.is_file()]
     rows = [path for path in (folder / "processes").rglob("*.parquet")]
     count = len(read_rows(str(folder / "processes")))
-    tables = _seconds(folder / "speed-2-0", "car")
+    tables = _seconds(folder / "processes", "car")
     return Table(
         "Constants, one thread per job",
         ("what", "value"),

@@ -28,6 +28,11 @@ _MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
 _MATCHING = ("frames", "search_deg", "search_m", "terms")
 
 
+def is_table(uri: str) -> bool:
+    """Whether a URI is of a table of correspondences, by its suffix; it may be in an archive."""
+    return uri.partition("::")[0].endswith(TABLE_SUFFIXES)
+
+
 class Settings(BaseModel):
     """Settings of one job.
 
@@ -83,7 +88,7 @@ class Job:
     @property
     def is_table(self) -> bool:
         """Whether the input is a table of correspondences."""
-        return self.recordings[0].endswith(TABLE_SUFFIXES)
+        return is_table(self.recordings[0])
 
     def input_hash(self) -> str:
         """SHA-256 of the rig, the settings and the recordings.
@@ -194,7 +199,7 @@ def _job(
     if not isinstance(vehicle, str) or not vehicle:
         raise place.error(f"vehicle {vehicle!r}: expected a name; give the column as text")
     recordings = tuple(join(folder, uri) for uri in _recordings(place, recording))
-    if recordings[0].endswith(TABLE_SUFFIXES):
+    if is_table(recordings[0]):
         if len(recordings) > 1:
             raise place.error(f"vehicle {vehicle!r}: several tables; write them into one file")
         if not rig:

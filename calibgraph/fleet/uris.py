@@ -81,8 +81,11 @@ def fingerprint(uri: str) -> str:
     filesystem, path = locate(uri)
     digest = hashlib.sha256()
     entries = _local_entries(Path(path)) if is_local(filesystem) else _entries(filesystem, path)
-    for name, state in entries:
-        digest.update(json.dumps([name, state]).encode())
+    try:
+        for name, state in entries:
+            digest.update(json.dumps([name, state]).encode())
+    except FileNotFoundError:
+        raise FileNotFoundError(uri) from None
     return digest.hexdigest()
 
 
