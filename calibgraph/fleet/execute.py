@@ -96,7 +96,7 @@ def _calibrate(task: Task, local: Callable[[str], Path]) -> Calibration:
         matcher=StructureMatcher(seed=settings.config.seed, **options),
         config=settings.config,
         terms=settings.terms,
-        time_limit_s=task.limits.timeout_s,
+        time_limit_s=task.limits.timeout_s / 2,  # the rest is for the checks
         progress=_print_stages(),
     )
 
