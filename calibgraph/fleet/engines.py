@@ -6,6 +6,7 @@ business; limits, retries and rows are the same for all.
 
 from __future__ import annotations
 
+import logging
 import queue
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -121,8 +122,9 @@ class DaskEngine:
         try:
             if not address:
                 self._cluster = distributed.LocalCluster(
-                    n_workers=slots or count_cores(), threads_per_worker=1, dashboard_address=None
-                )
+                    n_workers=slots or count_cores(), threads_per_worker=1, dashboard_address=None,
+                    silence_logs=logging.ERROR,
+                )  # fmt: skip
             self._client = distributed.Client(self._cluster or address, timeout="30s")
         except (OSError, ValueError, TimeoutError) as error:
             raise CalibrationError(f"--engine dask:{address}: no scheduler ({error})") from error
