@@ -119,7 +119,7 @@ def _compare(folder: Path, driver_s: float, rng: np.random.Generator) -> Table:
     thread = threading.Thread(target=kill_at_random, args=(stop, kills), daemon=True)
     thread.start()
     wall, _ = _run(manifest, folder / "plan-kills", 2)
-    stop.set()
+    stop.set()  # kills go on to the end of the run, unless there are 50 of them before
     thread.join()
     per_hour = kills[0] / wall * 3600 / 2
     killed = replace(plan, losses_per_hour=per_hour)

@@ -66,7 +66,7 @@ def simulate(seconds: NDArray[np.float64], plan: Plan, rng: np.random.Generator)
     """
     waiting = deque((job, 0) for job in range(len(seconds)))
     queue = deque[tuple[int, int, float]]()  # job, try, and when it was submitted
-    free = [plan.start_s] * plan.slots  # when each idle slot is ready
+    free = [(0.0, plan.start_s)] * plan.slots  # per idle slot, since when, and time to start it
     ends: list[tuple[float, int, int, str]] = []  # time, job, try, kind of failure
     driver_free = useful = 0.0
     retries = failed = 0
@@ -75,11 +75,12 @@ def simulate(seconds: NDArray[np.float64], plan: Plan, rng: np.random.Generator)
             queue.append((*waiting.popleft(), driver_free))
         while queue and free:
             job, number, submitted = queue.popleft()
-            length, kind = _draw(seconds[job], plan, rng)
-            start = max(heapq.heappop(free), submitted)
+            idle_since, start_s = heapq.heappop(free)
+            length, kind = _draw(seconds[job], start_s, plan, rng)
+            start = max(idle_since, submitted)
             heapq.heappush(ends, (start + length, job, number, kind))
         time_s, job, number, kind = heapq.heappop(ends)
-        heapq.heappush(free, time_s + (plan.start_s if kind else 0.0))
+        heapq.heappush(free, (time_s, plan.start_s if kind else 0.0))
         driver_free = max(driver_free, time_s) + plan.driver_s
         if not kind:
             useful += seconds[job]
@@ -94,11 +95,14 @@ def simulate(seconds: NDArray[np.float64], plan: Plan, rng: np.random.Generator)
     )  # fmt: skip
 
 
-def _draw(seconds: float, plan: Plan, rng: np.random.Generator) -> tuple[float, str]:
+def _draw(
+    seconds: float, start_s: float, plan: Plan, rng: np.random.Generator
+) -> tuple[float, str]:
     """Length of a try, and what ends it: nothing, the time limit, or the loss of its worker."""
     length = seconds * (plan.straggler_factor if rng.random() < plan.straggler_share else 1.0)
     kind = ""
     if length > plan.timeout_s:
         length, kind = plan.timeout_s, "timeout"
+    length += start_s
     loss = rng.exponential(3600 / plan.losses_per_hour) if plan.losses_per_hour else np.inf
     return (loss, "worker died") if loss < length else (length, kind)

@@ -114,6 +114,8 @@ def test_a_log_per_vehicle_holds_its_tries(fleet: Fleet) -> None:
     assert "KeyError" in log.read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_a_second_run_does_only_what_may_succeed_now(fleet: Fleet) -> None:
     before = read_rows(fleet.out)
     summary = run_fleet(fleet.manifest, fleet.out, limits=LIMITS, slots=3)
