@@ -89,7 +89,7 @@ class RayEngine:
             try:
                 ray.init(log_to_driver=False, include_dashboard=False, configure_logging=False,
                          **options)  # fmt: skip
-            except (ConnectionError, ValueError, RuntimeError) as error:
+            except Exception as error:  # Ray has no class of its own for it
                 raise CalibrationError(f"--engine ray:{address}: no cluster ({error})") from error
         self._ray = ray
         self.slots = slots or int(ray.cluster_resources().get("CPU", 1))
