@@ -23,7 +23,12 @@ from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 
-_WORKERS = ("calibgraph.fleet.child", "ray::run_in_kept_child", "multiprocessing.spawn", "multiprocessing-fork")
+_WORKERS = (
+    "calibgraph.fleet.child",
+    "ray::run_in_kept_child",
+    "multiprocessing.spawn",
+    "multiprocessing-fork",
+)
 
 
 def main() -> None:

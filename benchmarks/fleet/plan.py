@@ -95,7 +95,7 @@ def _constants(folder: Path, driver_s: float, drives: Seconds) -> Table:
         "Constants, one thread per job",
         ("what", "value"),
         (
-            ("a recording of 3 cameras and 3 frames [s, median]", f"{np.median(drives):.1f}"),
+            ("a recording of 3 cameras and 2 frames [s, median]", f"{np.median(drives):.1f}"),
             ("a table of 720 correspondences [s, median]", f"{np.median(tables):.3f}"),
             ("the driver per job of 6 cameras [ms]", f"{driver_s * 1e3:.2f}"),
             ("the sample, 6 frames [MB]", f"{sum(p.stat().st_size for p in sample) / 1e6:.1f}"),
