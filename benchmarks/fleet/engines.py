@@ -151,9 +151,17 @@ def kill_at_random(stop: threading.Event, kills: list[int]) -> None:
     while kills[0] < 50 and not stop.wait(rng.uniform(0.2, 0.8)):
         below = psutil.Process().children(recursive=True)
         workers = [each for each in below if _is_worker(each)]
-        if workers:
+        if any(map(_is_job, workers)):
             rng.choice(workers).kill()
             kills[0] += 1
+
+
+def _is_job(process: psutil.Process) -> bool:
+    """Whether it is a job's process: before the first, a cluster is still starting."""
+    try:
+        return "calibgraph.fleet.child" in process.cmdline()
+    except psutil.Error:
+        return False
 
 
 def _is_worker(process: psutil.Process) -> bool:

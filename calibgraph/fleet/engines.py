@@ -126,7 +126,7 @@ class DaskEngine:
                     silence_logs=logging.ERROR,
                 )  # fmt: skip
             self._client = distributed.Client(self._cluster or address, timeout="30s")
-        except (OSError, ValueError, TimeoutError) as error:
+        except Exception as error:  # of its communication and of its processes
             raise CalibrationError(f"--engine dask:{address}: no scheduler ({error})") from error
         self._pool = self._client.get_executor(pure=False, retries=0)
         self.slots = slots or sum(self._client.nthreads().values()) or 1
