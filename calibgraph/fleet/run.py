@@ -56,25 +56,22 @@ def run_fleet(
 ) -> Summary:
     """Calibrate the vehicles of a manifest, each alone, and publish a row per camera.
 
-    What an earlier run has finished is not done again: rows that are done, or that failed by their
-    input, with the same hash of rig, settings and recordings. A job that fails becomes a row.
+    What an earlier run finished with the same inputs is not done again. A failed job is a row.
 
     Args:
-        manifest: path or URI of a table, see :func:`calibgraph.fleet.manifest.load_manifest`.
-        out: folder or URI of the rows, see :func:`calibgraph.fleet.rows.read_rows`.
-        engine: where jobs run, an object or its name, see
-            :func:`calibgraph.fleet.engines.open_engine`.
+        manifest: path or URI of a table, see ``fleet.manifest.load_manifest``.
+        out: folder or URI of the rows.
+        engine: where jobs run, see :func:`calibgraph.fleet.engines.open_engine`.
         slots: jobs at once, of an engine by name; one per core if None.
         shard: the part of the manifest that is done; all if None.
         limits: of each job.
-        allow_missing: whether recordings that are not there become failed rows.
+        allow_missing: whether missing recordings become failed rows.
         logs: whether what a job printed is kept, below ``_logs``.
         progress: called as the work goes on.
 
     Raises:
-        FileError: if the manifest is wrong, inputs are missing, or rows there are of another
-            version: before anything is done.
-        CalibrationError: if workers have another version of this package.
+        CalibrationError: before anything is done, if the manifest is wrong, inputs are missing, or
+            rows or workers are of another version.
     """
     report, shard, limits = progress or no_progress, shard or Shard(), limits or Limits()
     found, store = load_manifest(manifest), RowStore(out)
