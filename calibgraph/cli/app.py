@@ -23,6 +23,7 @@ from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
+from calibgraph.cli.fleet_report import fleet_model, fleet_report
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
@@ -85,11 +86,15 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     tune: outputs.settings,
     track: outputs.result,
     fleet: outputs.nothing,
+    fleet_model: outputs.fleet_model,
+    fleet_report: outputs.fleet_page,
 }
 """Every command, and the files that it writes."""
 
 for _command, _outputs in COMMANDS.items():
-    app.command(_command.__name__.rstrip("_"))(outputs.keep_files(_command, _outputs))
+    app.command(_command.__name__.rstrip("_").replace("_", "-"))(
+        outputs.keep_files(_command, _outputs)
+    )
 bench.command()(outputs.keep_files(paper, outputs.benchmark))
 app.add_typer(bench, name="bench")
 

@@ -40,6 +40,21 @@ def page(given: Given) -> list[Output]:
     return [Output(given["out"] or folder / REPORT_FILE, "report", is_report, (".html", ".htm"))]
 
 
+def fleet_page(given: Given) -> list[Output]:
+    """The page of a fleet."""
+    from calibgraph.model.result_files import is_report
+    from calibgraph.outputs import Output
+
+    return [Output(given["out"], "fleet-report", is_report, (".html", ".htm"))]
+
+
+def fleet_model(given: Given) -> list[Output]:
+    """What a fleet knows, in the folder of ``--out``."""
+    from calibgraph.fleet.knowledge import outputs_of_knowledge
+
+    return outputs_of_knowledge(given["out"])
+
+
 def guess(given: Given) -> list[Output]:
     """A displaced rig."""
     return [_marked_yaml(given["out"], "perturb")]

@@ -114,6 +114,17 @@ def twist_between(T_camera_lidar: Array, reference: Array) -> Array:
     return np.asarray(gtsam.Pose3.Logmap(step))
 
 
+def twists_between(T_a_b: Array, references: Array) -> Array:
+    """(f, 6) xi, rotation [rad] and translation [m], in T_a_b = exp(xi) reference.
+
+    Args:
+        T_a_b: (f, 4, 4).
+        references: (4, 4) or (f, 4, 4).
+    """
+    twists: Array = logarithms(relative_transform(T_a_b, references))
+    return twists
+
+
 def pose_rows(camera: int) -> slice:
     """The six rows of camera number ``camera`` in a joint vector or matrix of all cameras."""
     return slice(6 * camera, 6 * camera + 6)
@@ -139,6 +150,21 @@ def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
 def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
     """(6, 6) Ad(T_lidar_camera^-1): a twist in the LiDAR frame to the same in the camera's."""
     return np.asarray(T_lidar_camera.inverse().AdjointMap(), dtype=np.float64)
+
+
+def adjoints(T_a_b: Array) -> Array:
+    """(f, 6, 6) Ad(T_a_b): twists in b, rotation first, to the same in a.
+
+    Args:
+        T_a_b: (f, 4, 4).
+    """
+    R, (x, y, z) = T_a_b[:, :3, :3], T_a_b[:, :3, 3].T
+    zero = np.zeros(len(R))
+    crossed = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    Ad = np.zeros((len(R), 6, 6))
+    Ad[:, :3, :3] = Ad[:, 3:, 3:] = R
+    Ad[:, 3:, :3] = crossed @ R
+    return Ad
 
 
 def retract_all(T_camera_lidar: Array, steps: Array) -> Array:

@@ -1,0 +1,159 @@
+"""Simulated fleets with known deviations: rows as `calibgraph fleet` writes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import relative_transform, retract_all
+
+Array = NDArray[np.float64]
+
+CAMERAS = ("front", "front_left", "front_right", "left", "rear", "right")
+MODELS = ("compact", "van")
+SPREAD = np.array([np.radians(0.15)] * 3 + [0.004] * 3)
+POOR = 0.3
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Rows, and the truth behind them.
+
+    Attributes:
+        rows: the table.
+        T_camera_lidar: (n, 4, 4) true.
+        moved: (n,) whether the camera was moved.
+        poor: (n,) whether its vehicle was poorly observed.
+        changed: (model, batch, camera) whose mount was changed, if any.
+    """
+
+    rows: pa.Table
+    T_camera_lidar: Array
+    moved: NDArray[np.bool_]
+    poor: NDArray[np.bool_]
+    changed: tuple[str, str, str]
+
+
+def simulate_fleet(
+    rng: np.random.Generator,
+    vehicles: int = 500,
+    *,
+    batches: int = 10,
+    moved_share: float = 0.05,
+    change_deg: float = 0.4,
+    mileage_deg: float = 0.0,
+    step_deg: float = 0.0,
+) -> Fleet:
+    """A fleet of two models with six cameras each.
+
+    Args:
+        rng: of all draws.
+        vehicles: in all; batch and model are drawn.
+        batches: per model.
+        moved_share: of the cameras: by 1 degree and 2 cm in a random direction.
+        change_deg: of the left camera in the third batch of the first model.
+        mileage_deg: of the rear cameras about x, per 100,000 km.
+        step_deg: of the right cameras of the second model's first batch, from mid 2026 on.
+    """
+    plan = _plan(rng, vehicles, batches)
+    model, batch, poor, day, mileage = plan
+    v, c = np.repeat(np.arange(vehicles), 6), np.tile(np.arange(6), vehicles)
+    nominal = np.array([_random_pose(rng) for _ in range(12)]).reshape(2, 6, 4, 4)
+    d = _regular(rng, model[v], batch[v], c, change_deg)
+    moved = rng.random(len(v)) < moved_share
+    d[moved] += _directions(rng, np.count_nonzero(moved)) * np.radians(1)
+    d[c == 4, 0] += np.radians(mileage_deg) * mileage[v[c == 4]] / 1e5
+    late = (c == 5) & (model[v] == 1) & (batch[v] == 0) & (day[v] > 182)
+    d[late, 1] += np.radians(step_deg)
+    truth = retract_all(nominal[model[v], c], -d)
+    covariance = _noise(rng, poor[v])
+    errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=d.shape))
+    temperature = rng.uniform(-10, 35, vehicles)
+    rows = _table(plan, temperature, retract_all(truth, -errors), covariance)
+    changed = (MODELS[0], "B02", CAMERAS[3]) if change_deg > 0 else ("", "", "")
+    return Fleet(rows, truth, moved, poor[v], changed)
+
+
+def _plan(rng: np.random.Generator, vehicles: int, batches: int) -> tuple[NDArray[Any], ...]:
+    """Of each vehicle: model, batch, whether it is poorly observed, day of the year, mileage."""
+    model, batch = rng.integers(2, size=vehicles), rng.integers(batches, size=vehicles)
+    poor, day = rng.random(vehicles) < POOR, rng.uniform(0, 365, vehicles)
+    return model, batch, poor, day, rng.uniform(0, 150_000, vehicles)
+
+
+def _regular(
+    rng: np.random.Generator,
+    model: NDArray[Any],
+    batch: NDArray[Any],
+    camera: NDArray[Any],
+    change_deg: float,
+) -> Array:
+    """(n, 6) deviations of vehicles and batches, and of the mount that was changed."""
+    mixing = np.array([_correlation(rng) for _ in CAMERAS])
+    shift = rng.normal(size=(2, batch.max() + 3, 6, 6)) * SPREAD * 0.2
+    shift[0, 2, 3] += _directions(rng, 1)[0] * np.radians(change_deg)
+    d = np.einsum("nij,nj->ni", mixing[camera], rng.normal(size=(len(camera), 6)))
+    return np.asarray(d + shift[model, batch, camera])
+
+
+def _table(
+    plan: tuple[NDArray[Any], ...], temperature: Array, T_camera_lidar: Array, covariance: Array
+) -> pa.Table:
+    """The rows, six cameras to a vehicle."""
+    model, batch, poor, day, mileage = (np.repeat(values, 6) for values in plan)
+    vehicle = np.repeat(np.arange(len(temperature)), 6)
+    start = np.datetime64("2026-01-01T00:00:00", "us")
+    return pa.table({
+        "vehicle": [f"V{i:06d}" for i in vehicle],
+        "camera": [*CAMERAS] * len(temperature),
+        "model": [MODELS[i] for i in model],
+        "batch": [f"B{i:02d}" for i in batch],
+        "status": ["done"] * len(vehicle),
+        "verdict": np.where(poor, "WARN", "PASS").tolist(),
+        "reasons": [["few frames"] if p else [] for p in poor],
+        "T_camera_lidar": _lists(T_camera_lidar, 16),
+        "covariance": _lists(covariance, 36),
+        "date": start + (day * 86_400e6).astype("timedelta64[us]"),
+        "mileage_km": mileage,
+        "temperature_c": np.repeat(temperature, 6),
+    })  # fmt: skip
+
+
+def _lists(values: Array, size: int) -> pa.FixedSizeListArray:
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), size)
+
+
+def _random_pose(rng: np.random.Generator) -> Array:
+    twist = rng.normal(size=(1, 6)) * [1, 1, 1, 0.5, 0.5, 0.5]
+    return retract_all(np.eye(4)[None], twist)[0]
+
+
+def _correlation(rng: np.random.Generator) -> Array:
+    """(6, 6) root of a covariance with SPREAD on its diagonal."""
+    root = np.linalg.cholesky(np.corrcoef(rng.normal(size=(6, 20)) + rng.normal(size=20)))
+    return np.asarray(SPREAD[:, None] * root)
+
+
+def _directions(rng: np.random.Generator, count: int) -> Array:
+    """(n, 6) rotations of 1 rad and translations of 1.15 m (2 cm per degree)."""
+    w, t = rng.normal(size=(2, count, 3))
+    w, t = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (w, t))
+    return np.column_stack([w, 0.02 / np.radians(1) * t])
+
+
+def _noise(rng: np.random.Generator, poor: NDArray[np.bool_]) -> Array:
+    """(n, 6, 6) covariances of measurements: of poor vehicles ten times the standard deviation."""
+    root = rng.normal(size=(len(poor), 6, 12)) / np.sqrt(12)
+    sigma = np.where(poor, 0.5, 0.05)[:, None] * [*np.radians([1.0] * 3), 0.03, 0.03, 0.03]
+    root = sigma[:, :, None] * root
+    return np.asarray(root @ root.transpose(0, 2, 1))
+
+
+def errors_of(T_camera_lidar: Array, truth: Array) -> Array:
+    """(n,) angle [rad] between estimates and truth."""
+    R = relative_transform(T_camera_lidar, truth)[:, :3, :3]
+    return np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1))

@@ -1,0 +1,215 @@
+"""What happened to a fleet: tests of mounts, batches, dates and drifts, many at once.
+
+All tests of a fleet are one family: what is reported was chosen by Benjamini and Hochberg's rule,
+so of many reports one in a hundred is expected to be wrong, however many tests there were.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, false_discovery_control, fisher_exact
+
+from calibgraph.fleet.fit import Mount, Pooled
+from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.model.geometry import twists_between
+
+Array = NDArray[np.float64]
+Kind = Literal["mount", "batch", "date", "drift"]
+
+_MIN_ON_A_SIDE = 3
+"""Vehicles before and after a date: with fewer it is these vehicles that stand apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One test of one camera of a model.
+
+    Attributes:
+        kind: a mount that moves in many vehicles, a batch that was changed, a date from which a
+            batch is another one, or a drift against a column.
+        model, camera, batch: where; batch is empty for all.
+        p_value: of the test alone.
+        change: (6,) rotation [rad], translation [m], of a batch, at a date, or per unit of the
+            column; NaN of a mount.
+        sigma: (6,) of it.
+        at: the date (YYYY-MM-DD), the column, or how many cameras were moved.
+        reach: from the least to the largest value of the column.
+    """
+
+    kind: Kind
+    model: str
+    camera: str
+    batch: str
+    p_value: float
+    change: Array
+    sigma: Array
+    at: str = ""
+    reach: float = 1.0
+
+    @property
+    def text(self) -> str:
+        """One sentence."""
+        where = f"{self.model or 'fleet'} {self.camera}"
+        batch = f"batch {self.batch}" if self.batch else "all vehicles"
+        return {
+            "mount": f"{where}: the mount moved in {self.at} vehicles, more than other cameras'",
+            "batch": f"{where}: {batch} differs from the model by {_size(self.change)}",
+            "date": f"{where}: {batch} changed on {self.at} by {_size(self.change)}",
+            "drift": f"{where}: drifts with {self.at}, {_size(self.change * self.reach)} "
+            f"over its range of {self.reach:,.0f}",
+        }[self.kind]
+
+
+def _size(change: Array) -> str:
+    """Angle and distance."""
+    degrees = math.degrees(float(np.linalg.norm(change[:3])))
+    return f"{degrees:.2g} deg, {100 * float(np.linalg.norm(change[3:])):.2g} cm"
+
+
+def find_changes(fleet: FleetModel) -> list[Finding]:
+    """Everything that stands out among mounts, batches, dates and drifts, the surest first."""
+    tests = [test for name, model in fleet.models.items() for test in _tests(fleet, name, model)]
+    if not tests:
+        return []
+    adjusted = false_discovery_control([test.p_value for test in tests])
+    found = [test for test, p in zip(tests, adjusted, strict=True) if p <= FALSE_DISCOVERIES]
+    return sorted(found, key=lambda finding: finding.p_value)
+
+
+def _tests(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
+    """Every test of one model."""
+    yield from _moved_mounts(fleet, name, model)
+    for mount in model.mounts.values():
+        yield from _changed_batches(mount, model.pooled)
+        information, y = mount.weigh(model.pooled).information, mount.deviations()
+        for batch, label in enumerate(mount.batches):
+            rows = mount.batch == batch
+            found = _change_at_a_date(mount.seen.day[rows], information[rows], y[rows])
+            if found is not None:
+                yield Finding("date", mount.model, mount.camera, label, *found)
+        columns = {**mount.seen.covariates, "date": mount.seen.day}
+        for column, x in columns.items():
+            slope = _drift(x, mount.batch, information, y)
+            if slope is not None:
+                reach = float(np.nanmax(x) - np.nanmin(x))
+                yield Finding("drift", mount.model, mount.camera, "", *slope, column, reach)
+
+
+def _moved_mounts(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
+    """Fisher's exact test: of a camera against the model's others, more were moved."""
+    of, nothing = fleet.observations, np.full(6, np.nan)
+    rows = (of.model == name) & of.measured
+    counts = np.array([[np.count_nonzero(fleet.apart & rows & (of.camera == camera)),
+                        np.count_nonzero(rows & (of.camera == camera))]
+                       for camera in model.mounts])  # fmt: skip
+    if len(counts) == 1:
+        return
+    for camera, (moved, all_of_it) in zip(model.mounts, counts, strict=True):
+        others = counts.sum(axis=0) - [moved, all_of_it]
+        table = [[moved, all_of_it - moved], [others[0], others[1] - others[0]]]
+        p = float(fisher_exact(table, alternative="greater").pvalue)
+        yield Finding("mount", name, camera, "", p, nothing, nothing, f"{moved} of {all_of_it}")
+
+
+def _changed_batches(mount: Mount, pooled: Pooled) -> Iterator[Finding]:
+    """Batches whose centre is further from the model's than batches scatter."""
+    if len(mount.batches) == 1:
+        return
+    some, T, noise = mount.measured_batches(mount.weigh(pooled))
+    y = twists_between(T, mount.centers.nominal)
+    total = noise + pooled.batch * mount.spread + mount.centers.nominal_covariance
+    for batch, deviation, covariance in zip(some, y, total, strict=True):
+        sigma = np.sqrt(np.diag(covariance))
+        yield Finding("batch", mount.model, mount.camera, mount.batches[batch],
+                      _p_value(deviation, covariance), deviation, sigma)  # fmt: skip
+
+
+def _change_at_a_date(
+    day: Array, information: Array, y: Array
+) -> tuple[float, Array, Array, str] | None:
+    """The split in time with the largest change; its p-value counts all splits (Bonferroni).
+
+    Args:
+        day: (n,) of one batch; NaN where unknown.
+        information: (n, 6, 6) of each vehicle about the batch's centre.
+        y: (n, 6) deviations.
+
+    Returns:
+        p-value, (6,) change, (6,) sigma, the first day after it. None with too few vehicles.
+    """
+    order = np.argsort(day)[: np.count_nonzero(np.isfinite(day))]
+    if len(order) < 2 * _MIN_ON_A_SIDE:
+        return None
+    H = information[order].cumsum(axis=0)
+    g = np.einsum("nij,nj->ni", information[order], y[order]).cumsum(axis=0)
+    splits = np.arange(_MIN_ON_A_SIDE - 1, len(order) - _MIN_ON_A_SIDE)
+    before, after = np.linalg.inv(H[splits]), np.linalg.inv(H[-1] - H[splits])
+    change = np.einsum("kij,kj->ki", after, g[-1] - g[splits])
+    change -= np.einsum("kij,kj->ki", before, g[splits])
+    covariance = before + after
+    squared = np.einsum("ki,kij,kj->k", change, np.linalg.inv(covariance), change)
+    best = int(np.argmax(squared))
+    first = np.datetime64(int(day[order][splits[best] + 1]), "D")
+    p = min(1.0, len(splits) * float(chi2.sf(squared[best], 6)))
+    return p, change[best], np.sqrt(np.diag(covariance[best])), str(first)
+
+
+def _drift(
+    x: Array, batch: NDArray[np.intp], information: Array, y: Array
+) -> tuple[float, Array, Array] | None:
+    """The slope of deviations against a column, within batches, by generalised least squares.
+
+    Each batch has a centre of its own, so that what changed between batches is no drift.
+
+    Returns:
+        p-value, (6,) slope per unit, (6,) sigma. None where the column does not vary.
+    """
+    known = np.isfinite(x)
+    hessian, right = np.zeros((6, 6)), np.zeros(6)
+    unit = float(np.std(x[known])) if known.any() else 0.0
+    for number in np.unique(batch[known]) if unit > 0 else ():
+        rows = known & (batch == number)
+        W, scaled = information[rows], x[rows] / unit
+        total, first = W.sum(axis=0), np.einsum("n,nij->ij", scaled, W)
+        Wy = np.einsum("nij,nj->ni", W, y[rows])
+        share = np.linalg.solve(total, np.column_stack([first, Wy.sum(axis=0)]))
+        hessian += np.einsum("n,nij->ij", scaled**2, W) - first @ share[:, :6]
+        right += scaled @ Wy - first @ share[:, 6]
+    values = np.linalg.eigvalsh(hessian)
+    if values[0] <= 1e-9 * max(values[-1], 1e-300):
+        return None
+    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    slope = covariance @ right
+    return _p_value(slope, covariance), slope / unit, np.sqrt(np.diag(covariance)) / unit
+
+
+def _p_value(change: Array, covariance: Array) -> float:
+    """Of a change of six axes, if there is none."""
+    return float(chi2.sf(change @ np.linalg.solve(covariance, change), 6))
+
+
+def moved_lidars(fleet: FleetModel) -> list[str]:
+    """Vehicles of which the LiDAR was moved, not the cameras.
+
+    All cameras stand apart, and the poses between them do not.
+    """
+    of, found = fleet.observations, []
+    for name, model in fleet.models.items():
+        rows = (of.model == name) & of.measured & np.isin(of.camera, list(model.mounts))
+        vehicles, index = np.unique(of.vehicle[rows], return_inverse=True)
+        all_of_it, apart = np.bincount(index), np.bincount(index, weights=fleet.apart[rows])
+        whole = (all_of_it > 1) & (apart == all_of_it)
+        turned = {v for pair in model.pairs.values() for v in _moved_in(pair, model.pooled_pairs)}
+        found += [str(vehicle) for vehicle in vehicles[whole] if vehicle not in turned]
+    return found
+
+
+def _moved_in(mount: Mount, pooled: Pooled) -> list[str]:
+    """Vehicles in which a pair of cameras is rather moved than not."""
+    return [*mount.seen.vehicle[mount.weigh(pooled).share[1] > 0.5].tolist()]  # noqa: PLR2004

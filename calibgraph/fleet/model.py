@@ -1,0 +1,115 @@
+"""What a fleet knows: the nominal pose of every camera, and every vehicle's deviation from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.fleet.fit import Mount, Pooled, fit_mounts
+from calibgraph.fleet.observations import Observations, concatenate, relative_observations
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFit:
+    """One model of vehicle.
+
+    Attributes:
+        mounts: per camera that enough vehicles measured.
+        pooled: what they share.
+        pairs: per further camera b, its pose from the first camera a, T_b_a, as a mount.
+        pooled_pairs: what the pairs share.
+        reference: the first camera, a.
+    """
+
+    mounts: Mapping[str, Mount]
+    pooled: Pooled
+    pairs: Mapping[str, Mount]
+    pooled_pairs: Pooled
+    reference: str
+
+
+@dataclass(frozen=True, eq=False)
+class FleetModel:
+    """All models of a fleet, and its vehicles as they follow from them.
+
+    Attributes:
+        observations: the rows.
+        models: per model with at least one camera that enough vehicles measured.
+        T_camera_lidar: (n, 4, 4) shrunk estimate of each row; as measured where its mount is
+            unknown.
+        covariance: (n, 6, 6) of it.
+        deviation: (n, 6) measured deviation from the nominal pose of its batch; NaN if unknown.
+        moved: (n,) probability that the camera was moved in its mount; NaN if unknown.
+    """
+
+    observations: Observations
+    models: Mapping[str, ModelFit]
+    T_camera_lidar: Array
+    covariance: Array
+    deviation: Array
+    moved: Array
+
+    @cached_property
+    def apart(self) -> NDArray[np.bool_]:
+        """(n,) rows that stand apart, of which one in a hundred is expected not to."""
+        return likely(self.moved, self.observations.measured)
+
+
+FALSE_DISCOVERIES = 0.01
+"""Expected share of wrong ones among everything that is flagged."""
+
+
+def likely(probability: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The largest set whose expected share of wrong members is at most FALSE_DISCOVERIES."""
+    wrong = np.where(among & np.isfinite(probability), 1.0 - probability, 1.0)
+    order = np.argsort(wrong, kind="stable")
+    expected = np.cumsum(wrong[order]) / np.arange(1, len(order) + 1)
+    chosen = np.zeros(len(order), dtype=np.bool_)
+    chosen[order[: np.count_nonzero(expected <= FALSE_DISCOVERIES)]] = True
+    return chosen
+
+
+def fit_fleet(observations: Observations) -> FleetModel:
+    """The hierarchical model of a fleet, and its vehicles' cameras shrunk towards it.
+
+    Vehicles of a model and batch scatter about the batch's nominal pose, batches about the
+    model's; both spreads are learnt, and so is how many cameras were moved and how far. A
+    measurement with a small error bar stays as it is; one with a large one moves to its batch.
+
+    Args:
+        observations: one row per vehicle and camera.
+    """
+    models = {str(name): fit_model(observations.select(observations.model == name))
+              for name in np.unique(observations.model)}  # fmt: skip
+    models = {name: model for name, model in models.items() if model.mounts}
+    n = len(observations.vehicle)
+    T, covariance = observations.T_camera_lidar.copy(), observations.covariance.copy()
+    deviation, moved = np.full((n, 6), np.nan), np.full(n, np.nan)
+    for name, model in models.items():
+        for camera, mount in model.mounts.items():
+            rows = np.flatnonzero((observations.model == name) & (observations.camera == camera))
+            everyone = mount.of_all(observations.select(rows), model.pooled)
+            deviation[rows], moved[rows] = (
+                everyone.deviations(),
+                everyone.weigh(model.pooled).share[1],
+            )
+            T[rows], covariance[rows] = everyone.shrink(model.pooled)
+    return FleetModel(observations, models, T, covariance, deviation, moved)
+
+
+def fit_model(of: Observations) -> ModelFit:
+    """The cameras of one model of vehicle, and the poses between them."""
+    mounts, pooled = fit_mounts(of)
+    cameras = [mount.camera for mount in mounts]
+    pairs = [relative_observations(of, camera, cameras[0]) for camera in cameras[1:]]
+    pair_mounts, pooled_pairs = fit_mounts(concatenate(pairs)) if pairs else ([], Pooled())
+    return ModelFit(
+        {mount.camera: mount for mount in mounts}, pooled,
+        {mount.camera: mount for mount in pair_mounts}, pooled_pairs, (cameras or [""])[0],
+    )  # fmt: skip

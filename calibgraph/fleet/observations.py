@@ -1,0 +1,183 @@
+"""The rows of a fleet as arrays: what each calibration measured, and of which vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError
+from calibgraph.model.geometry import adjoints, relative_transform
+
+Array = NDArray[np.float64]
+Words = NDArray[np.str_]
+
+NAMES = ("vehicle", "camera", "model", "batch")
+_COLUMNS = (*NAMES, "status", "verdict", "T_camera_lidar", "covariance", "seconds", "date")
+_UNKNOWN = 1e6
+"""Variance [rad^2, m^2] of a camera without a usable result: it leaves the prior as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """One row per vehicle and camera.
+
+    Attributes:
+        vehicle, camera, model, batch: (n,) names; model and batch are empty where not given.
+        T_camera_lidar: (n, 4, 4).
+        covariance: (n, 6, 6) of xi in T_camera_lidar = exp(xi) estimate (rotation [rad], then
+            translation [m], in the camera's axes).
+        measured: (n,) whether the row has a result with an error bar that did not FAIL.
+        day: (n,) days since 1970; NaN where there is no date.
+        covariates: per column of numbers of the manifest, (n,), NaN where there is none.
+    """
+
+    vehicle: Words
+    camera: Words
+    model: Words
+    batch: Words
+    T_camera_lidar: Array
+    covariance: Array
+    measured: NDArray[np.bool_]
+    day: Array
+    covariates: Mapping[str, Array]
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some rows: a mask or an index array."""
+        chosen = {
+            name: getattr(self, name)[rows]
+            for name in (*NAMES, "T_camera_lidar", "covariance", "measured", "day")
+        }
+        covariates = {name: values[rows] for name, values in self.covariates.items()}
+        return Observations(**chosen, covariates=covariates)
+
+
+def observe(rows: pa.Table) -> Observations:
+    """The rows of a fleet as arrays.
+
+    Args:
+        rows: as of ``read_rows``; columns of numbers beyond its own become covariates.
+
+    Raises:
+        CalibrationError: if a column is missing.
+    """
+    missing = [name for name in ("vehicle", "camera", "status", "T_camera_lidar", "covariance")
+               if name not in rows.column_names]  # fmt: skip
+    if missing:
+        raise CalibrationError(
+            f"the fleet's table has no column {missing[0]!r}, found "
+            f"{', '.join(rows.column_names)}; give the folder that calibgraph fleet wrote"
+        )
+    T, placed = _fixed_size(rows, "T_camera_lidar", 16)
+    covariance, bounded = _fixed_size(rows, "covariance", 36)
+    done = (words(rows, "status") == "done") & (words(rows, "verdict") != "FAIL")
+    measured = done & placed & bounded & (words(rows, "camera") != "")
+    unknown = np.eye(6) * _UNKNOWN
+    return Observations(
+        **{name: words(rows, name) for name in NAMES},
+        T_camera_lidar=np.where(measured[:, None, None], T.reshape(-1, 4, 4), np.eye(4)),
+        covariance=np.where(measured[:, None, None], covariance.reshape(-1, 6, 6), unknown),
+        measured=measured,
+        day=days(rows),
+        covariates=_covariates(rows),
+    )
+
+
+def newest_rows(rows: pa.Table, *, days_ago: float = 0.0) -> pa.Table:
+    """The newest row of each vehicle and camera, among those with a date by then.
+
+    Args:
+        rows: the fleet's; rows of one date, or of none, are taken in their order.
+        days_ago: before the newest date of all; with 0 rows without a date count too.
+    """
+    day = days(rows)
+    old = np.full(len(rows), True)
+    if days_ago:
+        old = day <= np.nanmax(day, initial=-np.inf) - days_ago
+    index = np.flatnonzero(old)
+    index = index[np.argsort(np.nan_to_num(day[index], nan=-np.inf), kind="stable")]
+    names = np.char.add(np.char.add(words(rows, "vehicle"), "\n"), words(rows, "camera"))[index]
+    last = len(index) - 1 - np.unique(names[::-1], return_index=True)[1]
+    return rows.take(pa.array(index[np.sort(last)]))
+
+
+def concatenate(parts: Sequence[Observations]) -> Observations:
+    """Observations of one model under each other, at least one."""
+    arrays = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(Observations)
+        if field.name != "covariates"
+    }
+    covariates = {name: np.concatenate([part.covariates[name] for part in parts])
+                  for name in parts[0].covariates}  # fmt: skip
+    return Observations(**arrays, covariates=covariates)
+
+
+def relative_observations(of: Observations, camera: str, reference: str) -> Observations:
+    """The poses between two cameras, of the vehicles that have both.
+
+    Args:
+        of: the observations of one model.
+        camera: b.
+        reference: a.
+
+    Returns:
+        With T_b_a in place of T_camera_lidar, and its covariance in the axes of b. The errors of
+        both cameras are taken as independent: a row holds no covariance between cameras.
+    """
+    a, b = (np.flatnonzero((of.camera == name) & of.measured) for name in (reference, camera))
+    _, in_a, in_b = np.intersect1d(of.vehicle[a], of.vehicle[b], return_indices=True)
+    a, b = a[in_a], b[in_b]
+    T_b_a = relative_transform(of.T_camera_lidar[b], of.T_camera_lidar[a])
+    Ad = adjoints(T_b_a)
+    covariance = of.covariance[b] + Ad @ of.covariance[a] @ Ad.transpose(0, 2, 1)
+    return replace(of.select(b), T_camera_lidar=T_b_a, covariance=covariance)
+
+
+def words(rows: pa.Table, name: str) -> Words:
+    """(n,) a column as text; empty where it is null or missing."""
+    if name not in rows.column_names:
+        return np.full(len(rows), "", dtype=np.str_)
+    column = rows.column(name).cast(pa.string()).fill_null("")
+    return np.asarray(column.to_numpy(), dtype=np.str_)
+
+
+def days(rows: pa.Table) -> Array:
+    """(n,) the column ``date`` in days since 1970; NaN where there is none.
+
+    Raises:
+        CalibrationError: if it holds what is no date.
+    """
+    if "date" not in rows.column_names:
+        return np.full(len(rows), np.nan)
+    try:
+        stamps = rows.column("date").cast(pa.timestamp("us"))
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise CalibrationError(
+            f"the fleet's column 'date' holds what is no date ({error}); write 2026-03-01"
+        ) from error
+    stamp = stamps.to_numpy()
+    microseconds = stamp.astype("datetime64[us]").astype(np.float64)
+    return np.where(np.isnat(stamp), np.nan, microseconds / 86_400e6)
+
+
+def _fixed_size(rows: pa.Table, name: str, size: int) -> tuple[Array, NDArray[np.bool_]]:
+    """(n, size) values of a column of lists, zero where it is null; (n,) where it is not."""
+    column = rows.column(name).combine_chunks()
+    present = np.asarray(column.is_valid())
+    values = np.zeros((len(rows), size))
+    values[present] = np.asarray(column.flatten(), dtype=np.float64).reshape(-1, size)
+    return values, present & np.isfinite(values).all(axis=1)
+
+
+def _covariates(rows: pa.Table) -> dict[str, Array]:
+    """The columns of numbers that are not the fleet's own."""
+    plain = (pa.types.is_floating, pa.types.is_integer)
+    others = [field for field in rows.schema if field.name not in _COLUMNS]
+    numbers = [field.name for field in others if any(test(field.type) for test in plain)]
+    return {
+        name: rows.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy() for name in numbers
+    }

@@ -1,0 +1,109 @@
+"""The fleet on one page: compact arrays in the page, a table that draws what is in view."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections import Counter
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from calibgraph.files import write_text
+from calibgraph.fleet.findings import find_changes
+from calibgraph.fleet.model import FleetModel, fit_fleet
+from calibgraph.fleet.observations import Words, newest_rows, observe
+from calibgraph.fleet.standing import COLOURS, Standing, stand
+
+Array = NDArray[np.float64]
+
+_MILLIDEGREE, _TENTH_OF_MM = np.radians(1e-3), 1e-4
+_NOTHING = -32768  # in place of a deviation
+_WEEK = 7.0
+_LONGEST_REASON, _MOST_REASONS = 200, 4000  # characters; different ones, 0.8 MB in all
+
+
+def write_fleet_report(
+    rows: pa.Table, path: Path, *, before: pa.Table | None = None, link: str = ""
+) -> FleetModel:
+    """Write a fleet as one HTML page that needs nothing else: no network, no files beside it.
+
+    Args:
+        rows: as of ``read_rows``; of several of a vehicle and camera the newest counts.
+        path: of the page.
+        before: an earlier table to compare with; the rows of a week and more before the newest
+            if None.
+        link: of a vehicle's own report, with ``{vehicle}`` for its name.
+
+    Returns:
+        The model of the fleet that the page shows.
+
+    Raises:
+        CalibrationError: if the table is not a fleet's.
+        FileError: if the page cannot be written.
+    """
+    newest = newest_rows(rows)
+    fleet = fit_fleet(observe(newest))
+    earlier = newest_rows(rows, days_ago=_WEEK) if before is None else newest_rows(before)
+    standing = stand(newest, fleet, earlier)
+    content = json.dumps(payload(fleet, standing, link), separators=(",", ":"))
+    template = files("calibgraph.fleet").joinpath("page.html").read_text("utf-8")
+    write_text(path, template.replace("@DATA@", content.replace("<", "\\u003c")))
+    return fleet
+
+
+def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
+    """What the page's script reads: names once, numbers as little-endian arrays in base64."""
+    of = fleet.observations
+    order = np.lexsort([of.camera, of.vehicle])
+    vehicles, first, vehicle = np.unique(of.vehicle[order], return_index=True, return_inverse=True)
+    first = order[first]
+    cameras, camera = np.unique(of.camera[order], return_inverse=True)
+    models, model = _names(of.model[first])
+    batches, batch = _names(of.batch[first])
+    reasons, reason = _count_reasons([standing.reasons[index] for index in order])
+    sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
+    return {
+        "colours": COLOURS, "link": link, "cameras": cameras.tolist(), "models": models,
+        "batches": batches, "vehicles": vehicles.tolist(), "reasons": reasons,
+        "findings": [[finding.kind, finding.text] for finding in find_changes(fleet)],
+        "model": _pack(model, "<u2"), "batch": _pack(batch, "<u2"),
+        "day": _pack(np.nan_to_num(of.day[first], nan=-1), "<i4"),
+        "vehicle": _pack(vehicle, "<u4"), "camera": _pack(camera, "<u2"),
+        "colour": _pack(standing.colour[order], "<u1"),
+        "changed": _pack(standing.changed[order], "<u1"),
+        "reason": _pack(reason, "<u2"),
+        **{name: _pack(_scaled(np.where(of.measured[:, None], values, np.nan)[order]), "<i2")
+           for name, values in (("deviation", fleet.deviation), ("sigma", sigma))},
+    }  # fmt: skip
+
+
+def _names(of_vehicles: Words) -> tuple[list[str], NDArray[np.intp]]:
+    names, index = np.unique(of_vehicles, return_inverse=True)
+    return names.tolist(), index
+
+
+def _scaled(twists: Array) -> Array:
+    """(n, 6) in thousandths of a degree and tenths of a millimetre, within 16 bits."""
+    scaled = np.rint(twists / np.repeat([_MILLIDEGREE, _TENTH_OF_MM], 3)).clip(-32767, 32767)
+    return np.where(np.isfinite(scaled), scaled, _NOTHING)
+
+
+def _pack(values: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode()
+
+
+def _count_reasons(reasons: list[str]) -> tuple[list[str], NDArray[np.intp]]:
+    """The different reasons, the most frequent ones, and each row's; the others in short."""
+    short = [text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+             for text in reasons]  # fmt: skip
+    known = [text for text, _ in Counter(short).most_common(_MOST_REASONS)]
+    index = {text: number for number, text in enumerate(known)}
+    other = len(known)
+    return [*known, "see the vehicle's report"], np.array(
+        [index.get(text, other) for text in short]
+    )

@@ -1,0 +1,135 @@
+"""The page of a fleet: small, quick, without a network; its script draws what is in view."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from benchmarks.fleet.vehicles import simulate_fleet
+from calibgraph.fleet.model import fit_fleet
+from calibgraph.fleet.observations import observe
+from calibgraph.fleet.page import write_fleet_report
+from calibgraph.fleet.standing import COLOURS, changed_poses, stand
+from calibgraph.model.geometry import retract_all
+from tests.conftest import Call
+from tests.report.test_browser import browser, render
+
+HOSTILE = "</script><b>x"
+
+
+def column(rows: pa.Table, name: str, values: object) -> pa.Table:
+    index = rows.column_names.index(name)
+    return rows.set_column(index, name, pa.array(values, rows.schema.field(name).type))
+
+
+@pytest.fixture(scope="module")
+def rows() -> pa.Table:
+    """Vehicle 0 failed, vehicle 1 has FAIL; nothing else but 5 % of cameras moved."""
+    table = simulate_fleet(np.random.default_rng(7), 120, change_deg=0.0).rows
+    verdict, status = table["verdict"].to_pylist(), table["status"].to_pylist()
+    status[:6], verdict[6:12] = ["failed"] * 6, ["FAIL"] * 6
+    return column(column(table, "status", status), "verdict", verdict)
+
+
+@pytest.fixture(scope="module")
+def page(rows: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of these rows; the first vehicle has a name that would end the script."""
+    path = tmp_path_factory.mktemp("page") / "fleet.html"
+    hostile = column(rows, "vehicle", [HOSTILE] * 6 + rows["vehicle"].to_pylist()[6:])
+    write_fleet_report(hostile, path, link="vehicles/{vehicle}/report.html")
+    return path
+
+
+def test_colours_follow_status_verdict_and_deviation(rows: pa.Table) -> None:
+    fleet = fit_fleet(observe(rows))
+    colours = np.array(COLOURS)[stand(rows, fleet).colour]
+    assert set(colours[:6]) == {"unknown"}
+    assert set(colours[6:12]) == {"red"}
+    verdict = np.asarray(rows["verdict"].to_pylist())[12:]
+    assert (colours[12:][fleet.apart[12:]] == "red").all()
+    assert (colours[12:][~fleet.apart[12:] & (verdict == "WARN")] == "yellow").all()
+    assert (colours[12:][~fleet.apart[12:] & (verdict == "PASS")] == "green").all()
+
+
+def test_what_changed_since_last_time_is_found(rows: pa.Table) -> None:
+    """Ten poses moved by 20 error bars; measurements of two weeks err independently."""
+    rng, of = np.random.default_rng(8), observe(rows)
+    chosen = rng.choice(np.flatnonzero(of.measured), 10, replace=False)
+    sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
+    noise = np.einsum("nij,nj->ni", np.linalg.cholesky(of.covariance), rng.normal(size=sigma.shape))
+    moved = np.where(np.isin(np.arange(len(rows)), chosen)[:, None], 20 * sigma, 0.0) + noise
+    T = retract_all(of.T_camera_lidar, -np.where(of.measured[:, None], moved, 0.0))
+    values = pa.FixedSizeListArray.from_arrays(pa.array(T.ravel()), 16)
+    name = "T_camera_lidar"
+    now = rows.set_column(rows.column_names.index(name), name, values)
+    changed = changed_poses(observe(now), of)
+    assert set(chosen) <= set(np.flatnonzero(changed))
+    assert changed.sum() <= 12
+
+
+def test_a_browser_shows_it_without_errors_and_without_a_network(
+    page: Path, tmp_path: Path
+) -> None:
+    rendering = render(page, tmp_path)
+    assert rendering.errors == []
+    assert rendering.requests == []
+    red = (rendering.picture == (0x20, 0, 0xB0)).all(axis=2)  # BGR
+    assert red.sum() > 1000
+
+
+def opened(page: Path, script: str, folder: Path) -> tuple[str, float]:
+    """The page's title after a script has run in it, and the seconds that it took to open."""
+    copy = folder / "copy.html"
+    copy.write_text(page.read_text().replace("</body>", f"<script>{script}</script></body>"))
+    command = [browser(), "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom",
+               f"--user-data-dir={folder / 'profile'}", copy.as_uri()]  # fmt: skip
+    start = time.perf_counter()
+    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    (title,) = re.findall(r"<title>([^<]*)</title>", dom)
+    return title, time.perf_counter() - start
+
+
+def test_filters_sorting_and_details_work(page: Path, tmp_path: Path) -> None:
+    script = """
+      const shown = () => at("shown").textContent.split(" ")[0], found = [shown()];
+      at("search").value = "V000001"; at("search").oninput(); found.push(shown());
+      document.querySelector(".row").click();
+      found.push(document.querySelector("#detail a").getAttribute("href"));
+      at("search").value = ""; at("search").oninput();
+      document.querySelector(".counts .unknown").click(); found.push(shown());
+      document.querySelector(".counts .unknown").click();
+      at("head").children[0].click(); found.push(document.querySelector(".row span").textContent);
+      at("head").children[0].click(); found.push(document.querySelector(".row span").textContent);
+      document.title = found.join(" ");"""
+    title = opened(page, script, tmp_path)[0]
+    assert title == "120 1 vehicles/V000001/report.html 1 &lt;/script&gt;&lt;b&gt;x V000119"
+
+
+@pytest.mark.slow
+def test_ten_thousand_vehicles_open_in_about_a_second(tmp_path: Path) -> None:
+    rows, page = simulate_fleet(np.random.default_rng(9), 10_000).rows, tmp_path / "fleet.html"
+    write_fleet_report(rows, page)
+    assert page.stat().st_size < 5e6
+    script = """document.title =
+        [rows.length, document.querySelectorAll(".row").length, performance.now()].join(" ");"""
+    count, drawn, milliseconds = opened(page, script, tmp_path)[0].split()
+    assert (int(count), int(drawn) < 60) == (10_000, True)
+    assert float(milliseconds) < 2000
+
+
+def test_commands_write_a_page_and_a_model(rows: pa.Table, tmp_path: Path, call: Call) -> None:
+    folder = tmp_path / "rows"
+    parquet.write_to_dataset(rows, folder)
+    for command, out in (("fleet-report", "page.html"), ("fleet-model", "known")):
+        code, _, err = call(command, folder, "--out", tmp_path / out)
+        assert (code, "120 vehicles" in err) == (0, True)
+    assert (tmp_path / "known" / "fleet_model.json").is_file()
+    code, _, err = call("fleet-report", folder / "nothing", "--out", tmp_path / "x.html")
+    assert (code, err.count("\n")) == (2, 1)
