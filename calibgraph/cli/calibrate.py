@@ -15,6 +15,7 @@ from calibgraph.cli.options import (
     ConfigOption,
     ConfigSeedOption,
     DatasetArgument,
+    EngineOption,
     JsonOption,
     OutOption,
     PresetOption,
@@ -96,7 +97,7 @@ def solve(
         Path,
         typer.Argument(
             metavar="CORRESPONDENCES",
-            help="Table, .parquet or .csv; a .parquet may be larger than memory.",
+            help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
         ),
     ],
     terms: TermsOption = "full",
@@ -105,20 +106,24 @@ def solve(
     out: OutOption = Path("calibration"),
     seed: ConfigSeedOption = None,
     bootstrap: BootstrapOption = None,
+    engine: EngineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256
+    from calibgraph.fleet.sharded.solve import solve_table, table_files
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.pipeline import solve
     from calibgraph.report import write_report
 
     with checked_arguments():
         settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
-    with progress_bar("solving"):
-        result = solve(load_rig(rig), correspondences, settings, checked_terms)
-        result = result.with_inputs({str(correspondences): sha256(correspondences)})
+    with progress_bar("solving") as progress, checked_arguments():
+        result = solve_table(
+            load_rig(rig), correspondences, settings, checked_terms, engine, progress=progress
+        )
+        result = result.with_inputs({str(path): sha256(path)
+                                     for path in table_files(correspondences)})  # fmt: skip
         written = [result.save(out), write_report(result, out / REPORT_FILE)]
     _print_and_exit(result, written, as_json=as_json)
 

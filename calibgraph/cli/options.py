@@ -19,6 +19,14 @@ DatasetArgument = Annotated[
 RigOption = Annotated[
     Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
 ]
+EngineOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="local|processes|ray",
+        help="Who holds the files of a folder: this process, one process per core (default), or "
+        "actors of a Ray cluster (RAY_ADDRESS, else a new local one).",
+    ),
+]
 MatcherOption = Annotated[
     str,
     typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),

@@ -22,7 +22,7 @@ from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
     constrained_root,
-    largest_eigenvalue,
+    error_gradient,
     median_norm,
     sqrt_information,
     whitened_norm,
@@ -61,6 +61,14 @@ class CameraBlock:
         new = np.flatnonzero(np.diff(self.frame)) + 1
         return np.concatenate([[0], new, [len(self.frame)]])
 
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def frame_numbers(self) -> NDArray[np.int64]:
+        """(f,) of the frames that they come from."""
+        return self.frame[self.frame_edges[:-1]]
+
     @property
     def frames(self) -> int:
         """How many frames they come from."""
@@ -86,6 +94,10 @@ class CameraBlock:
     def with_scale(self, scale: ResidualScale) -> ProjectionBlock:
         """The projection block with its loss, in units of the residuals' sigma."""
         return self.block.rescale(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
+
+    def frame_gradients(self, T_lidar_camera: gtsam.Pose3, scale: ResidualScale) -> Array:
+        """(f, 6) gradient of half the robust cost of each frame."""
+        return self.with_scale(scale).frame_sums(T_lidar_camera, self.frame_edges).gradient
 
     def select(self, rows: NDArray[Any]) -> CameraBlock:
         """Some rows: a mask or an index array."""
@@ -242,7 +254,7 @@ class BlockResiduals:
         band = np.flatnonzero(self.projectable & near)
         edge = self.block.select(band)
         residuals, errors = self.residuals_px[band], self.errors_px[band]
-        across = _error_gradient(residuals, errors, edge.information)
+        across = error_gradient(residuals, errors, edge.information)
         across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
         weighted = replace(edge, block=edge.block.rewhiten(root))
@@ -258,17 +270,6 @@ class BlockResiduals:
             loss_scale_px=scale.loss_scale,
             gate_px=scale.gate_px,
         )
-
-
-def _error_gradient(residuals: Array, errors: Array, information: Array | None) -> Array:
-    """(n, 2) derivative of the error [px] by the residual."""
-    safe = np.maximum(errors, np.finfo(float).tiny)[:, None]
-    if information is None:
-        return np.asarray(residuals / safe)
-    uu, uv, vv = information.T
-    x, y = residuals.T
-    along = np.column_stack([uu * x + uv * y, uv * x + vv * y])
-    return np.asarray(along / (largest_eigenvalue(information)[:, None] * safe))
 
 
 def merge(parts: Sequence[CameraBlock]) -> CameraBlock:

@@ -95,15 +95,15 @@ def _frames_behind(name: str, inliers: Objective) -> int:
 def _frame_gradients(inliers: Objective, T_camera_lidar: Transforms, scales: Scales) -> Array:
     """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
     cameras, blocks = list(T_camera_lidar), inliers.blocks
-    own = {name: block.frame[block.frame_edges[:-1]] for name, block in blocks.items()}
+    own = {name: block.frame_numbers for name, block in blocks.items()}
     of_pairs = [pair.frame for pair in inliers.pairs]
     numbers = np.unique(np.concatenate([np.empty(0, np.int64), *own.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
     for name, block in blocks.items():
         pose = to_T_lidar_camera(T_camera_lidar[name])
-        sums = block.with_scale(scales[name]).frame_sums(pose, block.frame_edges)
         rows = np.searchsorted(numbers, own[name])
-        gradients[rows, pose_rows(cameras.index(name))] = sums.gradient
+        of_frames = block.frame_gradients(pose, scales[name])
+        gradients[rows, pose_rows(cameras.index(name))] = of_frames
     for pair in inliers.pairs:
         rows = np.searchsorted(numbers, np.unique(pair.frame))
         columns = rows_of_pair(cameras, pair)

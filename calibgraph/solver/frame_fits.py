@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,14 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
         block: of one camera.
         T_camera_lidar: (f, 4, 4) starts of its frames.
     """
+    fits = fit_alone(block, T_camera_lidar)
+    spreads = about_common_extrinsic(fits.spreads, fits.counts)
+    each = np.repeat(spreads, fits.counts.astype(np.int64))
+    return replace(fits, spreads=spreads, sizes=fits.sizes / each)
+
+
+def fit_alone(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
+    """As :func:`fit_each_frame`, with spreads about the frames' own extrinsics, sizes unscaled."""
     runs, T = to_runs(block.frame_edges), T_camera_lidar
     least = block.least_spreads(runs)
     for _ in range(_OWN_STEPS):
@@ -67,18 +75,17 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
         steps *= np.minimum(1.0, _MAX_STEP_RAD / np.maximum(turns, 1e-12))[:, None]
         T = retract_all(T, steps)
     counts = runs[:, 1] - runs[:, 0]
-    spreads = _about_common_extrinsic(spreads, counts)
     return FrameFits(
         T_camera_lidar=T,
         counts=counts.astype(np.float64),
         spreads=spreads,
         spreads_px=robust_spreads(block.all_sizes(T, runs)[0], runs),
         hessians=sums.hessian,
-        sizes=sizes / np.repeat(spreads, counts),
+        sizes=sizes,
     )
 
 
-def _about_common_extrinsic(spreads: Array, counts: NDArray[np.int64]) -> Array:
+def about_common_extrinsic(spreads: Array, counts: Array) -> Array:
     """(f,) spreads of residuals about the common extrinsic, from those about each frame's own.
 
     Six unknowns take their share of 2 n residuals; where they take most, the spread is at least

@@ -11,8 +11,9 @@ deviations by the residuals of the matches that have them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,15 +140,15 @@ def weigh_frames(
     starts = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
     frames = fit_each_frame(block, starts)
     sigmas = confidence_sigmas(frames.sizes, confidence)
-    start = _densest_start(block, frames, T_camera_lidar)
-    T_consensus, weights = _find_consensus(frames, start)
+    start = densest_start(block, frames, T_camera_lidar)
+    T_consensus, weights = find_consensus(frames, start)
     each = np.repeat(weights, np.diff(edges))
     counted = each > 0
     kept = block.select(counted).with_weights(each[counted] / sigmas[counted] ** 2)
     return WeighedCamera(kept, T_consensus, int(np.count_nonzero(weights == 0)))
 
 
-def _find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
+def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """Where frames are densest, (4, 4) T_camera_lidar, and (f,) their weights, at most 1.
 
     Mean shift over the frames' own extrinsics, with a kernel that is zero beyond a reach. After the
@@ -198,7 +199,14 @@ def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
     return _REACH * max(min(robust_spread(np.sqrt(shift)), _MAX_WIDENING * nearest), least)
 
 
-def _densest_start(block: CameraBlock, frames: FrameFits, T_camera_lidar: Array) -> Array:
+class _Candidates(Protocol):
+    """A block, of which only this is asked."""
+
+    def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
+        """Which of some T_camera_lidar has the least loss."""
+
+
+def densest_start(block: _Candidates, frames: FrameFits, T_camera_lidar: Array) -> Array:
     """The (4, 4) T_camera_lidar of least loss over all frames: a frame's own, or the given one."""
     step = -(-len(frames.T_camera_lidar) // _MAX_CANDIDATES)
     candidates: list[Array] = [T_camera_lidar, *frames.T_camera_lidar[::step]]
@@ -223,17 +231,34 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     """
     known = np.flatnonzero(np.isfinite(sizes))
     order = known[_order_of(confidence[known])]
-    if len(order) < 2 * _BIN_MATCHES or confidence[order[0]] == confidence[order[-1]]:
+    if count_groups(len(order)) == 1 or confidence[order[0]] == confidence[order[-1]]:
         return np.ones(len(sizes))
-    groups = np.array_split(order, min(_CONFIDENCE_BINS, len(order) // _BIN_MATCHES))
-    spreads = np.array([max(robust_spread(sizes[group]), _MIN_SIZE) for group in groups])
+    groups = np.array_split(order, count_groups(len(order)))
+    spreads = np.array([robust_spread(sizes[group]) for group in groups])
     counts = np.array([len(group) for group in groups])
     middles = np.array([np.median(confidence[group]) for group in groups])
-    falling = isotonic_regression(np.log(spreads), weights=counts, increasing=False).x
+    falling = falling_logarithms(spreads, counts)
     learnt = np.empty(len(sizes))
     for rows in (order, np.flatnonzero(~np.isfinite(sizes))):  # in order, places are found faster
         learnt[rows] = np.exp(np.interp(confidence[rows], middles, falling))
     return np.asarray(learnt / np.median(learnt))
+
+
+def count_groups(matches: int) -> int:
+    """Into how many groups of equal size matches are divided by their confidence; 1: too few."""
+    return max(1, min(_CONFIDENCE_BINS, matches // _BIN_MATCHES))
+
+
+def falling_logarithms(spreads: Array, counts: NDArray[np.int64]) -> Array:
+    """(g,) logarithms of the spreads of groups of rising confidence, made monotone.
+
+    Args:
+        spreads: (g,) of the groups.
+        counts: (g,) their matches.
+    """
+    logarithms = np.log(np.maximum(spreads, _MIN_SIZE))
+    falling: Array = isotonic_regression(logarithms, weights=counts, increasing=False).x
+    return falling
 
 
 @compiled(nogil=True, error_model="numpy")

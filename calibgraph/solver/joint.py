@@ -146,7 +146,7 @@ def count_correspondences(
         outliers = outlier_frames.get(name, 0)
         counts[name] = {
             **before,
-            "used": 0 if used is None else len(used.frame),
+            "used": 0 if used is None else len(used),
             "frames": (0 if given is None else given.frames) + outliers,
             "outlier_frames": outliers,
             "repeated_frames": kept.repeated_frames[name],

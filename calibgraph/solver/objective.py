@@ -116,7 +116,7 @@ class Objective:
         """The same objective with other (fewer) correspondences, and the pairs of their frames."""
         if not self.pairs:
             return self._with(blocks=dict(blocks))
-        frames = np.concatenate([b.frame[b.frame_edges[:-1]] for b in blocks.values()])
+        frames = np.concatenate([b.frame_numbers for b in blocks.values()])
         pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
         return self._with(blocks=dict(blocks), pairs=pairs)
 
@@ -213,9 +213,9 @@ class Objective:
             for name, block in self.blocks.items()
         }
         for name, kept in inliers.items():
-            if len(kept.frame) < MIN_MATCHES:
+            if len(kept) < MIN_MATCHES:
                 raise CorrespondenceError(
-                    f"camera {name!r}: only {len(kept.frame)} of {len(self.blocks[name].frame)} "
+                    f"camera {name!r}: only {len(kept)} of {len(self.blocks[name])} "
                     f"correspondences lie within the gate of {scales[name].gate_px:.3g} px, at "
                     f"least {MIN_MATCHES} are needed; the matches do not agree on a pose, or the "
                     "gate is too narrow",

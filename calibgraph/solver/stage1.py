@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
-_COMMON_SAMPLE = 1000  # matches of all frames, for a pose that single frames start from
+COMMON_SAMPLE = 1000
+"""Matches of all frames, for a pose that single frames start from."""
+
 _ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
@@ -72,7 +74,9 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     )
     poses = iter(searched)
     return {
-        name: _aggregate_frames(frames.with_poses({i: next(poses) for i in numbers}), config)
+        name: aggregate_frames(
+            *frames.with_poses({i: next(poses) for i in numbers}).solved, len(frames.runs), config
+        )
         for name, frames, numbers in zip(rig.cameras, common, left, strict=True)
     }
 
@@ -87,7 +91,7 @@ def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Frames:
+class FramePoses:
     """The frames of one camera.
 
     Attributes:
@@ -106,7 +110,12 @@ class _Frames:
         """The correspondences of the frame of that place."""
         return self.rows.select(slice(*self.runs[frame]))
 
-    def with_poses(self, poses: Mapping[int, Array | None]) -> _Frames:
+    @property
+    def solved(self) -> tuple[Array, NDArray[np.int64]]:
+        """(s, 4, 4) the poses that hold, and (s,) the numbers of their frames."""
+        return self.T_camera_lidar[self.found], self.rows.frame[self.runs[self.found, 0]]
+
+    def with_poses(self, poses: Mapping[int, Array | None]) -> FramePoses:
         """With the poses of some frames, by their place; None where there is none."""
         T_camera_lidar, found = self.T_camera_lidar.copy(), self.found.copy()
         for frame, T in poses.items():
@@ -115,36 +124,49 @@ class _Frames:
         return replace(self, T_camera_lidar=T_camera_lidar, found=found)
 
 
-def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> _Frames:
+def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> FramePoses:
     """The poses of all frames at once, from one that MAGSAC finds for all of them together.
 
     Found are those that explain the majority of the frame's correspondences: no other pose can
     explain more. Three of them do not count, which any pose explains.
     """
-    edges = frame_edges(rows.camera_index, rows.frame)
-    runs = to_runs(edges)
+    start = ransac_pnp(camera, select_evenly(rows, COMMON_SAMPLE), config)
+    return frames_from(start, camera, rows, config)
+
+
+def frames_from(
+    start: Array | None, camera: Camera, rows: Correspondences, config: Config
+) -> FramePoses:
+    """The poses of frames from one (4, 4) T_camera_lidar near all of them; None: none is found."""
+    runs = to_runs(frame_edges(rows.camera_index, rows.frame))
     none = np.zeros(len(runs), dtype=np.bool_)
-    start = ransac_pnp(camera, select_evenly(rows, _COMMON_SAMPLE), config)
     if start is None:
-        return _Frames(rows, runs, np.tile(np.eye(4), (len(runs), 1, 1)), none)
+        return FramePoses(rows, runs, np.tile(np.eye(4), (len(runs), 1, 1)), none)
     block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
     wide = block.rescale(scale=config.pnp_threshold_px / 2)
     near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
     refined = refine_frames(block, runs, near.T_camera_lidar, config)
     majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
-    return _Frames(rows, runs, refined.T_camera_lidar, refined.found & majority)
+    return FramePoses(rows, runs, refined.T_camera_lidar, refined.found & majority)
 
 
-def _aggregate_frames(frames: _Frames, config: Config) -> CameraStage1:
-    """One extrinsic over the frames of a camera."""
-    poses = frames.T_camera_lidar[frames.found]
-    numbers = frames.rows.frame[frames.runs[frames.found, 0]]
+def aggregate_frames(
+    poses: Array, numbers: NDArray[np.int64], frames: int, config: Config
+) -> CameraStage1:
+    """One extrinsic over the frames of a camera.
+
+    Args:
+        poses: (f, 4, 4) T_camera_lidar of the frames that have one.
+        numbers: (f,) of these frames.
+        frames: how many there are in all.
+        config: ``aggregate``.
+    """
     kept = poses[are_near_median(poses)]
     return CameraStage1(
         T_camera_lidar=aggregate(kept, config.aggregate) if len(kept) else None,
         by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),
         per_frame=kept,
-        failed_frames=len(frames.runs) - len(kept),
+        failed_frames=frames - len(kept),
     )
 
 

@@ -62,6 +62,23 @@ def constrained_error_px(residuals: Array, information: Array | None) -> Array:
     return np.asarray(np.sqrt(np.maximum(squared, 0.0) / largest_eigenvalue(information)))
 
 
+def error_gradient(residuals: Array, errors: Array, information: Array | None) -> Array:
+    """(n, 2) derivative of :func:`constrained_error_px` by the residual.
+
+    Args:
+        residuals: (n, 2).
+        errors: (n,) these errors.
+        information: (n, 3) or None.
+    """
+    safe = np.maximum(errors, np.finfo(float).tiny)[:, None]
+    if information is None:
+        return np.asarray(residuals / safe)
+    uu, uv, vv = information.T
+    x, y = residuals.T
+    along = np.column_stack([uu * x + uv * y, uv * x + vv * y])
+    return np.asarray(along / (largest_eigenvalue(information)[:, None] * safe))
+
+
 def constrained_root(information: Array) -> Array:
     """(n, 3) whitening matrices that make a residual's norm its constrained error."""
     return upper_root(information / largest_eigenvalue(information)[:, None])

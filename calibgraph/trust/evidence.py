@@ -178,7 +178,7 @@ class Evidence:
     def even_frames(self) -> NDArray[np.int64]:
         """Every other one of the frames that any camera has inliers in."""
         blocks = self.solution.inliers.blocks.values()
-        return np.unique(np.concatenate([b.frame[b.frame_edges[:-1]] for b in blocks]))[::2]
+        return np.unique(np.concatenate([b.frame_numbers for b in blocks]))[::2]
 
     @cached_property
     def halves(self) -> dict[str, tuple[Array, Array]]:
