@@ -12,12 +12,12 @@ from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError
 from .errors import FileError as FileError
 from .errors import RigError as RigError
-from .fleet.run import run_fleet as run_fleet
 from .fleet.model import FleetModel as FleetModel
 from .fleet.model import fit_fleet as fit_fleet
 from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
+from .fleet.run import run_fleet as run_fleet
 from .fleet.sharded.solve import solve_sharded as solve_sharded
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag
