@@ -17,6 +17,7 @@ from calibgraph import (
 from calibgraph.cli import outputs
 from calibgraph.cli.app import COMMANDS
 from calibgraph.cli.benchmark import paper
+from calibgraph.cli.fleet import fleet
 from calibgraph.cli.simulate import simulate
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
@@ -147,7 +148,7 @@ def test_an_argument_longer_than_a_name_is_no_file(tmp_path: Path, call: Call) -
 def test_every_command_with_an_output_declares_it() -> None:
     for command, written in {**COMMANDS, paper: outputs.benchmark}.items():
         has_output = "out" in inspect.signature(command).parameters
-        refuses_itself = command is simulate  # whatever is there
+        refuses_itself = command in (simulate, fleet)  # simulate any data, fleet what is no row
         assert (written is not outputs.nothing) == (has_output and not refuses_itself)
 
 
