@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -17,6 +18,9 @@ from calibgraph.progress import Progress
 _AHEAD = 2
 """Tasks submitted per slot: one runs, one waits, so that no slot waits for this process."""
 _WAIT_S = 1.0  # until rows are published that wait for others
+LONGEST_WITHOUT_WORKERS_S = 120.0
+"""A cluster that starts lost workers again needs seconds; Dask gives up on those that it loses
+while they start."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class Driver:
         self._waiting: deque[Try] = deque()
         self._running: dict[Future[Outcome], Try] = {}
         self._retries = 0
+        self._last_worker_s = time.monotonic()
 
     def run(self, tries: Iterable[Try], report: Progress) -> int:
         """Run all, and publish what is done even if this is interrupted.
@@ -60,7 +65,7 @@ class Driver:
             How many tries were made beyond the first of each job.
 
         Raises:
-            CalibrationError: if workers have another version of this package.
+            CalibrationError: if workers have another version of this package, or there are none.
         """
         self._waiting.extend(tries)
         total = len(self._waiting)
@@ -68,6 +73,7 @@ class Driver:
             while self._waiting or self._running:
                 self._submit()
                 ended, _ = wait(self._running, _WAIT_S, FIRST_COMPLETED)
+                self._require_workers()
                 for future in ended:
                     self._take(self._running.pop(future), _outcome_of(future))
                 self._publisher.publish_when_due()
@@ -78,6 +84,16 @@ class Driver:
         finally:
             self._publisher.publish()
         return self._retries
+
+    def _require_workers(self) -> None:
+        now = time.monotonic()
+        if self._engine.has_workers():
+            self._last_worker_s = now
+        elif now - self._last_worker_s > LONGEST_WITHOUT_WORKERS_S:
+            raise CalibrationError(
+                f"the cluster has had no worker for {LONGEST_WITHOUT_WORKERS_S:.0f} s; finished "
+                "rows are published: start workers and give the same command again"
+            )
 
     def _submit(self) -> None:
         """Fill the engine, not more: a manifest may have millions of rows."""

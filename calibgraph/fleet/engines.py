@@ -30,6 +30,9 @@ class Engine(Protocol):
     def submit(self, task: Task) -> Future[Outcome]:
         """Start a task; the future has an exception if the worker was lost."""
 
+    def has_workers(self) -> bool:
+        """Whether anything is there to run tasks."""
+
     def close(self) -> None:
         """Stop what runs, and release all."""
 
@@ -59,6 +62,10 @@ class ProcessEngine:
             return child.run(task)
         finally:
             self._free.put(child)
+
+    def has_workers(self) -> bool:
+        """Children that are lost are started again."""
+        return True
 
     def close(self) -> None:
         """End all children."""
@@ -102,6 +109,10 @@ class RayEngine:
         future: Future[Outcome] = self._run.remote(task).future()
         return future
 
+    def has_workers(self) -> bool:
+        """Whether a machine of the cluster is alive."""
+        return any(node["Alive"] for node in self._ray.nodes())
+
     def close(self) -> None:
         """Leave the cluster, which ends the tasks that run."""
         if self._owns:
@@ -135,6 +146,13 @@ class DaskEngine:
         """Give a task to the cluster."""
         future: Future[Outcome] = self._pool.submit(run_in_kept_child, task)
         return future
+
+    def has_workers(self) -> bool:
+        """Whether the scheduler is there and knows of any worker."""
+        try:
+            return bool(self._client.nthreads())
+        except Exception:  # of its communication
+            return False
 
     def close(self) -> None:
         """Cancel the tasks that run, and leave the cluster."""

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,10 +12,11 @@ import pytest
 
 from benchmarks.fleet.tables import write_fleet
 from calibgraph import load_correspondences, load_rig, solve
-from calibgraph.errors import FileError
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.fleet.engines import ProcessEngine
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import Summary, run_fleet
-from calibgraph.fleet.task import RETRIES, Limits
+from calibgraph.fleet.task import RETRIES, Limits, Outcome, Task
 
 POISON = Path(__file__).parent / "poison"
 GOOD, ILL = ("car-00000", "car-00001"), ("segfault", "hungry", "endless", "bug")
@@ -146,3 +148,30 @@ def test_missing_recordings_are_refused_or_become_rows(fleet: Fleet, tmp_path: P
     summary = run_fleet(str(manifest), str(out), allow_missing=True)
     assert summary.failures == {"bad input": 2}
     assert run_fleet(str(manifest), str(out), allow_missing=True).skipped == 0
+
+
+class LostCluster(ProcessEngine):
+    """Runs one task; then all workers are gone, and other tasks wait for ever."""
+
+    def __init__(self) -> None:
+        super().__init__(slots=1)
+        self._tasks = 0
+
+    def submit(self, task: Task) -> Future[Outcome]:
+        self._tasks += 1
+        return super().submit(task) if self._tasks == 1 else Future()
+
+    def has_workers(self) -> bool:
+        return False
+
+
+@pytest.mark.slow
+def test_a_cluster_without_workers_ends_the_run_and_keeps_finished_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest, out = write_fleet(tmp_path / "in", 2), str(tmp_path / "out")
+    monkeypatch.setattr("calibgraph.fleet.run.open_engine", lambda *_: LostCluster())
+    monkeypatch.setattr("calibgraph.fleet.driver.LONGEST_WITHOUT_WORKERS_S", 20.0)
+    with pytest.raises(CalibrationError, match="no worker for 20 s"):
+        run_fleet(str(manifest), out)
+    assert {row["vehicle"] for row in read_rows(out).to_pylist()} == {GOOD[0]}

@@ -17,7 +17,7 @@ FALSE_ACCEPTANCE = 1e-3
 PRIOR_LOCATION, PRIOR_SIGMA, SCALE = 5.7, 3.0, 0.92
 """Of the best z-score of a search for one roll: mean and standard deviation over scenes of the
 location, and scale. Locations in turned clouds and in those of other places: KITTI 4 to 5, 26,000
-to 47,000 points a scan 5 to 7, 16 beams in a laboratory 11; rendered streets, which are alike, 12."""
+to 47,000 points a scan 5 to 7, 16 beams in a laboratory 11; rendered streets, all alike, 12."""
 
 
 def least_z_score(tries: float) -> float:
