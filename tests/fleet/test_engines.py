@@ -71,6 +71,9 @@ def test_no_more_is_submitted_than_twice_the_slots(manifest: str, tmp_path: Path
             threading.Timer(0.01, future.set_result, (outcome,)).start()
             return future
 
+        def has_workers(self) -> bool:
+            return True
+
         def close(self) -> None:
             """Nothing to release."""
 

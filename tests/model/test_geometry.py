@@ -33,6 +33,11 @@ QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 NO_TRANSFORM = "the inverse of an information matrix or a normal equation, not of a transform"
 INVERTING = {
+    "calibgraph/fleet/centers.py": NO_TRANSFORM,
+    "calibgraph/fleet/deviations.py": NO_TRANSFORM,
+    "calibgraph/fleet/findings.py": NO_TRANSFORM,
+    "calibgraph/fleet/fit.py": NO_TRANSFORM,
+    "calibgraph/fleet/standing.py": NO_TRANSFORM,
     "calibgraph/matching/cmrnext/training/samples.py": "a camera matrix K",
     "calibgraph/solver/augmented_fit.py": NO_TRANSFORM,
     "calibgraph/tracking/assessment.py": NO_TRANSFORM,
