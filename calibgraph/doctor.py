@@ -22,7 +22,7 @@ from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.report.point_overlay import write_guess_overlays
-from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.conventions import undo_convention_errors
 
 Level = Literal["error", "warning", "note"]
@@ -142,11 +142,11 @@ def _describe(data: Dataset) -> Iterator[Finding]:
     yield from (Finding("note", note) for note in notes)
     if not set(describe_rig(data.rig)) & set(notes):
         yield from (Finding("note", line) for line in describe_rig(data.rig))
-    if count < MIN_FRAMES_FOR_ERROR_BAR:
+    if count < ENOUGH_FRAMES:
         yield Finding(
             "warning",
-            f"{count} frames give no error bar; record at least {MIN_FRAMES_FOR_ERROR_BAR}, better "
-            "10 to 30 from several places",
+            f"{count} frames: the error bar will be a wide, usual one; record at least "
+            f"{ENOUGH_FRAMES}, better 10 to 30 from several places",
         )
 
 
@@ -224,7 +224,7 @@ def _examine_places(data: Dataset) -> Iterator[Finding]:
             "warning",
             f"{len(data.frames)} frames are of {count} places: the vehicle stands, as in "
             f"{len(most)} frames from {names[most[0]]} to {names[most[-1]]}; frames of one place "
-            f"count as one, and {MIN_FRAMES_FOR_ERROR_BAR} are needed for an error bar",
+            f"count as one, and {ENOUGH_FRAMES} are needed for an error bar of their own",
         )
 
 

@@ -19,6 +19,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.named import find_matcher
+from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
 from calibgraph.matching.standstill import same_places
@@ -29,7 +30,7 @@ from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.repeats import SAME_PLACE
+from calibgraph.solver.repeats import PLACES, SAME_PLACE
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
@@ -85,7 +86,30 @@ def match_in_rounds(
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
     full.release()
+    with watch("places"):
+        run = name_places(run)
     return replace(run, out_of_time=out_of_time())
+
+
+def name_places(run: MatchingRun) -> MatchingRun:
+    """The run with the frames of each place named in its correspondences' metadata.
+
+    Where the matcher's error has a part that frames of one place share. The camera with the highest
+    z-score shows where the places are.
+    """
+    findings, rig = run.correspondences.findings, run.solution.solved_rig
+    found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
+    if not findings.place_variance or not found:
+        return run
+    camera = max(found, key=lambda name: found[name])
+    seed = run.solution.config.seed
+    try:
+        places = find_places(run.dataset, camera, rig.cameras[camera], seed=seed)
+    except (CalibrationError, OSError):  # the checks on images report it
+        return run
+    table = run.correspondences
+    named = replace(table, metadata={**table.metadata, PLACES: places})
+    return replace(run, correspondences=named, solution=run.solution.with_places(places))
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[Dataset, Rig]:

@@ -73,7 +73,10 @@ def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
         "frames 000002 and 000003 have the same image of left, and 1 more repeat one; leave "
         "repeats out",
     ]
-    assert "4 frames give no error bar" in texts(diagnose([folder], frames="0:4"), "warning")[0]
+    assert (
+        "4 frames: the error bar will be a wide, usual one"
+        in texts(diagnose([folder], frames="0:4"), "warning")[0]
+    )
 
 
 def test_a_vehicle_that_stands_is_named(folder: Path) -> None:

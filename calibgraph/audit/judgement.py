@@ -22,6 +22,7 @@ from scipy.special import chdtri, ndtri
 
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
 
@@ -44,9 +45,11 @@ _RECORD = (
     "above the sigmas"
 )
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
+
+
 _TOO_FEW_FRAMES = (
-    "too few frames for an error bar (those of one place count as one): record at least 5, better "
-    "30, of different places"
+    f"too few frames for an error bar of their own (those of one place count as one): record at "
+    f"least {ENOUGH_FRAMES}, better 30, of different places"
 )
 
 
@@ -98,9 +101,10 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         return CameraAudit("CANNOT TELL", doubt, z_score=z_score)
     deviation = _deviation(evidence, name)
     if covariance is None:
-        few = name in evidence.without_error_bar
-        reason = _TOO_FEW_FRAMES if few else doubt or _NO_ERROR_BAR
-        return CameraAudit("CANNOT TELL", reason, deviation, z_score=z_score)
+        return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
+    block = evidence.solution.inliers.blocks.get(name)
+    if block is not None and block.frames < ENOUGH_FRAMES:
+        return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
     sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
     status, reason = judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
     if doubt:

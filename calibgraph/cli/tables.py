@@ -125,7 +125,7 @@ def _error_bar_cells(result: Calibration, name: str) -> list[str]:
     sigmas = result.error_bar(name)
     if sigmas is not None:
         return _sigma_cells(*sigmas)
-    why = "too few frames" if result.error_bar_holds(name) else "unknown: FAIL"
+    why = "not determined" if result.error_bar_holds(name) else "unknown: FAIL"
     return [*why.split(), *[""] * 6][:6]
 
 

@@ -86,7 +86,7 @@ class Calibration:
         initial_rig: the rig that the solve started from.
         covariance: clustered by frames, plus the error that all frames share by the matcher's
             findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
-            [rad], translation [m]) in the camera's axes; None with too few frames.
+            [rad], translation [m]) in the camera's axes; None where not determined.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
         camera_verdicts: per camera.
         residuals: per camera that had correspondences.
@@ -145,7 +145,7 @@ class Calibration:
         """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
 
         Returns:
-            (3,) rotation [deg], (3,) translation [cm]; None with too few frames.
+            (3,) rotation [deg], (3,) translation [cm]; None where not determined.
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else degrees_and_centimetres(covariance)
@@ -167,7 +167,7 @@ class Calibration:
     def pair_covariance(self) -> dict[str, Array]:
         """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
 
-        Without the pairs of cameras that have no error bar; empty with too few frames.
+        Without the pairs of cameras that have no error bar.
         """
         if self.joint_covariance is None:
             return {}

@@ -22,6 +22,7 @@ _NUMBERS = {
     "range_translation_m": 100.0,
     "systematic_rotation_rad": math.pi,
     "systematic_translation_m": 100.0,
+    "place_variance": 1e6,
 }
 
 
@@ -40,6 +41,8 @@ class MatcherFindings:
             if unknown.
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             error that all its frames share.
+        place_variance: of the error that frames of one place share, over that of one frame's
+            matches if they were independent.
     """
 
     z_score: Mapping[str, float] = field(default_factory=dict)
@@ -52,6 +55,7 @@ class MatcherFindings:
     range_translation_m: float | None = None
     systematic_rotation_rad: float = 0.0
     systematic_translation_m: float = 0.0
+    place_variance: float = 0.0
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:

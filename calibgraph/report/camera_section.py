@@ -35,6 +35,7 @@ _COUNT_MEANINGS = {
     "frames_waiting": "frames that wait for others that agree with them",
     "outlier_frames": "frames left out, far from where frames are densest",
     "repeated_frames": "frames of the same place or content as another one, counted as part of it",
+    "places": "places that they are from, at least 20 m apart, or in different recordings",
     "frames_without_pnp": "frames in which PnP found no pose",
 }
 _FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped", "used")
@@ -164,7 +165,7 @@ def _axes(result: Calibration, name: str, moved: PoseError) -> tuple[Axis, ...]:
 def _why_no_error_bar(result: Calibration, name: str) -> str:
     if not result.error_bar_holds(name):
         return "since the verdict is FAIL"
-    return "too few frames" if result.sigmas(name) is None else ""
+    return "not by these correspondences" if result.sigmas(name) is None else ""
 
 
 def _sigma_cells(covariance: Array | None) -> list[str]:

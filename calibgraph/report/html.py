@@ -90,7 +90,7 @@ def _accuracy(result: Calibration) -> str:
     sentences = [_worst_axes(known)] if known else []
     for names, why in (
         (failed, "FAIL, an error bar would not hold"),
-        (few, "too few frames for an error bar"),
+        (few, "the correspondences do not determine them"),
     ):
         of_some = f" for {', '.join(names)}" if len(names) < len(bars) else ""
         sentences += [f"Unknown{of_some}: {why}."] if names else []

@@ -14,11 +14,12 @@ from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.frame_weights import weigh_all_frames
+from calibgraph.solver.information import weigh_relative_poses
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.repeats import number_by_place
-from calibgraph.solver.solution import Solution
+from calibgraph.solver.solution import Solution, count_places
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined
 
@@ -75,6 +76,11 @@ def solve_joint(
     with watch("pass2"):
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
+
+    with watch("relative_poses"):                                          # ours: their weight
+        objective, inliers, optimum = weigh_relative_poses(
+            objective, inliers, optimum, scales, kept.table.metadata
+        )
 
     counts = count_correspondences(kept, objective, inliers, pairwise, frames.outlier_frames)
     seconds = watch.seconds
@@ -152,5 +158,6 @@ def count_correspondences(
             "repeated_frames": kept.repeated_frames[name],
             "frames_used": 0 if used is None else used.frames,
             "frames_without_pnp": pairwise[name].failed_frames if name in pairwise else 0,
+            **count_places(kept.table.metadata, used),
         }
     return counts

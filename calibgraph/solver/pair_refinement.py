@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import (
+    pose_rows,
+    relative_covariance,
+    relative_transform,
+    to_T_lidar_camera,
+)
+from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
 from calibgraph.solver.objective import Objective, Scales
-from factors import pose_sigmas
+from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
+
+PAIR_SIGMA_RAD, PAIR_SIGMA_M = np.radians(0.02), 0.004
+"""Standard deviation per axis of a relative pose from the images of one scene: the scatter between
+the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which all frames share."""
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
 _PAIR_RESCALINGS = 6
@@ -102,6 +113,60 @@ def fit_pair(
         graph.add(held)
         T = optimize(graph, names, T).T_camera_lidar
     return T
+
+
+@dataclass(frozen=True, eq=False)
+class PairFit:
+    """Where images place camera B relative to camera A.
+
+    Attributes:
+        a, b: their names.
+        terms: features of A with surfaces in B, and of B in A.
+        T_camera_lidar: (4, 4) of both, A held near a calibration.
+        covariance: (6, 6) of xi in T_b_a = exp(xi) fit, in the axes of B.
+    """
+
+    a: str
+    b: str
+    terms: tuple[PairTerm, ...]
+    T_camera_lidar: Mapping[str, Array]
+    covariance: Array
+
+    @property
+    def T_b_a(self) -> Array:
+        """(4, 4)."""
+        return relative_transform(self.T_camera_lidar[self.b], self.T_camera_lidar[self.a])
+
+    @property
+    def features(self) -> int:
+        """How many, on surfaces."""
+        return sum(len(term.frame) for term in self.terms)
+
+
+def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> list[PairFit]:
+    """Each pair of cameras with enough features on surfaces, in the table's order.
+
+    Args:
+        rig: at the calibration that A is held near.
+        matches: with the surfaces there.
+        config: the loss.
+        held: (N, 6, 6) covariances by which cameras are held, in the rig's order.
+    """
+    fits, cameras = [], list(rig.cameras)
+    for a, b in matches.pairs():
+        terms = tuple(
+            term
+            for term in pair_terms(rig, matches.of_pair(a, b), config)
+            if not isinstance(term.block, EpipolarBlock)
+        )
+        if terms:
+            of_a = held[cameras.index(a)]
+            T = fit_pair((a, b), terms, rig.T_camera_lidar, of_a)
+            both = covariance_of_fit((a, b), terms, T, of_a)
+            shared = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
+            own = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
+            fits.append(PairFit(a, b, terms, T, own + np.diag(shared**2)))
+    return fits
 
 
 def covariance_of_fit(

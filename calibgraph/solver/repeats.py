@@ -21,6 +21,9 @@ Numbers = NDArray[np.int64]
 SAME_PLACE = "same_place"
 """Key of a table's metadata: lists of frame numbers, those of one place each."""
 
+PLACES = "places"
+"""The same of frames near each other, which show the same objects."""
+
 REPEATED_SHARE = 0.5  # of a frame's matches, equal to the last bit; independent ones have none
 
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9,
@@ -33,20 +36,45 @@ def number_by_place(metadata: Mapping[str, Any], frame: Numbers) -> Numbers:
     Raises:
         CorrespondenceError: if the metadata's ``same_place`` is not a list of lists of numbers.
     """
-    places = metadata.get(SAME_PLACE, [])
+    numbers = frame
+    for place in _lists_of_frames(metadata, SAME_PLACE):
+        numbers = np.where(np.isin(frame, place), np.int64(place[0]), numbers)
+    return numbers
+
+
+def frames_of_one_place(metadata: Mapping[str, Any], frame: Numbers) -> float:
+    """How many frames share what a place shares, in the mean over frames.
+
+    Args:
+        metadata: of a table; frames in none of its ``places`` are all of one place.
+        frame: (f,) numbers of a camera's frames.
+
+    Raises:
+        CorrespondenceError: if ``places`` is not a list of lists of numbers.
+    """
+    counts = [len(place) for place in split_places(metadata, frame)]
+    return float(np.square(counts).sum() / max(1, len(frame)))
+
+
+def split_places(metadata: Mapping[str, Any], frame: Numbers) -> list[Numbers]:
+    """The numbers of a camera's frames, place by place; arguments as of `frames_of_one_place`."""
+    places = [frame[np.isin(frame, place)] for place in _lists_of_frames(metadata, PLACES)]
+    named = np.concatenate([np.empty(0, dtype=np.int64), *places])
+    return [place for place in (*places, np.setdiff1d(frame, named)) if len(place)]
+
+
+def _lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:
+    places = metadata.get(key, [])
     good = isinstance(places, list) and all(
         isinstance(place, list) and place and all(type(number) is int for number in place)
         for place in places
     )
     if not good:
         raise CorrespondenceError(
-            f"{SAME_PLACE} of the table's metadata must be lists of frame numbers, as in "
+            f"{key} of the table's metadata must be lists of frame numbers, as in "
             f"[[0, 1, 2], [7, 8]], found {places!r:.60}"
         )
-    numbers = frame
-    for place in places:
-        numbers = np.where(np.isin(frame, place), np.int64(place[0]), numbers)
-    return numbers
+    return list(places)
 
 
 def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
-from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR, with_pseudo_frames
+from calibgraph.solver.covariance import ENOUGH_FRAMES, with_pseudo_frames
 from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.tracking.halves import Halves
@@ -72,7 +72,7 @@ def joint_covariance(state: State, sums: Posterior, prior: PriorHessians) -> Arr
     rotation, translation = state.systematic_sigmas
     shared = pose_sigmas(rotation_rad=rotation, translation_m=translation)
     covariance += np.diag(np.tile(shared**2, len(state.cameras)))
-    few = np.repeat(sums.frames < MIN_FRAMES_FOR_ERROR_BAR, 6)
+    few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return covariance
 

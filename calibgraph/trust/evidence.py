@@ -18,22 +18,23 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.covariance import (
-    cameras_with_few_frames,
-    cluster_robust_covariance,
-    data_sigmas,
-)
+from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
 from calibgraph.solver.factor_graph import relative_pose_graph
-from calibgraph.solver.objective import Transforms
+from calibgraph.solver.objective import Objective, Transforms
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.repeats import frames_of_one_place
+from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
 from calibgraph.trust.observability import prior_shares
-from calibgraph.trust.shared_error import shared_covariance
 from calibgraph.trust.thresholds import limit
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
+
+_HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
@@ -117,11 +118,6 @@ class Evidence:
         )
 
     @cached_property
-    def without_error_bar(self) -> frozenset[str]:
-        """Cameras of which the scatter tells nothing: held, or with too few frames of their own."""
-        return frozenset((*self.solution.held, *cameras_with_few_frames(self.solution.inliers)))
-
-    @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
         """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
         solution = self.solution
@@ -135,11 +131,48 @@ class Evidence:
         """(6 N, 6 N) by the scatter, plus the error that all the matcher's frames share."""
         if self.scatter is None:
             return None
-        solution = self.solution
-        pairs = solution.inliers.pairs
-        return self.scatter + shared_covariance(
-            self.findings, solution.T_camera_lidar, self.curvature, pairs
+        shared = self.error_over_usual * self._shared(self.solution.inliers, self.curvature)
+        return (
+            self.scatter
+            + shared
+            + error_between(self.solution.T_camera_lidar, self.solution.inliers.pairs)
         )
+
+    @cached_property
+    def error_over_usual(self) -> float:
+        """Variance of the shared error over its usual one, by what cameras see in common."""
+        own = self.of_correspondences
+        if own is self or own.joint_covariance is None:
+            return 1.0
+        return error_over_usual(own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits)
+
+    @cached_property
+    def pair_fits(self) -> list[PairFit]:
+        """Where the images place pairs of cameras, the first of each held near the solution."""
+        matches = self.solution.camera_matches
+        if matches is None:
+            return []
+        held = [self._block(self.pair_covariance, name) for name in self.cameras]
+        return fit_pairs(self.solution.solved_rig, matches, self.solution.config, np.array(held))
+
+    @cached_property
+    def pair_covariance(self) -> Array:
+        """(6 N, 6 N) of the solution; where it is not determined, of what is usual."""
+        if self.joint_covariance is not None:
+            return self.joint_covariance
+        held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
+        return np.diag(np.tile(held, len(self.cameras)))
+
+    def _shared(self, inliers: Objective, curvature: Curvature) -> Array:
+        """(6 N, 6 N) covariance of a solution by the error that all frames share, if as usual."""
+        metadata = self.solution.correspondences.metadata
+        repeats = {
+            name: frames_of_one_place(metadata, block.frame_numbers)
+            for name, block in inliers.blocks.items()
+        }
+        T_camera_lidar = {name: self.solution.T_camera_lidar[name] for name in inliers.cameras}
+        scatter = shared_scatter(self.findings, T_camera_lidar, curvature, repeats)
+        return curvature.sandwich(scatter)
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
@@ -147,7 +180,7 @@ class Evidence:
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        joint = None if camera in self.without_error_bar else self.joint_covariance
+        joint = None if camera in self.solution.held else self.joint_covariance
         return self._block(joint, camera)
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
@@ -216,7 +249,7 @@ class Evidence:
         scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
         if scatter is None:
             return DataOnly(T_camera_lidar, None)
-        shared = shared_covariance(self.findings, T_camera_lidar, curvature, free.pairs)
+        shared = self._shared(free, curvature) + error_between(T_camera_lidar, free.pairs)
         return DataOnly(T_camera_lidar, scatter + shared)
 
     @cached_property

@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 from calibgraph.model.verdict import Threshold, in_unit, is_reachable
-from calibgraph.solver.covariance import MIN_FRAMES_FOR_ERROR_BAR
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 
 _COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
@@ -76,9 +76,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "cm", "The same.", _COUNTED),
     Threshold("correspondences_used", "correspondences used", "at least", 50, 0, "",
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
-    Threshold("frames", "frames", "at least", MIN_FRAMES_FOR_ERROR_BAR, 0, "",
+    Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
               "Are there enough frames?",
-              "The scatter of fewer frames gives no error bar.", "too few to give an error bar"),
+              "With fewer, the error bar is mostly what is usual of matches.",
+              "the error bar is mostly a usual one; give more, from several places"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
               "How much of a displaced start does a learned matcher leave?", _CHOSEN,

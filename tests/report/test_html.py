@@ -73,12 +73,12 @@ def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_pat
     assert result.error_bar("left->right") is None and result.sigmas("left") is not None
 
 
-def test_too_few_frames_for_an_error_bar_are_reported(pair: Rig, tmp_path: Path) -> None:
-    result = solve_simulated(pair, frames=3)
+def test_a_missing_error_bar_is_reported(pair: Rig, tmp_path: Path) -> None:
+    result = solve_simulated(pair, terms="priors")
     assert result.covariance["left"] is None
     text = write_page(result, tmp_path)
-    assert "Unknown: too few frames for an error bar." in text
-    assert "Error bar per axis: unknown, too few frames" in text
+    assert "Unknown: the correspondences do not determine them." in text
+    assert "Error bar per axis: unknown, not by these correspondences" in text
     assert "One standard deviation, about and along" not in text
 
 

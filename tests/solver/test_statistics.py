@@ -22,12 +22,12 @@ def error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return gtsam.Pose3.Logmap(gtsam.Pose3(estimate @ np.linalg.inv(truth)))
 
 
-@pytest.mark.parametrize("frames", [pytest.param(6, marks=pytest.mark.ci), 30])
+@pytest.mark.parametrize("frames", [1, 2, 3, pytest.param(6, marks=pytest.mark.ci), 30])
 def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> None:
     """Errors shared by a frame: (J^T J)^-1 would be too small by far, clusters are not.
 
-    With few frames the allowance for what they leave unsaid makes the error bar wide: never too
-    small, but down to 0.5 in the mean.
+    With few frames the error bar rests on how matches of a frame are usually correlated (0.2 of
+    their variance; here it is a half), and on the allowance for what few frames leave unsaid.
     """
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
     squares: dict[str, list[float]] = {"left": [], "right": [], "left->right": []}
@@ -50,6 +50,9 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         if frames == 30:
             assert 0.7 < np.mean(values) / 6 < 1.4, name
             assert 0.9 <= inside <= 0.98, name
+        elif frames < 5:
+            assert 0.3 < np.mean(values) / 6 < 1.3, name
+            assert inside >= 0.88, name
         else:
             assert 0.5 < np.mean(values) / 6 < 1.4, name
             assert inside >= 0.9, name

@@ -49,14 +49,14 @@ def test_malformed_findings_are_refused(
 
 
 def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:
-    """It is part of the error bar; with too few frames for one it stands alone."""
-    for frames, reason in (
-        (8, "sigma: rotation"),
-        (3, "error that the matcher's frames share: rotation"),
+    """It is part of the error bar; where there is none, it stands alone."""
+    for terms, reason in (
+        ("full", "sigma: rotation"),
+        ("priors", "error that the matcher's frames share: rotation"),
     ):
-        table = calibgraph.simulate_correspondences(pair, frames=frames, matches=200)
+        table = calibgraph.simulate_correspondences(pair, frames=8, matches=200)
         with_error = replace(table, metadata={"systematic_rotation_rad": 0.02})
-        verdict = calibgraph.solve(pair, with_error).camera_verdicts["left"]
+        verdict = calibgraph.solve(pair, with_error, terms=terms).camera_verdicts["left"]
         assert verdict.status == "FAIL"
         rotations = [text for text in verdict.reasons if "rotation" in text]
         assert len(rotations) == 1 and rotations[0].startswith(reason)

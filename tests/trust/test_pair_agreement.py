@@ -11,7 +11,8 @@ import calibgraph
 from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
-from calibgraph.trust.pair_agreement import PairAgreement, pair_agreements
+from calibgraph.solver.pair_refinement import fit_pairs
+from calibgraph.trust.pair_agreement import PairAgreement, pair_agreement
 from factors import pose_sigmas
 from tests.solver.test_camera_pairs import simulated_pairs
 from tests.trust.conftest import named
@@ -21,8 +22,9 @@ COVARIANCE = np.diag(np.tile(SIGMAS**2, 2))
 
 
 def agreement(rig: Rig, table: CameraMatches, covariance: np.ndarray | None) -> PairAgreement:
-    (found,) = pair_agreements(rig, table, covariance, Config())
-    return found
+    each = np.diag(SIGMAS**2) if covariance is None else covariance[:6, :6]
+    (fit,) = fit_pairs(rig, table, Config(), np.array([each, each]))
+    return pair_agreement(rig, fit, covariance)
 
 
 def test_a_right_calibration_agrees(pair: Rig) -> None:
@@ -83,7 +85,7 @@ def test_without_a_covariance_there_are_no_sigmas(pair: Rig) -> None:
 def test_pairs_without_surfaces_are_left_out(pair: Rig) -> None:
     table = simulated_pairs(pair)
     bare = table.with_planes(np.full_like(table.planes_lidar_per_m, np.nan))
-    assert pair_agreements(pair, bare, None, Config()) == ()
+    assert fit_pairs(pair, bare, Config(), np.array([COVARIANCE[:6, :6]] * 2)) == []
 
 
 def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:

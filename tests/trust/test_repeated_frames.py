@@ -32,7 +32,8 @@ def copies(table: Correspondences, number: int) -> Correspondences:
 def test_copies_of_a_frame_count_as_one_frame(pair: Rig) -> None:
     one = simulated(pair, frames=1)
     result, alone = solve(pair, copies(one, 12)), solve(pair, one)
-    assert result.covariance == {"left": None, "right": None}
+    for name, covariance in alone.covariance.items():
+        np.testing.assert_allclose(result.covariance[name], covariance, rtol=1e-6, atol=1e-15)
     assert result.verdict.status != "PASS"
     assert result.counts["left"]["frames"] == 1
     assert result.counts["left"]["repeated_frames"] == 11
@@ -63,3 +64,24 @@ def test_frames_of_one_place_count_as_one_frame(pair: Rig) -> None:
     wrong = replace(table, metadata={**table.metadata, "same_place": [[2, "3"]]})
     with pytest.raises(CorrespondenceError, match="same_place"):
         solve(pair, wrong)
+
+
+def test_the_part_that_a_place_shares_falls_with_the_number_of_places(pair: Rig) -> None:
+    """Eight frames of one place, or of four: of what they share, a quarter of the variance."""
+    table = simulated(pair, frames=8)
+    found = []
+    for places in ([], [[0, 1], [2, 3], [4, 5], [6, 7]]):
+        named = {"place_variance": 1e4, "places": places}
+        result = solve(pair, replace(table, metadata={**table.metadata, **named}))
+        covariance = result.covariance["left"]
+        assert covariance is not None
+        found.append(covariance)
+        assert result.counts["left"]["places"] == max(1, len(places))
+    np.testing.assert_allclose(np.diag(found[1]) / np.diag(found[0]), 0.25, rtol=0.02)
+
+
+def test_places_that_are_no_lists_of_frames_are_refused(pair: Rig) -> None:
+    table = simulated(pair, frames=8)
+    for wrong in ([[2, "3"]], [2], "all"):
+        with pytest.raises(CorrespondenceError, match="places of the table's metadata"):
+            solve(pair, replace(table, metadata={**table.metadata, "places": wrong}))

@@ -34,7 +34,12 @@ from calibgraph.progress import Progress
 SYSTEMATIC_ROTATION_RAD = float(np.radians(0.09))
 SYSTEMATIC_TRANSLATION_M = 0.02
 """Error per axis that the frames of a scene share: its root mean square over recorded scenes of two
-rigs, each from a few places. One place alone is worse; synthetic scenes are better."""
+rigs, each from a few places. Synthetic scenes are better."""
+PLACE_VARIANCE = 8.0
+"""The error that frames of one place share besides, which is larger where there is less to match:
+in variances of one frame's matches. With it, the normalised squared error over 6 of 15 cameras
+(KITTI 00, 05 to 08, raw 0005 and 0051, a VLP-16) is 1.1 in the mean, 0.75 in the median; with 4 it
+is 1.4, with 16 0.8."""
 
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
@@ -208,6 +213,7 @@ class StructureMatcher:
             z_score=z_scores,
             systematic_rotation_rad=SYSTEMATIC_ROTATION_RAD,
             systematic_translation_m=SYSTEMATIC_TRANSLATION_M,
+            place_variance=PLACE_VARIANCE,
             range_rotation_deg=reach.rotation_deg,
             range_translation_m=reach.translation_m,
         )

@@ -1,0 +1,123 @@
+"""The error that all frames of a recording share, which the scatter between frames cannot show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
+from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
+from calibgraph.solver.curvature import Curvature
+from calibgraph.solver.pair_refinement import PAIR_SIGMA_M, PAIR_SIGMA_RAD, PairFit
+from factors import EpipolarBlock, pose_sigmas
+
+Array = NDArray[np.float64]
+
+_USUAL_DOF = 6.0  # degrees of freedom that the usual size of the shared error counts for
+
+
+def shared_scatter(
+    findings: MatcherFindings,
+    T_camera_lidar: Mapping[str, Array],
+    curvature: Curvature,
+    repeats: Mapping[str, float],
+) -> Array:
+    """(6 N, 6 N) covariance of the gradient, by the error that all frames share.
+
+    Three parts. The cloud is displaced as a rigid body, for all cameras alike, and the matches of
+    each camera are displaced by themselves: each with half the variance of ``systematic_sigmas``.
+    And frames of one place show the same objects, so that a part of their error repeats: as
+    ``place_variance`` times the covariance of one frame's matches, if they were independent. Their
+    scatter, in which this part is missing, is added elsewhere.
+
+    Args:
+        findings: the matcher's error.
+        T_camera_lidar: the solution, all cameras.
+        curvature: there.
+        repeats: per camera with correspondences, how many frames share a place, in the mean.
+    """
+    rotation_rad, translation_m = findings.systematic_sigmas
+    half = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2) / 2
+    cameras = list(T_camera_lidar)
+    to_cameras = np.concatenate([gtsam.Pose3(T).AdjointMap() for T in T_camera_lidar.values()])
+    displaced = to_cameras @ half @ to_cameras.T + np.kron(np.eye(len(cameras)), half)
+    matches = curvature.of_correspondences
+    scatter = np.asarray(matches @ displaced @ matches)
+    for name, repeated in repeats.items():
+        rows = pose_rows(cameras.index(name))
+        scatter[rows, rows] += findings.place_variance * repeated * matches[rows, rows]
+    return scatter
+
+
+def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]) -> Array:
+    """(6 N, 6 N) covariance of the error of relative poses from images, half in each camera."""
+    of_pair = np.diag(pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M) ** 2)
+    cameras = list(T_camera_lidar)
+    tied = [float(len(body) > 1) for body in tied_cameras(cameras, pairs) for _ in body]
+    order = [cameras.index(name) for body in tied_cameras(cameras, pairs) for name in body]
+    return np.asarray(np.kron(np.diag(np.array(tied)[np.argsort(order)]), of_pair / 2))
+
+
+def error_over_usual(
+    T_camera_lidar: Mapping[str, Array], covariance: Array, fits: Sequence[PairFit]
+) -> float:
+    """Variance of the shared error over its usual one, by what cameras see in common; at least 1.
+
+    The correspondences place each camera by itself; images place them relative to each other, much
+    better. The difference, over pairs that span each group of tied cameras, is chi-squared
+    distributed if the covariances are right, with six degrees of freedom per pair. The usual size
+    counts as six of them. It is never taken for less than usual: what displaces all cameras alike
+    is not seen between them.
+
+    Args:
+        T_camera_lidar: (4, 4) of all cameras, by their correspondences.
+        covariance: (6 N, 6 N) of these.
+        fits: where the images place them.
+    """
+    cameras, chosen = list(T_camera_lidar), _spanning(fits)
+    if not chosen:
+        return 1.0
+    apart, to_pairs, of_images = [], [], np.zeros((6 * len(chosen), 6 * len(chosen)))
+    for number, fit in enumerate(chosen):
+        T_b_a = relative_transform(T_camera_lidar[fit.b], T_camera_lidar[fit.a])
+        apart.append(twist_between(T_b_a, fit.T_b_a))
+        to_pair = np.zeros((6, len(covariance)))
+        to_pair[:, pose_rows(cameras.index(fit.a))] = -gtsam.Pose3(T_b_a).AdjointMap()
+        to_pair[:, pose_rows(cameras.index(fit.b))] = np.eye(6)
+        to_pairs.append(to_pair)
+        of_images[pose_rows(number), pose_rows(number)] = fit.covariance
+    jacobian, step = np.concatenate(to_pairs), np.concatenate(apart)
+    whole = jacobian @ covariance @ jacobian.T + of_images
+    chi_squared = float(step @ np.linalg.solve(whole, step))
+    return max(1.0, (_USUAL_DOF + chi_squared) / (_USUAL_DOF + len(step)))
+
+
+def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:
+    """Pairs that tie each group of cameras once: those with the most features first."""
+    body: dict[str, str] = {}
+    chosen = []
+    for fit in sorted(fits, key=lambda fit: -fit.features):
+        one, two = (body.setdefault(name, name) for name in (fit.a, fit.b))
+        if one != two and fit.features >= ENOUGH_SURFACES:
+            chosen.append(fit)
+            body = {name: one if of == two else of for name, of in body.items()}
+    return chosen
+
+
+def tied_cameras(cameras: Sequence[str], pairs: Sequence[PairTerm]) -> list[list[str]]:
+    """The cameras in groups that are tied by enough common features on surfaces."""
+    counts: dict[frozenset[str], int] = {}
+    for pair in pairs:
+        if not isinstance(pair.block, EpipolarBlock):
+            names = frozenset((pair.a, pair.b))
+            counts[names] = counts.get(names, 0) + len(pair.frame)
+    bodies = [[name] for name in cameras]
+    for names, count in counts.items():
+        joined = [body for body in bodies if names & set(body)]
+        if count >= ENOUGH_SURFACES and len(joined) > 1:
+            bodies = [body for body in bodies if body not in joined] + [sum(joined, [])]
+    return bodies
