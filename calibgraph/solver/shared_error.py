@@ -13,7 +13,7 @@ from calibgraph.model.geometry import pose_rows, relative_transform, twist_betwe
 from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
 from calibgraph.solver.curvature import Curvature
 from calibgraph.solver.pair_refinement import PAIR_SIGMA_M, PAIR_SIGMA_RAD, PairFit
-from factors import EpipolarBlock, pose_sigmas
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -56,10 +56,9 @@ def shared_scatter(
 def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]) -> Array:
     """(6 N, 6 N) covariance of the error of relative poses from images, half in each camera."""
     of_pair = np.diag(pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M) ** 2)
-    cameras = list(T_camera_lidar)
-    tied = [float(len(body) > 1) for body in tied_cameras(cameras, pairs) for _ in body]
-    order = [cameras.index(name) for body in tied_cameras(cameras, pairs) for name in body]
-    return np.asarray(np.kron(np.diag(np.array(tied)[np.argsort(order)]), of_pair / 2))
+    seen = {name for pair in pairs for name in (pair.a, pair.b)}
+    cameras = np.diag([float(name in seen) for name in T_camera_lidar])
+    return np.asarray(np.kron(cameras, of_pair / 2))
 
 
 def error_over_usual(
@@ -106,18 +105,3 @@ def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:
             chosen.append(fit)
             body = {name: one if of == two else of for name, of in body.items()}
     return chosen
-
-
-def tied_cameras(cameras: Sequence[str], pairs: Sequence[PairTerm]) -> list[list[str]]:
-    """The cameras in groups that are tied by enough common features on surfaces."""
-    counts: dict[frozenset[str], int] = {}
-    for pair in pairs:
-        if not isinstance(pair.block, EpipolarBlock):
-            names = frozenset((pair.a, pair.b))
-            counts[names] = counts.get(names, 0) + len(pair.frame)
-    bodies = [[name] for name in cameras]
-    for names, count in counts.items():
-        joined = [body for body in bodies if names & set(body)]
-        if count >= ENOUGH_SURFACES and len(joined) > 1:
-            bodies = [body for body in bodies if body not in joined] + [sum(joined, [])]
-    return bodies

@@ -18,7 +18,6 @@ from calibgraph.solver.shared_error import (
     error_between,
     error_over_usual,
     shared_scatter,
-    tied_cameras,
 )
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
@@ -66,7 +65,7 @@ def test_the_part_of_a_place_does_not_fall_with_the_number_of_its_frames(pair: R
     )
 
 
-def test_the_error_of_images_is_between_tied_cameras_alone(pair: Rig) -> None:
+def test_the_error_of_images_is_between_cameras_that_share_features_alone(pair: Rig) -> None:
     terms, T = pair_terms(pair, simulated_pairs(pair), Config()), pair.T_camera_lidar
     assert not error_between(T, ()).any()
     relative = relative_covariance(
@@ -132,14 +131,3 @@ def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
         ]
     assert max(errors) > 0.02
     assert widths[1] > 2 * widths[0]
-
-
-def test_only_cameras_with_enough_in_common_are_tied(pair: Rig, mixed_rig: Rig) -> None:
-    terms = pair_terms(pair, simulated_pairs(pair), Config())
-    few = tuple(term.select(np.arange(20)) for term in terms)
-    assert tied_cameras(["left", "right"], terms) == [["left", "right"]]
-    assert tied_cameras(["left", "right"], few) == [["left"], ["right"]]
-    three = pair_terms(mixed_rig, simulated_pairs(mixed_rig), Config())
-    assert sorted(map(sorted, tied_cameras(list(mixed_rig.cameras), three))) == [
-        ["front", "wide"], ["side"],
-    ]  # fmt: skip
