@@ -121,10 +121,11 @@ def _kills(manifest: Path, folder: Path) -> Table:
     expected = {
         key: row for key, row in _rows(folder / "processes").items() if "drive" not in key[0]
     }
-    cells = [_kill_workers(manifest, folder / f"killed-{name}", name, expected)
-             for name in ("processes", "ray", "dask")]  # fmt: skip
-    cells.append(_kill_commands(manifest, folder / "commands", expected))
-    columns = ("killed", "kills", "failed rows before the second run", "done again", "rows")
+    cells = []
+    for name in ("processes", "ray", "dask"):
+        cells.append(_kill_workers(manifest, folder / f"killed-{name}", name, expected))
+        cells.append(_kill_commands(manifest, folder / f"commands-{name}", name, expected))
+    columns = ("killed", "kills", "failed or left before the last run", "done again", "rows")
     return Table("Kills", columns, (*cells,))
 
 
@@ -139,16 +140,17 @@ def _kill_workers(
     finally:
         stop.set()
         thread.join()
+    before = _seconds(out)
     run_fleet(str(manifest), str(out), slots=2)
     assert _rows(out) == expected
-    failed = sum(summary.failures.values())
-    return f"workers, {engine}", str(kills[0]), str(failed), "0", str(len(expected))
+    failed, again = sum(summary.failures.values()), _count_again(before, _seconds(out))
+    return f"workers, {engine}", str(kills[0]), str(failed), str(again), str(len(expected))
 
 
-def kill_at_random(stop: threading.Event, kills: list[int]) -> None:
-    """Kill one of the workers below this process every half second or so, up to 50."""
+def kill_at_random(stop: threading.Event, kills: list[int], most: int = 50) -> None:
+    """Kill one of the workers below this process every half second or so."""
     rng = random.Random(0)
-    while kills[0] < 50 and not stop.wait(rng.uniform(0.2, 0.8)):
+    while kills[0] < most and not stop.wait(rng.uniform(0.2, 0.8)):
         below = psutil.Process().children(recursive=True)
         workers = [each for each in below if _is_worker(each)]
         if any(map(_is_job, workers)):
@@ -173,33 +175,41 @@ def _is_worker(process: psutil.Process) -> bool:
 
 
 def _kill_commands(
-    manifest: Path, out: Path, expected: dict[tuple[str, str], Any]
+    manifest: Path, out: Path, engine: str, expected: dict[tuple[str, str], Any]
 ) -> tuple[str, ...]:
-    """Kill -9 the command five times; no row that was there is made again."""
-    command = [sys.executable, "-m", "calibgraph", "fleet", str(manifest), "--out", str(out)]
-    before, again = dict[str, float](), 0
+    """Kill -9 the command five times while it works; no row that was there is made again."""
+    command = [sys.executable, "-m", "calibgraph", "fleet", str(manifest), "--out", str(out),
+               "--engine", engine, "--jobs", "2"]  # fmt: skip
+    rng, before, kills, again = random.Random(0), dict[str, float](), 0, 0
     for _ in range(5):
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        time.sleep(9.0)
+        while process.poll() is None and len(_seconds(out)) == len(before):
+            time.sleep(0.5)
+        time.sleep(rng.uniform(0.0, 4.0))
+        kills += process.poll() is None
         process.kill()
         process.wait()
-        after = _seconds(out)
-        again += sum(after.get(name) != seconds for name, seconds in before.items())
-        before = after
-    left = len(before)
+        before, earlier = _seconds(out), before
+        again += _count_again(earlier, before)
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
     after = _seconds(out)
-    again += sum(after.get(name) != seconds for name, seconds in before.items())
+    again += _count_again(before, after)
     assert _rows(out) == expected
-    return "commands", "5", f"{len(after) - left} not yet done", str(again), str(len(expected))
+    left = str(len(after) - len(before))
+    return f"commands, {engine}", str(kills), left, str(again), str(len(expected))
+
+
+def _count_again(before: dict[str, float], after: dict[str, float]) -> int:
+    """The vehicles whose rows are no longer those that were there."""
+    return sum(after.get(name) != seconds for name, seconds in before.items())
 
 
 def _seconds(out: Path) -> dict[str, float]:
-    """Per vehicle, the wall time: no second try has the same."""
-    if not out.exists():
+    """Per vehicle that is done, the wall time: no second try has the same."""
+    if not out.exists() or not any(out.glob("bucket=*/rows.parquet")):
         return {}
-    rows = read_rows(str(out))
-    return dict(zip(rows["vehicle"].to_pylist(), rows["seconds"].to_pylist(), strict=True))
+    rows = [row for row in read_rows(str(out)).to_pylist() if row["status"] == "done"]
+    return {row["vehicle"]: row["seconds"] for row in rows}
 
 
 if __name__ == "__main__":

@@ -130,6 +130,10 @@ class DaskEngine:
     def __init__(self, address: str = "", slots: int | None = None) -> None:
         distributed = _require("distributed", "dask")
         self._cluster = None
+        # Else a local cluster gives up a worker that is not there again 15 s after it was lost.
+        self._settings = _require("dask").config.set(
+            {"distributed.deploy.lost-worker-timeout": "365 days"}
+        )
         try:
             if not address:
                 self._cluster = distributed.LocalCluster(
@@ -161,6 +165,7 @@ class DaskEngine:
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+        self._settings.__exit__(None, None, None)
 
 
 def open_engine(name: str, slots: int | None = None, memory_bytes: int | None = None) -> Engine:

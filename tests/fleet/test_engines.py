@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from benchmarks.fleet.engines import kill_at_random
 from benchmarks.fleet.tables import write_fleet
 from calibgraph import CalibrationError
 from calibgraph.fleet.engines import ProcessEngine, open_engine
@@ -114,10 +114,15 @@ def test_clusters_give_the_rows_of_processes(name: str, manifest: str, tmp_path:
 def test_every_row_is_there_once_though_workers_are_killed(
     name: str, manifest: str, tmp_path: Path
 ) -> None:
-    killed = kill_workers_of(os.getpid(), every_s=2.0, count=6)
+    # A cluster that gives up workers which it loses while they start has done so after 20 s.
+    stop, kills = threading.Event(), [0]
+    killer = threading.Thread(target=kill_at_random, args=(stop, kills, 40), daemon=True)
+    killer.start()
     run_fleet(manifest, str(tmp_path), engine=name, slots=2)
+    stop.set()
+    killer.join()
+    assert kills == [40]
     run_fleet(manifest, str(tmp_path), slots=2)
-    assert killed
     rows = rows_without_seconds(tmp_path)
     assert len(rows) == len({(row["vehicle"], row["camera"]) for row in rows}) == 24
 
@@ -152,19 +157,3 @@ def children_of(pid: int) -> list[psutil.Process]:
         except psutil.Error:
             continue
     return found
-
-
-def kill_workers_of(pid: int, *, every_s: float, count: int) -> list[int]:
-    """Kill random processes of jobs from now on, in a thread; those that were killed."""
-    rng, killed = random.Random(0), list[int]()
-
-    def kill() -> None:
-        for _ in range(count):
-            time.sleep(every_s)
-            if found := children_of(pid):
-                victim = rng.choice(found)
-                victim.kill()
-                killed.append(victim.pid)
-
-    threading.Thread(target=kill, daemon=True).start()
-    return killed
