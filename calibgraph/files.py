@@ -1,4 +1,4 @@
-"""Reading and writing files safely: atomic writes, hashes, YAML to checked models in one line."""
+"""Reading and writing files safely: atomic writes, hashes, content to checked models."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from calibgraph.errors import FileError
+from calibgraph.yaml_text import describe_value, parse_yaml, yaml_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
 MAX_YAML_BYTES = 8 * 2**20
-MAX_YAML_VALUES = 1_000_000
-MAX_YAML_DEPTH = 200  # of brackets: the parser in C ends the process at some ten thousand
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -141,42 +138,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return parse_yaml(read_text(path), path)
 
 
-def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
-    """The mapping in the text of a YAML file.
-
-    Raises:
-        FileError: if it is not YAML, not a mapping, or too deep or large when written out.
-    """
-    if _bracket_depth(text) > MAX_YAML_DEPTH:
-        raise FileError(path, _TOO_DEEP)
-    try:
-        content = yaml.load(text, Loader=_Loader)
-        expanded = _expanded_size(content, {})
-    except (yaml.YAMLError, ValueError) as error:
-        why = str(error).replace('in "<unicode string>", ', "")
-        raise FileError(path, f"is not valid YAML: {why}") from error
-    except RecursionError:
-        raise FileError(path, _TOO_DEEP) from None
-    if not isinstance(content, dict):
-        raise FileError(path, f"holds {_kind(content)}, expected a mapping of keys to values")
-    if expanded > MAX_YAML_VALUES:
-        raise FileError(
-            path, f"its aliases stand for over {MAX_YAML_VALUES} values; write them out"
-        )
-    return content
-
-
-_TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
-
-
-def _bracket_depth(text: str) -> int:
-    """Depth to which brackets are nested; those in quotes count too."""
-    data = np.frombuffer(text.encode(), np.uint8)
-    opened = np.isin(data, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
-    closed = np.isin(data, np.frombuffer(b"]}", np.uint8)).astype(np.int64)
-    return int(np.cumsum(opened - closed).max(initial=0))
-
-
 def read_text(path: Path) -> str:
     """Read a text file.
 
@@ -189,16 +150,6 @@ def read_text(path: Path) -> str:
         raise FileError(path, f"is not a text file ({error.reason})") from error
 
 
-def _expanded_size(value: Any, sizes: dict[int, int]) -> int:
-    """Number of values when every alias is written out; each is visited once."""
-    if not isinstance(value, (dict, list)):
-        return 1
-    if id(value) not in sizes:
-        children = value.values() if isinstance(value, dict) else value
-        sizes[id(value)] = 1 + sum(_expanded_size(child, sizes) for child in children)
-    return sizes[id(value)]
-
-
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:
     """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line.
 
@@ -209,11 +160,6 @@ def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> 
     """
     text = yaml_text(content)
     write_text(path, f"{first_line}\n{text}" if first_line else text)
-
-
-def yaml_text(content: dict[str, Any]) -> str:
-    """A mapping as YAML, as :func:`write_yaml` writes it."""
-    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True))
 
 
 def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
@@ -237,70 +183,5 @@ def describe(error: ValidationError) -> str:
     if first["type"] == "missing":
         return f"key {where!r} is missing; add it"
     message = first["msg"].removeprefix("Value error, ")
-    found = "" if first["type"] == "value_error" else f", found {_kind(first['input'])}"
+    found = "" if first["type"] == "value_error" else f", found {describe_value(first['input'])}"
     return f"{where}: {message}{found}" if where else f"{message}{found}"
-
-
-def _kind(value: object) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # Python writes no number of thousands of digits
-        text = f"a {type(value).__name__} of too many digits"
-    return text if len(text) <= 60 else f"{text[:57]}..."  # noqa: PLR2004 - a line's worth
-
-
-_FastLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
-    """YAML that refuses a key given twice: PyYAML would silently keep the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, (str, int)) and key in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark
-                )
-            seen.add(key if isinstance(key, (str, int)) else id(key_node))
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping
-
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Copy the values of merge keys (``<<``) into a mapping, and count them all."""
-        super().flatten_mapping(node)
-        self._flattened = getattr(self, "_flattened", 0) + len(node.value)
-        if self._flattened > MAX_YAML_VALUES:
-            raise yaml.MarkedYAMLError(
-                problem=f"merge keys (<<) stand for over {MAX_YAML_VALUES} values",
-                problem_mark=node.start_mark,
-            )
-
-
-# OpenCV's matrices: mappings with the keys rows, cols, dt and data.
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
-
-
-class _Dumper(yaml.SafeDumper):
-    """YAML with numpy values, and sequences of plain numbers on one line."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True
-
-
-def _represent_sequence(dumper: yaml.SafeDumper, data: Any) -> yaml.Node:
-    items = list(data)
-    flow = all(isinstance(item, (int, float, str, np.number)) for item in items)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
-
-
-_Dumper.add_representer(list, _represent_sequence)
-_Dumper.add_representer(tuple, _represent_sequence)
-_Dumper.add_representer(np.ndarray, lambda dumper, data: _represent_sequence(dumper, data.tolist()))
-_Dumper.add_multi_representer(np.floating, lambda dumper, data: dumper.represent_float(float(data)))
-_Dumper.add_multi_representer(
-    np.signedinteger, lambda dumper, data: dumper.represent_int(int(data))
-)

@@ -15,10 +15,11 @@ from pyarrow import csv, parquet
 from pydantic import BaseModel, ConfigDict, Field
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, parse_yaml
+from calibgraph.files import checked_model
 from calibgraph.fleet.rows import SCHEMA, bucket_of
 from calibgraph.fleet.uris import fingerprint, join, read_bytes
 from calibgraph.model.config import Config, Terms, config_from
+from calibgraph.yaml_text import parse_yaml
 
 TABLE_SUFFIXES = (".parquet", ".csv")
 SEPARATOR = ";"

@@ -71,7 +71,7 @@ def run_fleet(
 
     Raises:
         CalibrationError: before anything is done, if the manifest is wrong, inputs are missing, or
-            rows or workers are of another version.
+            rows or workers are of another version; in the end, if another run has replaced rows.
     """
     report, shard, limits = progress or no_progress, shard or Shard(), limits or Limits()
     found, store = load_manifest(manifest), RowStore(out)
@@ -157,11 +157,19 @@ def _first_try(job: Job) -> Try:
 
 def _summary(store: RowStore, jobs: Sequence[Job], skipped: int, retries: int) -> Summary:
     verdicts, failures, own = Counter[str](), Counter[str](), {job.key for job in jobs}
+    found = set()
     for row in _states(store, jobs):
-        if (row["vehicle"], row["recording"]) not in own:
+        key = row["vehicle"], row["recording"]
+        if key not in own:
             continue
+        found.add(key)
         if row["status"] == "done":
             verdicts[row["verdict"]] += 1
         else:
             failures[row["error_kind"]] += 1
+    if len(found) < len(own):
+        raise FileError(
+            store.uri, f"the rows of {len(own) - len(found)} jobs were replaced by another command "
+            "that wrote here at the same time; give the same command again"
+        )  # fmt: skip
     return Summary(len(jobs), skipped, retries, dict(verdicts), dict(failures))

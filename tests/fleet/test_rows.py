@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+import threading
 from pathlib import Path
 
 import pyarrow as pa
@@ -61,3 +63,41 @@ def test_a_folder_without_rows_is_one_line(tmp_path: Path) -> None:
         read_rows(str(tmp_path))
     with pytest.raises(FileError, match="give what calibgraph fleet wrote"):
         read_rows(str(tmp_path / "none"))
+
+
+def test_a_reader_finds_whole_rows_while_they_are_replaced(tmp_path: Path) -> None:
+    store, stop = RowStore(str(tmp_path)), threading.Event()
+    store.publish(rows("a"))
+
+    def replace() -> None:
+        for length in itertools.cycle((1, 2000)):
+            if stop.is_set():
+                return
+            store.publish(rows("a", note="x" * length))
+
+    writer = threading.Thread(target=replace)
+    writer.start()
+    try:
+        lengths = [len(read_rows(str(tmp_path))) for _ in range(200)]
+    finally:
+        stop.set()
+        writer.join()
+    assert lengths == [1] * 200
+
+
+def test_no_row_is_lost_when_several_write_one_bucket(tmp_path: Path) -> None:
+    """Each of a name of its own in the same bucket, while another holds the rows read before."""
+    names = [name for name in map(str, range(20_000)) if bucket_of(name) == 0][:40]
+    assert len(names) == 40
+
+    def publish(own: list[str]) -> None:
+        store = RowStore(str(tmp_path))
+        for name in own:
+            store.publish(rows(name))
+
+    writers = [threading.Thread(target=publish, args=(names[part::4],)) for part in range(4)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert sorted(read_rows(str(tmp_path))["vehicle"].to_pylist()) == sorted(names)

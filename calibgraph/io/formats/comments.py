@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 from xml.etree import ElementTree
 
-from calibgraph.files import yaml_text
+from calibgraph.yaml_text import yaml_text
 
 
 def commented(lines: Iterable[str]) -> str:

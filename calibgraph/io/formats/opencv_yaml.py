@@ -12,12 +12,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, parse_yaml, read_text
+from calibgraph.files import checked_model, read_text
 from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients, lens_model
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.rig import Finite, Positive, rigid_transform
+from calibgraph.yaml_text import parse_yaml
 
 _ALIASES = {
     "camera_matrix": ("camera_matrix", "cameraMatrix", "CameraMat", "K"),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import parse_yaml, read_text, require_file
+from calibgraph.files import read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
@@ -24,6 +24,7 @@ from calibgraph.io.formats.urdf import read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.yaml_text import parse_yaml
 
 _MAX_BYTES = 32 * 2**20
 
