@@ -7,11 +7,12 @@ WARN), 1 the calibration FAILed (its files are written and marked FAIL) or is WR
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
@@ -91,11 +92,18 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
 }
 """Every command, and the files that it writes."""
 
+
+def _help_of(command: Callable[..., Any]) -> str:
+    """Its docstring, a line per paragraph: typer keeps the line breaks of all but the first."""
+    paragraphs = (inspect.getdoc(command) or "").split("\n\n")
+    return "\n\n".join(" ".join(text.split()) for text in paragraphs)
+
+
 for _command, _outputs in COMMANDS.items():
-    app.command(_command.__name__.rstrip("_").replace("_", "-"))(
+    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=_help_of(_command))(
         outputs.keep_files(_command, _outputs)
     )
-bench.command()(outputs.keep_files(paper, outputs.benchmark))
+bench.command(help=_help_of(paper))(outputs.keep_files(paper, outputs.benchmark))
 app.add_typer(bench, name="bench")
 
 

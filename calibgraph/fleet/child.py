@@ -91,11 +91,11 @@ class Child:
             self._stop()
         ours, theirs = Pipe()
         process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(theirs.fileno())],
+            [sys.executable, "-P", "-m", __name__, str(theirs.fileno())],
             stdin=subprocess.PIPE,  # it ends with this process
             stdout=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
-            env={**os.environ, **_ONE_THREAD},
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": _module_folders()},
             start_new_session=True,  # Ctrl-C is for the command
         )
         theirs.close()
@@ -126,6 +126,11 @@ class Child:
         """End the process, when no other thread uses it."""
         self.interrupt()
         self._stop()
+
+
+def _module_folders() -> str:
+    """Where the process finds modules: where this one does, not in the folder it is started in."""
+    return os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
 
 
 def _death(error: str) -> Outcome:

@@ -19,8 +19,7 @@ _AHEAD = 2
 """Tasks submitted per slot: one runs, one waits, so that no slot waits for this process."""
 _WAIT_S = 1.0  # until rows are published that wait for others
 LONGEST_WITHOUT_WORKERS_S = 120.0
-"""A cluster that starts lost workers again needs seconds; Dask gives up on those that it loses
-while they start."""
+"""A cluster that starts lost workers again needs seconds."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +90,9 @@ class Driver:
             self._last_worker_s = now
         elif now - self._last_worker_s > LONGEST_WITHOUT_WORKERS_S:
             raise CalibrationError(
-                f"the cluster has had no worker for {LONGEST_WITHOUT_WORKERS_S:.0f} s; finished "
-                "rows are published: start workers and give the same command again"
+                f"the cluster has had no worker for {LONGEST_WITHOUT_WORKERS_S:.0f} s, or none "
+                "with the memory of --memory-gb; finished rows are published: start workers and give "
+                "the same command again"
             )
 
     def _submit(self) -> None:

@@ -31,7 +31,7 @@ class Engine(Protocol):
         """Start a task; the future has an exception if the worker was lost."""
 
     def has_workers(self) -> bool:
-        """Whether anything is there to run tasks."""
+        """Whether anything is there that can run tasks."""
 
     def close(self) -> None:
         """Stop what runs, and release all."""
@@ -100,6 +100,13 @@ class RayEngine:
                 raise CalibrationError(f"--engine ray:{address}: no cluster ({error})") from error
         self._ray = ray
         self.slots = slots or int(ray.cluster_resources().get("CPU", 1))
+        self._memory_bytes = memory_bytes or 0
+        if not address and not self.has_workers():
+            self.close()
+            raise CalibrationError(
+                f"--memory-gb {self._memory_bytes / 1e9:g}: this machine has less for jobs; give "
+                "less, or leave it out"
+            )
         reserve = {"memory": memory_bytes} if memory_bytes else {}
         # Retries are the run's, so that they are counted alike with every engine.
         self._run = ray.remote(num_cpus=1, max_retries=0, **reserve)(run_in_kept_child)
@@ -110,8 +117,13 @@ class RayEngine:
         return future
 
     def has_workers(self) -> bool:
-        """Whether a machine of the cluster is alive."""
-        return any(node["Alive"] for node in self._ray.nodes())
+        """Whether a machine of the cluster is alive, and has what a task reserves."""
+        return any(
+            node["Alive"]
+            and node["Resources"].get("CPU", 0) >= 1
+            and node["Resources"].get("memory", 0) >= self._memory_bytes
+            for node in self._ray.nodes()
+        )
 
     def close(self) -> None:
         """Leave the cluster, which ends the tasks that run."""

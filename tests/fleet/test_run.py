@@ -57,10 +57,13 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     (folder / "in" / f"{BROKEN}.parquet").write_bytes(b"PAR1 and no more")
     manifest.write_text(text)
     (folder / "starts").mkdir()
+    (folder / "here" / "calibgraph").mkdir(parents=True)
+    (folder / "here" / "calibgraph" / "__init__.py").write_text("raise ImportError('another one')")
     out = str(folder / "out")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(POISON), prepend=":")
         patch.setenv("COUNT_STARTS", str(folder / "starts"))
+        patch.chdir(folder / "here")  # a package there is not taken for the installed one
         summary = run_fleet(str(manifest), out, limits=LIMITS, slots=3)
     return Fleet(folder, str(manifest), out, summary, count_starts(folder / "starts"))
 
