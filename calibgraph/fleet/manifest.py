@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +128,9 @@ def load_manifest(uri: str) -> Manifest:
         FileError: if it is missing, or a row of it is wrong.
     """
     table = _read(uri)
+    for name, count in Counter(table.column_names).items():
+        if count > 1:
+            raise FileError(uri, f"column {name!r} is there {count} times; rename or remove one")
     for name in ("vehicle", "recording"):
         if name not in table.column_names:
             raise FileError(
@@ -163,7 +167,7 @@ def _read(uri: str) -> pa.Table:
             return csv.read_csv(io.BytesIO(content), convert_options=strings)
         if suffix in (".yaml", ".yml"):
             return _from_yaml(uri, content)
-    except (pa.ArrowException, UnicodeDecodeError) as error:
+    except (pa.ArrowException, UnicodeDecodeError, OverflowError) as error:
         raise FileError(uri, f"cannot be read as {suffix[1:]} ({error})") from error
     raise FileError(uri, "the name of a manifest must end in .parquet, .csv or .yaml")
 
@@ -171,7 +175,7 @@ def _read(uri: str) -> pa.Table:
 def _from_yaml(uri: str, content: bytes) -> pa.Table:
     """The table under the key ``vehicles``."""
     rows = parse_yaml(content.decode(), uri).get("vehicles")
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
         raise FileError(uri, "expected the key 'vehicles' with a list of mappings, one per vehicle")
     columns = dict.fromkeys(str(name) for row in rows for name in row)
     cells = {name: [row.get(name) for row in rows] for name in columns}
@@ -241,8 +245,7 @@ def _settings(place: _Place, folder: str, files: dict[str, Any], cell: Any) -> S
     if isinstance(cell, str) and not cell.lstrip().startswith("{"):
         uri = join(folder, cell)
         if uri not in files:
-            text = read_bytes(uri, _MOST_SETTINGS_BYTES).decode()
-            files[uri] = _checked_settings(parse_yaml(text, uri), uri)
+            files[uri] = _checked_settings(parse_yaml(_text(uri), uri), uri)
         found: Settings = files[uri]
         return found
     where = f"{place.uri}: row {place.row}: settings"
@@ -251,6 +254,13 @@ def _settings(place: _Place, folder: str, files: dict[str, Any], cell: Any) -> S
         content = {name: value for name, value in content.items() if value is not None}
         return _checked_settings(content, where)
     raise place.error(f"settings {cell!r}: expected a mapping, or the URI of a YAML file")
+
+
+def _text(uri: str) -> str:
+    try:
+        return read_bytes(uri, _MOST_SETTINGS_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise FileError(uri, f"is not a text file ({error.reason})") from error
 
 
 def _checked_settings(content: dict[str, Any], where: str) -> Settings:

@@ -18,7 +18,7 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import compute, parquet
 
-from calibgraph.errors import FileError
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_place_for_folder, write_bytes
 from calibgraph.fleet.uris import is_local, locate
 
@@ -109,10 +109,12 @@ class RowStore:
         uri: of a folder, local or of fsspec.
 
     Raises:
-        FileError: if nothing can be written there.
+        CalibrationError: if it is empty, or nothing can be written there.
     """
 
     def __init__(self, uri: str) -> None:
+        if not uri:
+            raise CalibrationError("--out is empty; name a folder or URI for the rows")
         self.uri = uri
         self._filesystem, self._path = locate(uri)
         self._is_local = is_local(self._filesystem)

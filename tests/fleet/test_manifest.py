@@ -61,14 +61,48 @@ def test_settings_may_be_a_file(tmp_path: Path) -> None:
         (HEAD + "a,b,,{gate: 3},1\n", "row 0: settings: unknown key 'gate'"),
         (HEAD + "a,b,,{search_deg: -1},1\n", "row 0: settings: search_deg:"),
         (HEAD + "a,b,,none.yaml,1\n", "none.yaml: no such file"),
+        (HEAD + "a,b,,s.yaml,1\n", "s.yaml: is not a text file"),
         (HEAD + "a,b\n", "cannot be read as csv"),
+        ("vehicle,recording,model,model\na,b,c,d\n", "column 'model' is there 2 times"),
+        ("vehicle,vehicle,recording\na,a,b\n", "column 'vehicle' is there 2 times"),
+        ("", "cannot be read as csv"),
+        ('vehicle,recording\n\x00,"\n', "cannot be read as csv"),
     ],
 )
 def test_a_wrong_manifest_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "s.yaml").write_bytes(b"preset: \xe4")
     with pytest.raises(FileError) as caught:
         load_manifest(write(tmp_path, text))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("- a", "expected a mapping"),
+        ("vehicles: []", "expected the key 'vehicles' with a list"),
+        ("vehicles: &a [{vehicle: a, recording: *a}]", "nested too deeply"),
+        ("vehicles: [{vehicle: .nan, recording: b}]", "vehicle nan: expected a name"),
+        ("vehicles: [{vehicle: a, recording: b}, {vehicle: 3, recording: b}]", "cannot be read"),
+        ("vehicles: [{vehicle: a, recording: b, n: 99999999999999999999}]", "cannot be read"),
+        ("vehicles: [{vehicle: a, recording: b, rig: {a: 1}}]", "rig {'a': 1}: expected a path"),
+    ],
+)
+def test_a_wrong_yaml_manifest_is_one_line(tmp_path: Path, content: str, message: str) -> None:
+    with pytest.raises(FileError) as caught:
+        load_manifest(write(tmp_path, content, "fleet.yaml"))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_manifests_of_other_bytes_are_one_line(tmp_path: Path) -> None:
+    for name, content in (("a.parquet", b""), ("b.parquet", b"PAR1"), ("c.csv", b"vehicle,\xe4"),
+                          ("d.yaml", b"vehicles: \xe4")):  # fmt: skip
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FileError) as caught:
+            load_manifest(str(tmp_path / name))
+        assert "\n" not in str(caught.value)
 
 
 def test_other_suffixes_and_missing_manifests_are_one_line(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from calibgraph import FileError
+from calibgraph import CalibrationError, FileError
 from calibgraph.fleet.rows import SCHEMA, RowStore, bucket_of, read_rows
 
 
@@ -56,6 +56,11 @@ def test_rows_are_kept_on_a_store_that_is_not_local() -> None:
     store.publish(rows("a", "b"))
     store.publish(rows("b"))
     assert sorted(read_rows("memory://fleet-rows")["vehicle"].to_pylist()) == ["a", "b"]
+
+
+def test_an_empty_place_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="--out is empty"):
+        RowStore("")
 
 
 def test_a_folder_without_rows_is_one_line(tmp_path: Path) -> None:
