@@ -90,9 +90,9 @@ class Driver:
             self._last_worker_s = now
         elif now - self._last_worker_s > LONGEST_WITHOUT_WORKERS_S:
             raise CalibrationError(
-                f"the cluster has had no worker for {LONGEST_WITHOUT_WORKERS_S:.0f} s, or none with "
-                "the memory of --memory-gb; finished rows are published: start workers and give the "
-                "same command again"
+                f"the cluster has had no worker for {LONGEST_WITHOUT_WORKERS_S:.0f} s, or none "
+                "with the memory of --memory-gb; finished rows are published: start workers and "
+                "give the same command again"
             )
 
     def _submit(self) -> None:

@@ -158,13 +158,16 @@ def _read(uri: str) -> pa.Table:
     suffix = Path(uri).suffix
     try:
         if suffix == ".parquet":
-            return parquet.read_table(io.BytesIO(content))
+            table = parquet.read_table(io.BytesIO(content))
+            table.validate(full=True)  # texts may be other bytes
+            return table
         if suffix == ".csv":
             strings = csv.ConvertOptions(
                 column_types=dict.fromkeys((*_OWN, "model", "batch"), pa.string()),
                 strings_can_be_null=True,
             )
-            return csv.read_csv(io.BytesIO(content), convert_options=strings)
+            alone = csv.ReadOptions(use_threads=False)  # its threads may abort an early exit
+            return csv.read_csv(io.BytesIO(content), alone, convert_options=strings)
         if suffix in (".yaml", ".yml"):
             return _from_yaml(uri, content)
     except (pa.ArrowException, UnicodeDecodeError, OverflowError) as error:
