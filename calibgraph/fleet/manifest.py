@@ -206,6 +206,8 @@ def _job(
     """A row's job; ``files`` keeps the settings' files that were read."""
     if not isinstance(vehicle, str) or not vehicle:
         raise place.error(f"vehicle {vehicle!r}: expected a name; give the column as text")
+    if not vehicle.isprintable():
+        raise place.error(f"vehicle {vehicle!r}: has control characters; rename it")
     recordings = tuple(join(folder, uri) for uri in _recordings(place, recording))
     if is_table(recordings[0]):
         if len(recordings) > 1:

@@ -51,6 +51,7 @@ def test_settings_may_be_a_file(tmp_path: Path) -> None:
     [
         ("vehicle,rig\na,b\n", "column 'recording' is missing, found vehicle, rig"),
         ("vehicle,recording,status\na,b,c\n", "column 'status' is one of the results' own"),
+        (HEAD + "a\0b,c,,,1\n", r"row 0: vehicle 'a\x00b': has control characters; rename it"),
         (HEAD, "holds no rows"),
         (HEAD + ",b,,,1\n", "row 0: vehicle None: expected a name"),
         (HEAD + "a,,,,1\n", "row 0: recording None: expected a path or URI"),
