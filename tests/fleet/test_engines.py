@@ -137,8 +137,10 @@ def test_a_killed_command_leaves_rows_that_the_next_one_keeps(
         end = time.monotonic() + 60
         while not children_of(process.pid) and process.poll() is None and time.monotonic() < end:
             time.sleep(0.1)
-        time.sleep(5.0)
-        below = psutil.Process(process.pid).children(recursive=True)
+        time.sleep(3.0)
+        below = []
+        if process.poll() is None:  # it may have done all by now
+            below = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(stop)
         assert process.wait(30) in (code, 0)
         psutil.wait_procs(below, timeout=10)
