@@ -134,10 +134,10 @@ def test_a_killed_command_leaves_rows_that_the_next_one_keeps(
     command = [sys.executable, "-m", "calibgraph", "fleet", manifest, "--out", str(tmp_path)]
     for stop, code in ((signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)):
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        end = time.monotonic() + 60
-        while not children_of(process.pid) and process.poll() is None and time.monotonic() < end:
+        published, end = len(files_below(tmp_path)), time.monotonic() + 60
+        while len(files_below(tmp_path)) == published and process.poll() is None:
+            assert time.monotonic() < end
             time.sleep(0.1)
-        time.sleep(3.0)
         below = []
         if process.poll() is None:  # it may have done all by now
             below = psutil.Process(process.pid).children(recursive=True)
@@ -150,6 +150,10 @@ def test_a_killed_command_leaves_rows_that_the_next_one_keeps(
     rows = read_rows(str(tmp_path)).to_pylist()
     assert len(rows) == 24
     assert before.items() <= {row["vehicle"]: row["seconds"] for row in rows}.items()
+
+
+def files_below(out: Path) -> list[Path]:
+    return list(out.glob("bucket=*/rows.parquet"))
 
 
 def children_of(pid: int) -> list[psutil.Process]:
