@@ -27,7 +27,7 @@ from factors.kernel_sums import (
     weigh,
     whiten,
 )
-from factors.lens import PINHOLE, RADTAN, is_projectable
+from factors.lens_kernels import PINHOLE, RADTAN, is_projectable
 from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.

@@ -8,7 +8,7 @@ the rows that are taken out before a loop, and Python's exception on a division 
 from __future__ import annotations
 
 from factors.compiled import compiled
-from factors.lens import MIN_DEPTH_M, project_one
+from factors.lens_kernels import MIN_DEPTH_M, project_one, subtract_columns
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
@@ -110,7 +110,7 @@ def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
-        tile[RU, i] = u - columns[3, start + i]
+        tile[RU, i] = subtract_columns(kind, lens, u, columns[3, start + i])
         tile[RV, i] = v - columns[4, start + i]
         tile[UX, i], tile[UY, i], tile[UZ, i] = ux, uy, uz
         tile[VX, i], tile[VY, i], tile[VZ, i] = vx, vy, vz

@@ -1,10 +1,11 @@
 """Lens models: from a point in the camera frame to a pixel, with the derivative.
 
-The formulas are OpenCV's (``projectPoints`` and ``fisheye.projectPoints``) inside the field of
-view in which they are one-to-one. Outside (behind the camera, or past the field angle at which
-the distortion polynomial folds back) OpenCV returns pixels that mean nothing; here such a point is
-reported as invalid, and its projection is continued continuously (see ``project_one``), so that an
-optimizer that steps there gets a large, finite error instead of a NaN or a wrong small one.
+The formulas are OpenCV's (``projectPoints``, ``fisheye.projectPoints``, ``omnidir.projectPoints``)
+inside the field of view in which they are one-to-one. Outside (behind the camera, or past the field
+angle at which the distortion polynomial folds back) OpenCV returns pixels that mean nothing; here
+such a point is reported as invalid, and its projection is continued continuously (see
+``lens_kernels.project_one``), so that an optimizer that steps there gets a large, finite error
+instead of a NaN or a wrong small one.
 """
 
 from __future__ import annotations
@@ -18,33 +19,46 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors.compiled import compiled
+from factors.lens_kernels import (
+    EQUIRECTANGULAR,
+    FISHEYE,
+    OMNIDIRECTIONAL,
+    PINHOLE,
+    RADTAN,
+    is_projectable,
+    project_one,
+)
+from factors.wide_lenses import check_mirror, omnidirectional_limit
 
 Array = NDArray[np.float64]
-LensModel = Literal["pinhole", "fisheye"]
+LensModel = Literal["pinhole", "fisheye", "omnidirectional", "equirectangular"]
 
-MIN_DEPTH_M = 0.05
-"""Points with a smaller z are not projectable by a pinhole."""
-
-PINHOLE, RADTAN, FISHEYE = 0, 1, 2
-_COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
+    "pinhole": (0, 4, 5, 8),
+    "fisheye": (4,),
+    "omnidirectional": (5,),
+    "equirectangular": (0,),
+}
+"""How many distortion coefficients each model has."""
 ORDERS: dict[LensModel, str] = {
     "pinhole": "[], [k1, k2, p1, p2], [k1, k2, p1, p2, k3] or [k1, k2, p1, p2, k3, k4, k5, k6]",
     "fisheye": "[k1, k2, k3, k4]",
+    "omnidirectional": "[xi, k1, k2, p1, p2]",
+    "equirectangular": "[]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
 _MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
-_LIMIT = 12  # index of the domain's limit in the packed parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens, packed for the kernels. Build it with :meth:`pinhole` or :meth:`fisheye`.
+    """A lens, packed for the kernels. Build it with one of its static methods.
 
     Attributes:
-        kind: PINHOLE, RADTAN or FISHEYE.
-        packed: (13,) fx fy cx cy [px], eight distortion coefficients in OpenCV's order
-            (k1 k2 p1 p2 k3 k4 k5 k6, or k1 k2 k3 k4 for the fisheye), and the limit of the
-            injective domain: a normalised radius (pinhole) or a field angle [rad] (fisheye).
+        kind: of ``lens_kernels``: PINHOLE, RADTAN, FISHEYE, OMNIDIRECTIONAL or EQUIRECTANGULAR.
+        packed: (13,) fx fy cx cy [px], eight distortion coefficients in the order of ``ORDERS``,
+            then zeros, and the limit of the injective domain: a normalised radius (pinhole) or a
+            field angle [rad] (fisheye, omnidirectional).
     """
 
     kind: int
@@ -74,6 +88,48 @@ class Lens:
         coefficients = _checked(fx, fy, distortion, "fisheye")
         limit = _fisheye_limit(coefficients)
         return Lens(FISHEYE, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
+
+    @staticmethod
+    def omnidirectional(
+        *, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float]
+    ) -> Lens:
+        """The unified model of Mei (OpenCV ``omnidir``, Kalibr ``omni-radtan``): xi k1 k2 p1 p2.
+
+        Raises:
+            ValueError: unless there are 5 coefficients, positive focal lengths and 0 <= xi.
+        """
+        coefficients = _checked(fx, fy, distortion, "omnidirectional")
+        check_mirror(coefficients[0])
+        limit = omnidirectional_limit(coefficients)
+        return Lens(OMNIDIRECTIONAL, np.array([fx, fy, cx, cy, *coefficients, limit]))
+
+    @staticmethod
+    def equirectangular(
+        *, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float] = ()
+    ) -> Lens:
+        """A panorama: u = fx longitude + cx, v = fy latitude + cy; right and down are positive.
+
+        A whole one of width W has fx = W / (2 pi), and its columns go round.
+
+        Raises:
+            ValueError: if there is distortion, or a focal length that is not positive.
+        """
+        coefficients = _checked(fx, fy, distortion, "equirectangular")
+        return Lens(EQUIRECTANGULAR, np.array([fx, fy, cx, cy, *coefficients, math.pi]))
+
+    @property
+    def pixels_per_rad(self) -> float:
+        """Resolution along u on the camera's axis [px/rad]."""
+        fx = float(self.packed[0])
+        return fx / (1.0 + float(self.packed[4])) if self.kind == OMNIDIRECTIONAL else fx
+
+    def subtract(self, pixels_px: Array, others_px: Array) -> Array:
+        """(n, 2) differences of pixels; across the seam of a panorama the short way."""
+        difference = pixels_px - others_px
+        if self.kind == EQUIRECTANGULAR:
+            turn = 2.0 * math.pi * self.packed[0]
+            difference[:, 0] -= turn * np.floor(difference[:, 0] / turn + 0.5)
+        return np.asarray(difference)
 
     def project(self, points_camera_m: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Project points.
@@ -105,8 +161,8 @@ class Lens:
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
     if not (fx > 0 and fy > 0):
         raise ValueError(f"focal lengths must be positive, found fx={fx}, fy={fy}")
-    if len(distortion) not in _COEFFICIENTS[model]:
-        allowed = ", ".join(map(str, _COEFFICIENTS[model]))
+    if len(distortion) not in COEFFICIENTS[model]:
+        allowed = ", ".join(map(str, COEFFICIENTS[model]))
         raise ValueError(
             f"{len(distortion)} distortion coefficients found, expected {allowed}: {ORDERS[model]}"
         )
@@ -140,128 +196,6 @@ def _fisheye_limit(coefficients: Array) -> float:
     """Field angle at which the distorted angle stops growing, at most just under 180 degrees."""
     slope = np.array([1.0, *(coefficients[:4] * [3.0, 5.0, 7.0, 9.0])])
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
-
-
-@compiled()
-def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel (u, v) of a point in the camera frame and the rows of its Jacobian by x, y, z.
-
-    Outside the lens' domain the projection is continued: a pinhole's depth is held at
-    ``MIN_DEPTH_M``; past the limiting radius the distorted point grows linearly along the ray from
-    the limiting circle; past the limiting field angle the distorted angle grows with slope one.
-    The continuation is continuous, and bounded for bounded points.
-    """
-    if kind == FISHEYE:
-        return _fisheye(lens, x, y, z)
-    in_front = z > MIN_DEPTH_M
-    w = 1.0 / (z if in_front else MIN_DEPTH_M)
-    a, b = x * w, y * w
-    if kind == PINHOLE:
-        da_a, da_b, db_a, db_b = 1.0, 0.0, 0.0, 1.0
-        p, q = a, b
-    else:
-        p, q, da_a, da_b, db_a, db_b = _radtan(lens, a, b)
-    fx, fy = lens[0], lens[1]
-    wz = w if in_front else 0.0
-    return (
-        fx * p + lens[2],
-        fy * q + lens[3],
-        fx * da_a * w,
-        fx * da_b * w,
-        -fx * (da_a * a + da_b * b) * wz,
-        fy * db_a * w,
-        fy * db_b * w,
-        -fy * (db_a * a + db_b * b) * wz,
-    )
-
-
-@compiled()
-def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
-    """Distorted normalised point and its 2x2 Jacobian (row major), continued past the limit."""
-    limit = lens[12]
-    r2 = a * a + b * b
-    if r2 <= limit * limit:
-        return _radtan_inside(lens, a, b)
-    r = math.sqrt(r2)
-    scale = limit / r
-    p, q, pa, pb, qa, qb = _radtan_inside(lens, a * scale, b * scale)
-    # F(x) = (r / limit) D(x limit / r):  dF = D n^T / limit + dD (I - n n^T),  n = x / r.
-    na, nb = a / r, b / r
-    return (
-        p / scale,
-        q / scale,
-        p * na / limit + pa * nb * nb - pb * na * nb,
-        p * nb / limit + pb * na * na - pa * na * nb,
-        q * na / limit + qa * nb * nb - qb * na * nb,
-        q * nb / limit + qb * na * na - qa * na * nb,
-    )
-
-
-@compiled()
-def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
-    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
-    k4, k5, k6 = lens[9], lens[10], lens[11]
-    r2 = a * a + b * b
-    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
-    slope = (
-        k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))
-    ) * over
-    cross = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
-    return (
-        a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
-        b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
-        radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a,
-        cross,
-        cross,
-        radial + 2.0 * b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a,
-    )
-
-
-@compiled()
-def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Kannala-Brandt; the angle from atan2, so that fields of view over 180 degrees are seen."""
-    fx, fy = lens[0], lens[1]
-    rho2 = x * x + y * y
-    rho = math.sqrt(rho2)
-    if rho < 1e-12 * (abs(z) + 1e-300):
-        if z >= 0.0:  # on the axis: the limit of the formulas below
-            w = 1.0 / max(z, MIN_DEPTH_M)
-            return lens[2], lens[3], fx * w, 0.0, 0.0, 0.0, fy * w, 0.0
-        x = rho = 1e-9 * -z  # right behind, every direction is as good: take +x
-        y, rho2 = 0.0, rho * rho
-    theta = math.atan2(rho, z)
-    inside = min(theta, lens[12])
-    t2 = inside * inside
-    distorted = inside * (1.0 + t2 * (lens[4] + t2 * (lens[5] + t2 * (lens[6] + t2 * lens[7]))))
-    slope = 1.0 + t2 * (
-        3.0 * lens[4] + t2 * (5.0 * lens[5] + t2 * (7.0 * lens[6] + t2 * 9.0 * lens[7]))
-    )
-    if theta > inside:
-        distorted += theta - inside
-        slope = 1.0
-    scale = distorted / rho
-    n2 = rho2 + z * z
-    along = slope * z / (rho2 * n2) - scale / rho2  # d scale / dx = along * x
-    wz = -slope / n2
-    return (
-        fx * x * scale + lens[2],
-        fy * y * scale + lens[3],
-        fx * (scale + x * x * along),
-        fx * x * y * along,
-        fx * x * wz,
-        fy * x * y * along,
-        fy * (scale + y * y * along),
-        fy * y * wz,
-    )
-
-
-@compiled()
-def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Whether a point of the camera frame lies inside the lens' injective domain."""
-    if kind == FISHEYE:
-        return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[_LIMIT]
-    return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
 
 
 @compiled(nogil=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.lens import FISHEYE, Lens
+from factors.lens import Lens
+from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL
+from factors.wide_lenses import equirectangular_rays, first_omnidirectional_rays
 
 Array = NDArray[np.float64]
 
@@ -30,14 +32,16 @@ def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_
     rays = _first_rays(lens, pixels)
     for _ in range(_ITERATIONS):
         projected, by_ray = lens.project_with_jacobian(rays)
-        missing = pixels - projected
+        missing = lens.subtract(pixels, projected)
         if not len(rays) or np.abs(missing).max() < _CONVERGED_PX:
             break
         rays = rays + np.einsum("nij,nj->ni", _right_inverse(by_ray), missing)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     back, valid = lens.project(rays)
     with np.errstate(invalid="ignore"):
-        return rays, valid & (np.abs(back - pixels).max(axis=1, initial=0.0) < _MISS_PX)
+        return rays, valid & (
+            np.abs(lens.subtract(back, pixels)).max(axis=1, initial=0.0) < _MISS_PX
+        )
 
 
 def ray_spreads(lens: Lens, rays: Array) -> Array:
@@ -59,9 +63,13 @@ def _right_inverse(jacobians: Array) -> Array:
 
 
 def _first_rays(lens: Lens, pixels: Array) -> Array:
-    """(n, 3) rays without distortion: of an equidistant fisheye, or of a pinhole."""
+    """(n, 3) rays without distortion."""
     fx, fy, cx, cy = lens.packed[:4]
     x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    if lens.kind == EQUIRECTANGULAR:
+        return equirectangular_rays(np.column_stack([x, y]))
+    if lens.kind == OMNIDIRECTIONAL:
+        return first_omnidirectional_rays(lens.packed, np.column_stack([x, y]))
     radius = np.hypot(x, y)
     if lens.kind == FISHEYE:
         angle = np.minimum(radius, 0.9 * lens.packed[-1])

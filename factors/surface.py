@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from factors.block_arrays import RobustBlock
 from factors.block_sums import BlockSums
 from factors.compiled import compiled
-from factors.lens import Lens, is_projectable, project_one
+from factors.lens import Lens
+from factors.lens_kernels import is_projectable, project_one, subtract_columns
 from factors.loss import loss_and_weight, loss_id
 
 Array = NDArray[np.float64]
@@ -142,7 +143,7 @@ def surface_residual(
         ]
     )
     pixel, by_point = lens_b.project_with_jacobian(y)
-    return pixel[0] - pixel_b_px, by_point[0] @ by_poses
+    return lens_b.subtract(pixel, pixel_b_px)[0], by_point[0] @ by_poses
 
 
 def _skew(v: Array) -> Array:
@@ -211,7 +212,8 @@ def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
             w, k = _predict(R_a, c_a, R_b_a, t, rays[n], planes[n], y, g)
             projection = project_one(kind, lens, y[0], y[1], y[2])
             _fill_jacobian(R_b_a, t, rays[n], g, y, w, k, projection, jacobian)
-            u, v = projection[0] - pixels[n, 0], projection[1] - pixels[n, 1]
+            u = subtract_columns(kind, lens, projection[0], pixels[n, 0])
+            v = projection[1] - pixels[n, 1]
             rho, psi = loss_and_weight(loss, scale, u * u + v * v)
             sums[90] += rho
             place = 0
@@ -234,10 +236,8 @@ def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
     for n in range(len(rays)):
         w, _ = _predict(R_a, c_a, R_b_a, t, rays[n], planes[n], y, g)
         projection = project_one(kind, lens, y[0], y[1], y[2])
-        residuals[n, 0], residuals[n, 1] = (
-            projection[0] - pixels[n, 0],
-            projection[1] - pixels[n, 1],
-        )
+        residuals[n, 0] = subtract_columns(kind, lens, projection[0], pixels[n, 0])
+        residuals[n, 1] = projection[1] - pixels[n, 1]
         valid[n] = w > 0.0 and is_projectable(kind, lens, y[0] / w, y[1] / w, y[2] / w)
     return residuals, valid
 

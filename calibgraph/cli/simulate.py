@@ -35,7 +35,8 @@ def simulate(
         str | None,
         typer.Option(
             metavar="NAME|RIG",
-            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), sample "
+            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
+            "(two that see more than a half-space), panorama (one that sees all round), sample "
             f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
             rich_help_panel=_STREET,
         ),

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -99,6 +99,12 @@ MODELS_OF_OTHERS: dict[str, LensModel] = {
     "equidistant": "fisheye",
     "equi": "fisheye",
     "kannala_brandt": "fisheye",
+    "omni": "omnidirectional",
+    "omnidir": "omnidirectional",
+    "mei": "omnidirectional",
+    "unified": "omnidirectional",
+    "panorama": "equirectangular",
+    "spherical": "equirectangular",
 }
 """What ROS, Kalibr and others call the lens models."""
 
@@ -162,8 +168,8 @@ class Camera(_Model):
     @cached_property
     def lens(self) -> Lens:
         """The lens model for projection."""
-        make = {"pinhole": Lens.pinhole, "fisheye": Lens.fisheye}
-        return make[self.model](**self.intrinsics_px.model_dump(), distortion=self.distortion)
+        make: Callable[..., Lens] = getattr(Lens, self.model)
+        return make(**self.intrinsics_px.model_dump(), distortion=self.distortion)
 
     @property
     def matrix_px(self) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
 from calibgraph.simulation.world import World, cast, shade
+from factors import unproject
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -64,7 +65,7 @@ def camera_rays(camera: Camera) -> CameraRays:
     rays = pixel_directions(camera, pixels.reshape(-1, 2)).astype(np.float32)
     rays = rays.reshape(*pixels.shape[:3], 3)
     blind = np.asarray(~np.all(rays.any(axis=3), axis=2))
-    return CameraRays(directions=rays, blind=blind, pixel_rad=1 / camera.intrinsics_px.fx)
+    return CameraRays(directions=rays, blind=blind, pixel_rad=1 / camera.lens.pixels_per_rad)
 
 
 def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
@@ -76,8 +77,11 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
 
     Returns:
         (n, 3) unit vectors in the camera's frame; 0 where the lens projects no direction to the
-        pixel, or one more than 95 degrees off its axis.
+        pixel, or, as a fisheye, one more than 95 degrees off its axis.
     """
+    if camera.model in ("omnidirectional", "equirectangular"):
+        directions, valid = unproject(camera.lens, pixels_px)
+        return np.asarray(np.where(valid[:, None], directions, 0.0))
     undistort = {"fisheye": _fisheye_directions, "pinhole": _pinhole_directions}
     directions = undistort[camera.model](camera, pixels_px)
     back, valid = camera.lens.project(directions)

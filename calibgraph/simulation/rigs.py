@@ -23,8 +23,10 @@ def rig_of(name: str) -> Rig:
         name: ``kitti``: a stereo pair 54 cm apart, 1241 x 376, as in KITTI's odometry sequences;
             ``walkley``: a pair 60 cm apart, 1920 x 1200, wider and distorted; ``surround``: six
             cameras all round, 1280 x 800, distorted, with little overlap; ``fisheye``: four
-            fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle; ``sample``: two
-            cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
+            fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle; ``omni``: two lenses
+            of the unified model, 200 degrees, 1280 x 1280, ahead and back; ``panorama``: one
+            equirectangular camera that sees all round, 2048 x 1024, above the LiDAR; ``sample``:
+            two cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
 
     Raises:
         ValueError: if there is no such rig.
@@ -113,6 +115,39 @@ def _fisheye() -> dict[str, Camera]:
     return cameras
 
 
+def _omni() -> dict[str, Camera]:
+    places = {
+        "front": ((0.35, 0.0, -0.2), (2.0, 8.0, 0.5)),
+        "back": ((-0.4, 0.05, -0.25), (179, 9, 0)),
+    }
+    return {
+        name: Camera(
+            model="omnidirectional",
+            width_px=1280,
+            height_px=1280,
+            intrinsics_px=Intrinsics(fx=900.0, fy=898.5, cx=641.2, cy=637.4),
+            distortion=(1.3, -0.02, 0.04, 0.0003, -0.0002),
+            T_camera_lidar=_mounted(xyz_m, turns_deg),
+        )
+        for name, (xyz_m, turns_deg) in places.items()
+    }
+
+
+def _panorama() -> dict[str, Camera]:
+    width, height = 2048, 1024
+    return {
+        "panorama": Camera(
+            model="equirectangular",
+            width_px=width,
+            height_px=height,
+            intrinsics_px=Intrinsics(
+                fx=width / (2 * np.pi), fy=height / np.pi, cx=(width - 1) / 2, cy=(height - 1) / 2
+            ),
+            T_camera_lidar=_mounted((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0)),
+        )
+    }
+
+
 _SURROUND_YAW_DEG = {
     "front": 0.0, "front_left": 60.0, "back_left": 118.0, "back": 180.0, "back_right": -120.0,
     "front_right": -59.0,
@@ -121,7 +156,7 @@ _FISHEYE_YAW_DEG = {"front": 0.0, "left": 91.0, "back": 180.0, "right": -89.0}
 
 _RIGS: dict[str, Callable[[], dict[str, Camera]]] = {
     "kitti": _kitti, "walkley": _walkley, "surround": _surround, "fisheye": _fisheye,
-    "sample": _sample,
+    "omni": _omni, "panorama": _panorama, "sample": _sample,
 }  # fmt: skip
 RIG_NAMES = tuple(_RIGS)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import normalized
+from factors import unproject
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -55,6 +56,9 @@ def draw_visible_points(
 def _draw_scattered(rng: Rng, camera: Camera, count: int, depth_m: tuple[float, float]) -> Array:
     """(count, 3) points in the camera frame, in about the directions of the image."""
     low, high = np.log(depth_m)
+    if camera.model in ("omnidirectional", "equirectangular"):
+        rays = _draw_rays(rng, camera, count)
+        return np.asarray(rays * np.exp(rng.uniform(low, high, (len(rays), 1))))
     spread = 1.2 * np.array([camera.width_px, camera.height_px]) / 2
     focal = np.array([camera.intrinsics_px.fx, camera.intrinsics_px.fy])
     angles = rng.uniform(-1, 1, (count, 2)) * np.minimum(spread / focal, 1.4)
@@ -63,13 +67,22 @@ def _draw_scattered(rng: Rng, camera: Camera, count: int, depth_m: tuple[float, 
     return np.asarray(rays * (distance / np.linalg.norm(rays, axis=1))[:, None])
 
 
+def _draw_rays(rng: Rng, camera: Camera, count: int) -> Array:
+    """(at most count, 3) unit rays of pixels all over the image."""
+    pixels = rng.random((count, 2)) * [camera.width_px, camera.height_px] - 0.5
+    if camera.model in ("omnidirectional", "equirectangular"):
+        rays, valid = unproject(camera.lens, pixels)
+        return np.asarray(rays[valid])
+    plane = np.column_stack([normalized(camera, pixels), np.ones(count)])
+    return np.asarray(plane / np.linalg.norm(plane, axis=1)[:, None])
+
+
 def _draw_on_street(rng: Rng, camera: Camera, count: int) -> Array:
     """(at most count, 3) points of a street in the camera frame that a LiDAR sees."""
-    size = np.array([camera.width_px, camera.height_px])
-    plane = normalized(camera, rng.random((count, 2)) * size - 0.5)
+    rays = _draw_rays(rng, camera, count)
+    count = len(rays)
     T_lidar_camera = invert(camera.T_camera_lidar)
-    rays = np.column_stack([plane, np.ones(count)]) @ T_lidar_camera[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays = rays @ T_lidar_camera[:3, :3].T
     origin, wall = T_lidar_camera[:3, 3], np.sign(rays[:, 1]) * rng.uniform(*_WALLS_M)
     with np.errstate(divide="ignore"):
         ground = (-_LIDAR_HEIGHT_M - origin[2]) / np.minimum(rays[:, 2], 0)

@@ -155,9 +155,8 @@ def linearize(
     """
     pixels, by_twist = twist_columns(camera, table.points_lidar_m)
     jacobian_px = differentiate(pixels.T)
-    columns = np.concatenate(
-        [by_twist, jacobian_px.transpose(2, 1, 0), (table.pixels_px.T - pixels)[None]]
-    )
+    errors = camera.lens.subtract(table.pixels_px, pixels.T)
+    columns = np.concatenate([by_twist, jacobian_px.transpose(2, 1, 0), errors.T[None]])
     if table.information_px is not None:
         s00, s01, s11 = upper_root(table.information_px).T
         columns[:, 0] *= s00

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.frame_poses import Runs, fit_frames
-from factors import ProjectionBlock, smallest_scaled_eigenvalues
+from factors import ProjectionBlock, smallest_scaled_eigenvalues, unproject
 
 Array = NDArray[np.float64]
 
@@ -24,6 +26,9 @@ _MAX_SAMPLE = 4000  # matches; chosen, not measured
 RANSAC_ITERATIONS = 2000
 """Samples of 4 matches: with 80 % outliers, one is clean in 19 of 20 runs."""
 _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
+_CONE_RAD = np.radians(60.0)  # of a lens that sees all round: what one plane serves well
+_DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
@@ -103,7 +108,7 @@ def ransac_pnp(
     """(4, 4) T_camera_lidar by MAGSAC, None if there is no pose. Arguments as of `frame_pose`."""
     if len(matches) < MIN_MATCHES:
         return None
-    plane = normalized(camera, matches.pixels_px)
+    turn, plane = _plane_of_most(camera, matches.pixels_px)
     usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
     if np.count_nonzero(usable) < MIN_MATCHES:
         return None
@@ -114,7 +119,7 @@ def ransac_pnp(
     parameters.maxIterations = iterations
     parameters.confidence = 0.999
     parameters.randomGeneratorState = config.seed
-    focal = camera.intrinsics_px.fx
+    focal = camera.lens.pixels_per_rad
     ideal = np.diag([focal, focal, 1.0])
     try:
         found, _, rotation, translation, _ = cv2.solvePnPRansac(
@@ -127,7 +132,27 @@ def ransac_pnp(
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(rotation)[0]
     T[:3, 3] = translation.ravel()
+    T[:3] = turn.T @ T[:3]
     return T
+
+
+def _plane_of_most(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:
+    """A turn of the camera, and its pixels on the plane z = 1 of the turned frame.
+
+    The turn (3, 3) is the identity for lenses that look ahead. Of those that see all round, it is
+    to the direction with most of the pixels about it; pixels behind have NaN.
+    """
+    if camera.model in ("pinhole", "fisheye"):
+        return np.eye(3), normalized(camera, pixels_px)
+    rays, valid = unproject(camera.lens, pixels_px)
+    cosines = _DIRECTIONS @ rays[valid].T
+    about = (cosines > np.cos(_CONE_RAD)).sum(axis=1)
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], _DIRECTIONS[[about.argmax()]])[0].as_matrix()
+    turned = rays @ turn.T
+    ahead = valid & (turned[:, 2] > np.cos(_CONE_RAD))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = turned[:, :2] / turned[:, 2:]
+    return turn, np.where(ahead[:, None], plane, np.nan)
 
 
 def refine_frames(

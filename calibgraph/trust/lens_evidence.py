@@ -61,6 +61,8 @@ def measure_lens(
         scores: of the camera at the level ``WIDE``.
         seed: of the search.
     """
+    if camera.model == "equirectangular":  # the format determines it: the pose alone is free
+        return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
     best, gain = _search(camera, scores, _THREE, seed)
     aspect, aspect_sigma = _aspect_ratio(camera, scores, seed)
     rough = _fit_at_peaks(camera, scores, best)
@@ -116,7 +118,8 @@ def change_lens(camera: Camera, change: Array) -> Camera:
     of_x, of_y = np.exp(change[0] + change[3] * np.array([0.5, -0.5])).tolist()
     shift = change[2] * _longer_side(camera)
     distortion = [*camera.distortion, *[0.0] * (4 - len(camera.distortion))]
-    distortion[0] += float(np.clip(change[1], -MAX_RADIAL, MAX_RADIAL))
+    first_radial = int(camera.model == "omnidirectional")  # after xi
+    distortion[first_radial] += float(np.clip(change[1], -MAX_RADIAL, MAX_RADIAL))
     values = {key: getattr(camera, key) for key in type(camera).model_fields}
     values["intrinsics_px"] = k.model_copy(
         update={

@@ -45,7 +45,7 @@ def residual_checks(estimate: Estimate) -> list[Check]:
     residuals = estimate.residuals
     if residuals is None:
         return []
-    spread_deg = np.degrees(residuals.sigma_px / estimate.camera.intrinsics_px.fx)
+    spread_deg = np.degrees(residuals.sigma_px / estimate.camera.lens.pixels_per_rad)
     return [
         threshold("residual_spread").check(spread_deg),
         threshold("inlier_share").check(residuals.inlier_share),

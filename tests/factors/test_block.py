@@ -28,6 +28,8 @@ LENSES = {
     "radtan": Lens.pinhole(**K, distortion=RADTAN5),
     "rational": Lens.pinhole(**K, distortion=RADTAN8),
     "fisheye": Lens.fisheye(**K, distortion=KANNALA),
+    "omnidirectional": Lens.omnidirectional(**K, distortion=(1.2, *RADTAN5[:4])),
+    "equirectangular": Lens.equirectangular(**K),
 }
 
 

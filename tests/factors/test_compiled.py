@@ -88,7 +88,7 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     packages = tmp_path / "packages"
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
-    two = LENS + "\nfrom factors.lens import is_projectable as other"
+    two = LENS + "\nfrom factors.lens_kernels import is_projectable as other"
     two += "; print(other(0, np.ones(13), 0.0, 0.0, 1.0))"
     out, err = run(two, path=packages, **{variable: str(read_only)})
     assert out.splitlines() == [f"{HUBER} 0", "True"]

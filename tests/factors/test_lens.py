@@ -19,6 +19,8 @@ KANNALA = (0.02, -0.004, 0.001, -0.0002)
 
 LENSES = {f"radtan{n}": Lens.pinhole(**K, distortion=d) for n, d in RADTAN.items()}
 LENSES["fisheye"] = Lens.fisheye(**K, distortion=KANNALA)
+LENSES["omnidirectional"] = Lens.omnidirectional(**K, distortion=(1.2, *RADTAN[4]))
+LENSES["equirectangular"] = Lens.equirectangular(**K)
 
 
 def random_points(seed: int, count: int, spread: float) -> np.ndarray:

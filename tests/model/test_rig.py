@@ -85,7 +85,16 @@ BAD = {
         {"model": "equidistant"},
         r"called 'fisheye' here; its distortion is \[k1, k2, k3, k4\]",
     ),
-    "unknown lens": ({"model": "omni"}, r"'pinhole' or 'fisheye', found 'omni'"),
+    "unknown lens": ({"model": "ds"}, r"'omnidirectional' or 'equirectangular', found 'ds'"),
+    "mirror": (
+        {"model": "omnidirectional", "distortion": [-1, 0, 0, 0, 0]},
+        r"xi of the unified model is -1, expected 0 to 100",
+    ),
+    "panorama": (
+        {"model": "equirectangular", "distortion": [0.1, 0, 0, 0]},
+        r"4 distortion coefficients found, expected 0",
+    ),
+    "Kalibr's omni": ({"model": "omni"}, r"called 'omnidirectional' here"),
     "fisheye without": ({"model": "fisheye", "distortion": []}, r"0 distortion"),
     "size": ({"width_px": 0}, r"width_px"),
     "gigapixels": ({"width_px": 28_000, "height_px": 28_000}, r"28000x28000 px are over 2e\+08"),

@@ -13,7 +13,14 @@ from calibgraph.simulation.lidar import lidar_of
 from calibgraph.simulation.recording import Drive, build_drive, simulate_street
 from tests.conftest import FORWARD, KANNALA, RADTAN5
 
-LENSES = {"pinhole": (), "radtan": RADTAN5, "fisheye": KANNALA}
+LENSES: dict[str, tuple[float, ...]] = {
+    "pinhole": (),
+    "radtan": RADTAN5,
+    "fisheye": KANNALA,
+    "omnidirectional": (1.3, *RADTAN5[:4]),
+    "equirectangular": (),
+}
+FOCAL_PX = {"pinhole": 150.0, "radtan": 150.0, "omnidirectional": 140.0, "equirectangular": 38.2}
 DRIVE_SEED = 3
 
 
@@ -25,10 +32,9 @@ def small_camera(lens: str, position_m: tuple[float, float, float] = (0.3, 0.2, 
     T = np.eye(4)
     T[:3, :3] = FORWARD
     T[:3, 3] = -FORWARD @ position_m
-    is_fisheye = lens == "fisheye"
-    focal = 62.0 if is_fisheye else 150.0  # 120 px from the centre: 107 or 39 degrees
+    focal = FOCAL_PX.get(lens, 62.0)  # 120 px from the centre: 39 degrees, fisheye 107
     return Camera(
-        model="fisheye" if is_fisheye else "pinhole",
+        model="pinhole" if lens == "radtan" else lens,
         width_px=240,
         height_px=150,
         intrinsics_px=Intrinsics(fx=focal, fy=focal + 1, cx=121.3, cy=73.8),

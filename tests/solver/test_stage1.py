@@ -17,6 +17,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.geometry import pose_difference
+from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.pnp import frame_pose, normalized
 from calibgraph.solver.stage1 import (
     T_hat,
@@ -52,6 +53,20 @@ def test_every_frame_is_solved_without_noise(mixed_rig: Rig) -> None:
     for name, T in mixed_rig.T_camera_lidar.items():
         assert found[name].failed_frames == 0
         for pose in found[name].per_frame:
+            np.testing.assert_allclose(pose, T, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["omni", "panorama"])
+def test_frames_of_lenses_that_see_all_round_are_solved(name: str) -> None:
+    """By PnP without a guess, from matches of which many lie behind the camera."""
+    rig = rig_of(name)
+    errors = MatcherErrors(noise_px=0.0, outlier_share=0.3)
+    table = simulate_correspondences(rig, frames=3, matches=200, errors=errors)
+    for camera, T in rig.T_camera_lidar.items():
+        points = table.of_camera(camera).points_lidar_m
+        behind = (points @ T[:3, :3].T + T[:3, 3])[:, 2] < 0
+        assert behind.sum() > (250 if name == "panorama" else 0)
+        for pose in estimate_stage1(rig, table, Config())[camera].per_frame:
             np.testing.assert_allclose(pose, T, atol=1e-6)
 
 

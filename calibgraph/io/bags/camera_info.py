@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from calibgraph.errors import DatasetError
 from calibgraph.model.rig import MODELS_OF_OTHERS
 from factors import LensModel
+from factors.lens import COEFFICIENTS
 
 Array = NDArray[np.float64]
 
-_MODELS: Mapping[str, LensModel] = {**MODELS_OF_OTHERS, "fisheye": "fisheye"}
-_LENGTHS: Mapping[LensModel, Sequence[int]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+_MODELS: Mapping[str, LensModel] = {**MODELS_OF_OTHERS, **{model: model for model in COEFFICIENTS}}
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def _distortion(message: Any, where: str) -> tuple[str, list[float]]:
     """Lens model and coefficients; both may be empty for none, and zeros appended."""
     given = np.trim_zeros(_field(message, "D"), "b").tolist()
     model = _MODELS.get(message.distortion_model.strip().lower(), None if given else "pinhole")
-    if model is not None and len(given) <= max(_LENGTHS[model]):
-        return model, _padded(given, _LENGTHS[model])
+    if model is not None and len(given) <= max(COEFFICIENTS[model]):
+        return model, _padded(given, COEFFICIENTS[model])
     raise DatasetError(
         f"{where}: distortion model {message.distortion_model!r} with {len(given)} coefficients is "
         f"unknown; known are {', '.join(_MODELS)}: give a rig with the lens (--rig)"

@@ -17,6 +17,8 @@ from calibgraph.io.formats.lenses import (
     carried_coefficients,
     fitted_coefficients,
     lens_model,
+    no_place_for,
+    unified_coefficients,
 )
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
@@ -43,7 +45,6 @@ def write_kalibr(export: RigExport) -> str:
 def _content(export: RigExport, names: list[str], index: int) -> dict[str, Any]:
     name = names[index]
     camera = export.cameras[name]
-    k = camera.intrinsics_px
     own: dict[str, Any] = {"camera": name}
     chain: dict[str, Any] = {}
     if index:
@@ -54,9 +55,7 @@ def _content(export: RigExport, names: list[str], index: int) -> dict[str, Any]:
     if covariance is not None:
         own["covariance"] = covariance.ravel()
     return {
-        "camera_model": "pinhole",
-        "intrinsics": [k.fx, k.fy, k.cx, k.cy],
-        **_distortion(name, camera),
+        **_projection(name, camera),
         "resolution": [camera.width_px, camera.height_px],
         "rostopic": f"/{name}/image_raw",
         **chain,
@@ -65,7 +64,23 @@ def _content(export: RigExport, names: list[str], index: int) -> dict[str, Any]:
     }
 
 
+def _projection(name: str, camera: Camera) -> dict[str, Any]:
+    k = camera.intrinsics_px
+    focal = [k.fx, k.fy, k.cx, k.cy]
+    if camera.model == "omnidirectional":
+        xi, *coefficients = camera.distortion
+        return {
+            "camera_model": "omni",
+            "intrinsics": [xi, *focal],
+            "distortion_model": "radtan",
+            "distortion_coeffs": coefficients,
+        }
+    return {"camera_model": "pinhole", "intrinsics": focal, **_distortion(name, camera)}
+
+
 def _distortion(name: str, camera: Camera) -> dict[str, Any]:
+    if camera.model == "equirectangular":
+        raise no_place_for(name, camera, "Kalibr's camchain")
     if camera.model == "fisheye":
         return {"distortion_model": "equidistant", "distortion_coeffs": camera.distortion}
     if not any(camera.distortion):
@@ -94,6 +109,10 @@ class _Camera(BaseModel):
 
 class _Focal(BaseModel):
     intrinsics: tuple[Positive, Positive, Finite, Finite]
+
+
+class _Unified(BaseModel):
+    intrinsics: tuple[Finite, Positive, Positive, Finite, Finite]
 
 
 class _Camchain(BaseModel):
@@ -143,9 +162,27 @@ def _number(key: str) -> int:
 
 
 def _lens(camera: _Camera, path: Path) -> CameraLens:
+    if camera.camera_model == "omni":
+        return _omnidirectional(camera, path)
     model = lens_model(camera.distortion_model, path)
     if camera.camera_model != "pinhole":
-        model = lens_model(camera.camera_model, path)  # raises: omni, ds, eucm
+        model = lens_model(camera.camera_model, path)  # raises: ds, eucm
     focal = checked_model(_Focal, {"intrinsics": camera.intrinsics}, path)
     coefficients = fitted_coefficients(camera.distortion_coeffs, model, path)
     return CameraLens(model, camera.resolution, focal.intrinsics, coefficients)
+
+
+def _omnidirectional(camera: _Camera, path: Path) -> CameraLens:
+    """Kalibr's omni-radtan or omni-none: xi comes before the focal lengths.
+
+    Raises:
+        FileError: if it has another distortion.
+    """
+    if camera.distortion_model not in ("radtan", "none"):
+        raise FileError(
+            path, f"omni-{camera.distortion_model} is no lens here; calibrate it as omni-radtan"
+        )
+    xi, *focal = checked_model(_Unified, {"intrinsics": camera.intrinsics}, path).intrinsics
+    coefficients = unified_coefficients(xi, camera.distortion_coeffs, path)
+    fx, fy, cx, cy = focal
+    return CameraLens("omnidirectional", camera.resolution, (fx, fy, cx, cy), coefficients)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,14 @@ from calibgraph.io.formats.lenses import (
     carried_coefficients,
     fitted_coefficients,
     lens_model,
+    no_place_for,
+    unified_coefficients,
 )
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.formats.rotations import pose_of_quaternion, quaternion_xyzw
 from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Camera as RigCamera
 from calibgraph.model.rig import Finite, Positive
 
 _MAX_BYTES = 8 * 2**20
@@ -30,26 +34,32 @@ def write_koide(export: RigExport) -> str:
     """The camera, and its pose under ``results``."""
     name, camera = export.only_camera("koide3's calib.json")
     T = export.T_lidar_camera(name)
-    k = camera.intrinsics_px
-    if camera.model == "fisheye":
-        model, coefficients = "fisheye", list(camera.distortion)
-    else:
-        what = "koide3's plumb_bob"
-        model, coefficients = "plumb_bob", carried_coefficients(name, camera, 5, what)
     statement = export.statement(
         "T_lidar_camera: [x, y, z, qx, qy, qz, qw] maps camera to LiDAR coordinates: "
         "p_lidar = T_lidar_camera * p_camera, the inverse of T_camera_lidar"
     )
     content = {
-        "camera": {
-            "camera_model": model,
-            "intrinsics": [k.fx, k.fy, k.cx, k.cy],
-            "distortion_coeffs": coefficients,
-        },
+        "camera": _projection(name, camera),
         "meta": {"camera": name},
         "results": {"T_lidar_camera": [*T[:3, 3].tolist(), *quaternion_xyzw(T)]},
     }
     return stated_json(statement, content)
+
+
+def _projection(name: str, camera: RigCamera) -> dict[str, Any]:
+    k = camera.intrinsics_px
+    intrinsics = [k.fx, k.fy, k.cx, k.cy]
+    if camera.model == "omnidirectional":
+        xi, *coefficients = camera.distortion
+        model, intrinsics = "omnidir", [*intrinsics, xi]
+    elif camera.model == "fisheye":
+        model, coefficients = "fisheye", list(camera.distortion)
+    elif camera.model == "pinhole":
+        what = "koide3's plumb_bob"
+        model, coefficients = "plumb_bob", carried_coefficients(name, camera, 5, what)
+    else:
+        raise no_place_for(name, camera, "koide3's calib.json")
+    return {"camera_model": model, "intrinsics": intrinsics, "distortion_coeffs": coefficients}
 
 
 class _Camera(BaseModel):
@@ -60,6 +70,14 @@ class _Camera(BaseModel):
 
 class _Focal(BaseModel):
     intrinsics: tuple[Positive, Positive, Finite, Finite]
+
+
+class _Unified(BaseModel):
+    intrinsics: tuple[Positive, Positive, Finite, Finite, Finite]
+
+
+class _Panorama(BaseModel):
+    intrinsics: tuple[Positive, Positive]
 
 
 _Pose = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]
@@ -88,9 +106,6 @@ def read_koide(path: Path, name: str) -> Part:
         FileError: if the file is malformed, or the lens is none of ours.
     """
     found = checked_model(_Calibration, _content(path), path)
-    model = lens_model(found.camera.camera_model, path)
-    focal = checked_model(_Focal, found.camera.model_dump(), path)
-    coefficients = fitted_coefficients(found.camera.distortion_coeffs, model, path)
     name = str(found.meta.get("camera", name))
     r = found.results
     pose = r.T_lidar_camera or r.init_T_lidar_camera or r.init_T_lidar_camera_auto
@@ -98,7 +113,22 @@ def read_koide(path: Path, name: str) -> Part:
         T = {} if pose is None else {name: invert(pose_of_quaternion(pose[:3], pose[3:]))}
     except ValueError as error:
         raise FileError(path, f"T_lidar_camera: {error}") from error
-    return Part(path, {name: CameraLens(model, None, focal.intrinsics, coefficients)}, T)
+    return Part(path, {name: _lens(found.camera, path)}, T)
+
+
+def _lens(camera: _Camera, path: Path) -> CameraLens:
+    model, values = lens_model(camera.camera_model, path), camera.model_dump()
+    given = camera.distortion_coeffs
+    if model == "equirectangular":  # width and height in place of focal lengths
+        width, height = checked_model(_Panorama, values, path).intrinsics
+        intrinsics = (width / (2 * math.pi), height / math.pi, width / 2, height / 2)
+        return CameraLens(model, None, intrinsics, ())
+    if model == "omnidirectional":
+        *focal, xi = checked_model(_Unified, values, path).intrinsics
+        fx, fy, cx, cy = focal
+        return CameraLens(model, None, (fx, fy, cx, cy), unified_coefficients(xi, given, path))
+    intrinsics = checked_model(_Focal, values, path).intrinsics
+    return CameraLens(model, None, intrinsics, fitted_coefficients(given, model, path))
 
 
 def _content(path: Path) -> Any:

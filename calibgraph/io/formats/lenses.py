@@ -11,9 +11,8 @@ import numpy as np
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.model.rig import MODELS_OF_OTHERS, Camera
 from factors import LensModel
-from factors.lens import ORDERS
-
-_COUNTS: dict[LensModel, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (4,)}
+from factors.lens import COEFFICIENTS, ORDERS
+from factors.wide_lenses import check_mirror
 
 
 @dataclass(frozen=True)
@@ -40,17 +39,37 @@ def lens_model(name: str, path: Path) -> LensModel:
         FileError: if calibgraph has no such lens.
     """
     key = name.strip().lower().replace("-", "_").replace(" ", "_")
-    if key in ("pinhole", "none", ""):
+    if key in ("none", ""):
         return "pinhole"
-    found: LensModel | None = "fisheye" if key == "fisheye" else MODELS_OF_OTHERS.get(key)
+    ours = {model: model for model in COEFFICIENTS}
+    found = ours.get(key) or MODELS_OF_OTHERS.get(key)  # type: ignore[call-overload]
     if found is None:
         raise FileError(
             path,
             f"lens model {name!r} is none of calibgraph's: pinhole (plumb_bob, radtan, "
-            "rational_polynomial) and fisheye (equidistant, Kannala-Brandt); calibrate the "
-            "intrinsics with one of these",
+            "rational_polynomial), fisheye (equidistant, Kannala-Brandt), omnidirectional (omni, "
+            "Mei) and equirectangular; calibrate the intrinsics with one of these",
         )
     return found
+
+
+def unified_coefficients(xi: float, values: Sequence[float], path: Path) -> tuple[float, ...]:
+    """The coefficients here of the unified model: xi, and k1, k2, p1, p2 of others, or none.
+
+    Raises:
+        FileError: if there is another number of coefficients, or xi is out of range.
+    """
+    try:
+        check_mirror(xi)
+    except ValueError as error:
+        raise FileError(path, str(error)) from error
+    kept = fitted_coefficients(values, "pinhole", path) or (0.0,) * 4
+    if any(kept[4:]):
+        raise FileError(
+            path,
+            f"{len(values)} distortion coefficients; the unified model here has k1, k2, p1, p2",
+        )
+    return (xi, *kept[:4])
 
 
 def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -> tuple[float, ...]:
@@ -62,7 +81,7 @@ def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -
     kept = tuple(float(value) for value in np.trim_zeros(np.array(values, dtype=float), "b"))
     if model == "pinhole" and not kept:
         return ()
-    for count in _COUNTS[model]:
+    for count in COEFFICIENTS[model]:
         if count >= len(kept):
             return kept + (0.0,) * (count - len(kept))
     raise FileError(
@@ -86,6 +105,15 @@ def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> lis
             camera=name,
         )
     return padded[:most]
+
+
+def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
+    """The error of a format that has no place for a camera's lens model."""
+    return CalibrationError(
+        f"camera {name!r}: {what} cannot hold a lens of the model {camera.model}; choose another "
+        "--format (opencv, json)",
+        camera=name,
+    )
 
 
 def require_undistorted(name: str, camera: Camera, what: str) -> None:

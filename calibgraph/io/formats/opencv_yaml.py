@@ -13,7 +13,12 @@ from pydantic import BaseModel
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text
-from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients, lens_model
+from calibgraph.io.formats.lenses import (
+    CameraLens,
+    fitted_coefficients,
+    lens_model,
+    unified_coefficients,
+)
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
@@ -46,7 +51,11 @@ def write_opencv(export: RigExport) -> str:
         file.write("image_width", camera.width_px)
         file.write("image_height", camera.height_px)
         file.write("camera_matrix", camera.matrix_px)
-        file.write("distortion_coefficients", np.array(camera.distortion or (0.0,) * 5)[None])
+        distortion = [*camera.distortion] or [0.0] * 5
+        if camera.model == "omnidirectional":  # OpenCV's omnidir keeps xi apart
+            xi, *distortion = camera.distortion
+            file.write("xi", xi)
+        file.write("distortion_coefficients", np.array(distortion)[None])
         file.write("T_camera_lidar", np.array(camera.T_camera_lidar))
         covariance = export.ros_covariance(name)
         if covariance is not None:
@@ -70,6 +79,7 @@ class _Camera(BaseModel):
     model: str | None = None
     fisheye_model: int = 0
     distortion_type: int = 0  # of MC-Calib: 1 is its fisheye
+    xi: Finite | _Matrix | None = None  # of OpenCV's omnidir: a number, or one in a matrix
     T_camera_lidar: _Matrix | None = None
 
 
@@ -129,6 +139,8 @@ def _renamed(content: Mapping[str, Any]) -> dict[str, Any]:
 def _lens(camera: _Camera, path: Path) -> CameraLens:
     is_fisheye = camera.fisheye_model or camera.distortion_type
     model = lens_model(camera.model or ("fisheye" if is_fisheye else "pinhole"), path)
+    if camera.xi is not None:
+        model = "omnidirectional"
     K = _array(camera.camera_matrix, (3, 3), "the camera matrix", path)
     fx, fy = checked_model(_Diagonal, {"focal_lengths": (K[0, 0], K[1, 1])}, path).focal_lengths
     size = None
@@ -136,7 +148,11 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
         size = (camera.width, camera.height)
     coefficients = () if camera.distortion is None else camera.distortion.data
     intrinsics = (fx, fy, float(K[0, 2]), float(K[1, 2]))
-    return CameraLens(model, size, intrinsics, fitted_coefficients(coefficients, model, path))
+    if camera.xi is None:
+        return CameraLens(model, size, intrinsics, fitted_coefficients(coefficients, model, path))
+    xi = camera.xi
+    xi = _array(xi, (1, 1), "xi", path).item() if isinstance(xi, _Matrix) else xi
+    return CameraLens(model, size, intrinsics, unified_coefficients(xi, coefficients, path))
 
 
 def _transform(matrix: _Matrix, path: Path) -> Any:

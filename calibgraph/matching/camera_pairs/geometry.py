@@ -128,7 +128,7 @@ def _essential_matrix(
         return None
     a, b = (_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned)
     ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
-    focal = min(camera.intrinsics_px.fx for camera in cameras)
+    focal = min(camera.lens.pixels_per_rad for camera in cameras)
     parameters = cv2.UsacParams()
     parameters.score = cv2.SCORE_METHOD_MAGSAC
     parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA

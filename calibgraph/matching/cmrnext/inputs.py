@@ -36,7 +36,7 @@ _OCCLUDER_SHARE, _OCCLUDER_M = 0.9, 0.5  # how much nearer an occluder is
 
 
 class View:
-    """A camera without its distortion: a pinhole of the same focal lengths, centre and size.
+    """A camera without its distortion: a pinhole of the same resolution, centre and size.
 
     Args:
         camera: its pose is not used.
@@ -46,7 +46,8 @@ class View:
     def __init__(self, camera: Camera, *, crop_even: bool = False) -> None:
         self.camera = camera
         k = camera.intrinsics_px
-        self.focal_px, self.centre_px = np.array([k.fx, k.fy]), np.array([k.cx, k.cy])
+        on_axis = camera.lens.pixels_per_rad / k.fx  # less than 1 of the unified model alone
+        self.focal_px, self.centre_px = on_axis * np.array([k.fx, k.fy]), np.array([k.cx, k.cy])
         self.width, self.height = (
             size - size % 2 if crop_even else size for size in (camera.width_px, camera.height_px)
         )

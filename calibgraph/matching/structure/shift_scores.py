@@ -84,7 +84,7 @@ def score_frame(
     kept, group, groups = _group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
     windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
     places = find_places(windows.rays_m, viewpoint_m, camera, scale)
-    reach = int(np.ceil(level.reach_rad * camera.intrinsics_px.fx * scale.max()))
+    reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
     grids: Grids = reserve((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, image, places, windows, group, likelihood=level.fine)
@@ -149,7 +149,7 @@ def downscale_log_gray(
 
     A pixel p of the image lies at (p + 0.5) scale - 0.5.
     """
-    factor = min(1.0, 1.0 / (camera.intrinsics_px.fx * step_rad))
+    factor = min(1.0, 1.0 / (camera.lens.pixels_per_rad * step_rad))
     height, width = gray.shape
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
     small = cv2.resize(cv2.LUT(gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)

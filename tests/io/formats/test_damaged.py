@@ -55,7 +55,8 @@ def message_of(*paths: Path) -> str:
 @pytest.mark.parametrize(
     ("name", "old", "new", "said"),
     [
-        ("camchain.yaml", "camera_model: pinhole", "camera_model: omni", "'omni' is none of"),
+        ("camchain.yaml", "camera_model: pinhole", "camera_model: omni", "'intrinsics.4' is"),
+        ("camchain.yaml", "camera_model: pinhole", "camera_model: eucm", "'eucm' is none of"),
         ("camchain.yaml", "camera_model: pinhole", "camera_model: ds", "'ds' is none of"),
         ("camchain.yaml", "radtan", "fov", "lens model 'fov' is none of calibgraph's"),
         ("camchain.yaml", "[460.5, 461.5, 370.25, 240.75]", "[460.5, 461.5]", "intrinsics"),
@@ -81,7 +82,8 @@ def message_of(*paths: Path) -> str:
         ("tf.yaml", "w: 0.5", "v: 0.5", "rotation.w' is missing"),
         ("tf.yaml", "{x: 0, y: 0, z: 0, w: 1}", "{x: 0, y: 0, z: 0, w: 0}", "quaternion"),
         ("tf.yaml", "frame_id: base_link", "frame_id: odom", "no lens"),
-        ("calib.json", "plumb_bob", "equirectangular", "'equirectangular' is none of"),
+        ("calib.json", "plumb_bob", "equirectangular", "intrinsics: Tuple should have at most 2"),
+        ("calib.json", "plumb_bob", "atan", "'atan' is none of"),
         ("calib.json", '"T_lidar_camera": [', '"T_lidar_camera": [[', "is not valid JSON"),
         ("calib.json", '"intrinsics": [', '"intrinsics": [1,', "intrinsics"),
         ("front.yml", "cols: 3", "cols: 4", "3 rows, 4 columns and 9 numbers"),
