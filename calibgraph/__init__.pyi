@@ -19,6 +19,9 @@ from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
 from .fleet.sharded.solve import solve_sharded as solve_sharded
+from .guessing.guess import CameraGuess as CameraGuess
+from .guessing.guess import RigGuess as RigGuess
+from .guessing.guess import guess_rig as guess_rig
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.calibrations import load_calibration as load_calibration

@@ -25,6 +25,7 @@ from calibgraph.cli.doctor import doctor
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
+from calibgraph.cli.guess import guess
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
@@ -79,6 +80,7 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     perturb: outputs.guess,
     bag: outputs.rig_of_bag,
     doctor: outputs.pictures,
+    guess: outputs.rig_guess,
     export: outputs.exported,
     import_: outputs.imported,
     simulate: outputs.nothing,

@@ -18,6 +18,38 @@ if TYPE_CHECKING:
 
 _LIST = "list"
 
+FilesArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FILE...",
+        help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+    ),
+]
+RenameOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="OLD=NEW",
+        help="Another name of a camera, as its folder in the dataset; may be repeated.",
+    ),
+]
+LidarFrameOption = Annotated[
+    str | None,
+    typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
+]
+CameraFrameOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=FRAME",
+        help="Frame of a camera, where the names differ; may be repeated. A frame with 'optical' "
+        "in its name is x right, y down, z forward, others are x forward, z up.",
+    ),
+]
+SizeOption = Annotated[
+    str | None,
+    typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
+]
+"""Those of the files of others."""
+
 
 def _list_formats(format: str) -> str:
     """Print the formats for ``--format list``, before other arguments are required."""
@@ -102,37 +134,12 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 def import_(
-    files: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="FILE...",
-            help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
-        ),
-    ],
+    files: FilesArgument,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OLD=NEW",
-            help="Another name of a camera, as its folder in the dataset; may be repeated.",
-        ),
-    ] = None,
-    lidar_frame: Annotated[
-        str | None,
-        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
-    ] = None,
-    camera_frame: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=FRAME",
-            help="Frame of a camera, where the names differ; may be repeated. A frame with "
-            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
-        ),
-    ] = None,
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
-    ] = None,
+    rename: RenameOption = None,
+    lidar_frame: LidarFrameOption = None,
+    camera_frame: CameraFrameOption = None,
+    size: SizeOption = None,
     relative_sigma_deg: Annotated[
         float, typer.Option(min=0.001, help="Of relative poses (T_cn_cnm1): 1 sigma per axis.")
     ] = 0.1,
@@ -145,15 +152,15 @@ def import_(
     from calibgraph.io.formats.words import describe_rig
     from calibgraph.outputs import yaml_mark
 
-    named = [_parse_name(text) for text in files]
+    named = [parse_file(text) for text in files]
     with checked_arguments():
         rig = import_rig(
             [path for _, path in named],
             names={path: name for name, path in named if name},
-            rename=_parse_names("--rename", rename),
+            rename=parse_names("--rename", rename),
             lidar_frame=lidar_frame,
-            camera_frames=_parse_names("--camera-frame", camera_frame),
-            size_px=None if size is None else _parse_size(size),
+            camera_frames=parse_names("--camera-frame", camera_frame),
+            size_px=None if size is None else parse_size(size),
             relative_sigma_deg=relative_sigma_deg,
             relative_sigma_cm=relative_sigma_cm,
         )
@@ -164,13 +171,13 @@ def import_(
     print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
 
 
-def _parse_name(text: str) -> tuple[str, Path]:
+def parse_file(text: str) -> tuple[str, Path]:
     """The camera's name, if there is one before ``=``, and the file."""
     name, equals, file = text.partition("=")
     return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
 
 
-def _parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
+def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
     """The pairs of a repeated option A=B.
 
     Raises:
@@ -183,7 +190,7 @@ def _parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def _parse_size(text: str) -> tuple[int, int]:
+def parse_size(text: str) -> tuple[int, int]:
     """Width and height.
 
     Raises:

@@ -72,6 +72,11 @@ def imported(given: Given) -> list[Output]:
     return [_marked_yaml(given["out"], "import")]
 
 
+def rig_guess(given: Given) -> list[Output]:
+    """A rig to begin with."""
+    return [_marked_yaml(given["out"], "guess")]
+
+
 def rig_of_bag(given: Given) -> list[Output]:
     """A rig from a bag, if it is wanted."""
     return [] if given["out"] is None else [_marked_yaml(given["out"], "bag")]

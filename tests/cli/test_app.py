@@ -108,7 +108,7 @@ def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -
     [
         (("calibrate", SAMPLE, "--colour", "red"), "see calibgraph calibrate --help"),
         (("bench", "paper"), "see calibgraph bench paper --help"),
-        (("guess", SAMPLE), "see calibgraph --help"),
+        (("calibrat", SAMPLE), "see calibgraph --help"),
     ],
 )
 def test_a_wrong_call_leads_to_the_help_of_its_command(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -53,6 +54,75 @@ def import_rig(
     Raises:
         CalibrationError: if a file is malformed, a lens is none of ours, or something is missing.
     """
+    parts = read_rig_parts(
+        files, names=names, rename=rename, lidar_frame=lidar_frame, camera_frames=camera_frames
+    )
+    return parts.to_rig(
+        size_px=size_px,
+        relative_sigma_deg=relative_sigma_deg,
+        relative_sigma_cm=relative_sigma_cm,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RigParts:
+    """What files of other programs hold about a rig together; extrinsics may be missing.
+
+    Attributes:
+        path: of the first file, for errors.
+        lidar: name of the LiDAR.
+        lenses: by camera.
+        T_camera_lidar: (4, 4) of the cameras that have one.
+        pairs: relative poses.
+        frames: names of the frames.
+    """
+
+    path: Path
+    lidar: str
+    lenses: Mapping[str, CameraLens]
+    T_camera_lidar: Mapping[str, Array]
+    pairs: Sequence[RelativeCamera]
+    frames: Sequence[str]
+
+    def to_rig(
+        self,
+        extrinsics: Mapping[str, Array] | None = None,
+        *,
+        size_px: tuple[int, int] | None = None,
+        relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
+        relative_sigma_cm: float = RELATIVE_SIGMA_CM,
+    ) -> Rig:
+        """The rig, with further (4, 4) T_camera_lidar, which stand in for those of the files.
+
+        Raises:
+            CalibrationError: if an image size or an extrinsic is missing.
+        """
+        T = {**self.T_camera_lidar, **(extrinsics or {})}
+        sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
+        content: dict[str, Any] = {
+            "lidar": self.lidar,
+            "cameras": {
+                name: _camera(name, lens, T.get(name), size_px, self.frames)
+                for name, lens in self.lenses.items()
+            },
+            "relative_poses": [_relative_pose(pair, *sigmas) for pair in self.pairs],
+        }
+        return checked_model(Rig, content, self.path)
+
+
+def read_rig_parts(
+    files: Iterable[Path | str],
+    *,
+    names: Mapping[Path | str, str] | None = None,
+    rename: Mapping[str, str] | None = None,
+    lidar_frame: str | None = None,
+    camera_frames: Mapping[str, str] | None = None,
+) -> RigParts:
+    """Read the files of a rig; arguments as of :func:`import_rig`.
+
+    Raises:
+        CalibrationError: if a file is malformed, or a lens is none of ours.
+    """
     parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
@@ -61,13 +131,8 @@ def import_rig(
     T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
-    cameras = {
-        n: _camera(n, lens, T_camera_lidar.get(n), size_px, tree) for n, lens in lenses.items()
-    }
-    content: dict[str, Any] = {"lidar": lidar_frame or "lidar", "cameras": cameras}
-    content["relative_poses"] = [_relative_pose(pair, *sigmas) for pair in pairs]
-    return checked_model(Rig, content, parts[0].path)
+    lidar = lidar_frame or "lidar"
+    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names)
 
 
 def _read_all(
@@ -164,7 +229,7 @@ def _camera(
     lens: CameraLens,
     T_camera_lidar: Array | None,
     size_px: tuple[int, int] | None,
-    tree: FrameTree,
+    frames: Sequence[str],
 ) -> dict[str, Any]:
     """The content of a rig file for a camera.
 
@@ -178,10 +243,11 @@ def _camera(
             camera=name,
         )
     if T_camera_lidar is None:
-        frames = f" (its frames are {', '.join(tree.names)})" if tree.names else ""
+        listed = f" (its frames are {', '.join(frames)})" if frames else ""
         raise RigError(
-            f"camera {name!r}: no file has its T_camera_lidar{frames}; name its "
-            "frame with --camera-frame, or add a URDF, a sensor kit or a rig file with a guess",
+            f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
+            "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
+            "describe its mounting to calibgraph guess",
             camera=name,
         )
     fx, fy, cx, cy = lens.intrinsics_px

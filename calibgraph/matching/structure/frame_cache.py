@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Frame
+from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.window_table import WindowTables
 from calibgraph.memory import keep
-from calibgraph.model.rig import Camera
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Once
 
 FileVersion = tuple[Path, int, int]
@@ -55,6 +58,19 @@ class FrameCache:
         image = self._images.get(key, lambda: keep(frame.load_gray(name, camera)))
         self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)
         return image
+
+
+def load_camera_frames(
+    cache: FrameCache, frames: Sequence[Frame], rig: Rig, cores: Executor
+) -> dict[str, CameraFrames]:
+    """The images and clouds of frames for a search, by camera."""
+    clouds = list(cores.map(cache.cloud, frames))
+    return {
+        name: CameraFrames(
+            list(cores.map(partial(cache.image, name=name, camera=camera), frames)), clouds, cores
+        )
+        for name, camera in rig.cameras.items()
+    }
 
 
 def _file_version(path: Path) -> FileVersion:

@@ -14,10 +14,9 @@ import numpy as np
 from calibgraph.io.dataset import Dataset, Frame, spread_out
 from calibgraph.matching.protocol import Stage1Source, Start
 from calibgraph.matching.structure.consensus import find_consensus
-from calibgraph.matching.structure.frame_cache import FrameCache
+from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.matching.structure.global_search import Located, locate_cameras
 from calibgraph.matching.structure.peaks import extract_correspondences
-from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.pose_search import CONFIDENT, SearchRange
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
@@ -116,7 +115,7 @@ class StructureMatcher:
         with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
             candidates = locate_cameras(
                 rig,
-                self._load_frames(frames, rig, cores),
+                load_camera_frames(self._cache, frames, rig, cores),
                 self.search_range,
                 seed=self.seed,
                 out_of_time=out_of_time,
@@ -152,18 +151,6 @@ class StructureMatcher:
     def release(self) -> None:
         """Drop the frames that are kept from round to round."""
         self._cache = FrameCache()
-
-    def _load_frames(
-        self, frames: Sequence[Frame], rig: Rig, cores: ThreadPoolExecutor
-    ) -> dict[str, CameraFrames]:
-        clouds = list(cores.map(self._cache.cloud, frames))
-        image = self._cache.image
-        return {
-            name: CameraFrames(
-                list(cores.map(partial(image, name=name, camera=camera), frames)), clouds, cores
-            )
-            for name, camera in rig.cameras.items()
-        }
 
     def _first_round(self, candidates: Mapping[str, Located]) -> int:
         confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())

@@ -94,28 +94,12 @@ class PoseSearch:
         """The best pose in all of the range; of those that are accepted, the first."""
         best = Candidate(body, -math.inf)
         for roll in ROLLS_RAD:
-            best = max(best, self._best_of(body, roll, effort), key=_by_z_score)
+            best = max(best, self.with_roll(body, roll, effort=effort), key=_by_z_score)
             if best.z_score >= least_z_score(tries) or self.out_of_time():
                 break
         return best
 
-    def seen_by(self, other: Body, body: Body) -> Body | None:
-        """The body where a located one sees it; None if they see nothing in common."""
-        for name in body:
-            for by, camera in other.items():
-                T = self._common.place(name, by, camera.T_camera_lidar)
-                if T is not None:
-                    return place_member(body, name, T)
-        return None
-
-    def as_in_guess(self, other: Body, body: Body) -> Body:
-        """The body at its relative pose in the guess to a located one."""
-        by, camera = next(iter(other.items()))
-        old = lead(body).T_camera_lidar
-        relative = relative_transform(old, self.guess[by])
-        return place(body, relative @ camera.T_camera_lidar)
-
-    def _best_of(self, body: Body, roll_rad: float, effort: int) -> Candidate:
+    def with_roll(self, body: Body, roll_rad: float, *, effort: int) -> Candidate:
         """The best pose all over the range about a body's guess, with maps for one roll.
 
         All candidates of the box search are approached, and the best are refined.
@@ -136,6 +120,22 @@ class PoseSearch:
         survivors = near[: 1 if self.out_of_time() else effort * SURVIVORS]
         refined = [refine(self._frames, one.body) for one in survivors]
         return self._settle(max(refined, key=_by_z_score, default=nothing))
+
+    def seen_by(self, other: Body, body: Body) -> Body | None:
+        """The body where a located one sees it; None if they see nothing in common."""
+        for name in body:
+            for by, camera in other.items():
+                T = self._common.place(name, by, camera.T_camera_lidar)
+                if T is not None:
+                    return place_member(body, name, T)
+        return None
+
+    def as_in_guess(self, other: Body, body: Body) -> Body:
+        """The body at its relative pose in the guess to a located one."""
+        by, camera = next(iter(other.items()))
+        old = lead(body).T_camera_lidar
+        relative = relative_transform(old, self.guess[by])
+        return place(body, relative @ camera.T_camera_lidar)
 
     def _settle(self, candidate: Candidate) -> Candidate:
         """Refine a candidate further, and look around it for a better one.

@@ -1,0 +1,95 @@
+"""The command guess: a rig to begin with, from words, files, or nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.exchange import (
+    CameraFrameOption,
+    FilesArgument,
+    LidarFrameOption,
+    RenameOption,
+    SizeOption,
+    parse_file,
+    parse_names,
+    parse_size,
+)
+from calibgraph.cli.options import JsonOption, SeedOption
+from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+
+
+def guess(
+    files: FilesArgument,
+    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
+    mount: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=WORDS",
+            help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
+            "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
+            "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
+        ),
+    ] = None,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Images and clouds: cameras without words or an extrinsic in a file are searched "
+            "for over all headings. Slower, and less sure. May be repeated.",
+        ),
+    ] = None,
+    search: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Search for this camera although a file has an extrinsic."
+        ),
+    ] = None,
+    forward: Annotated[
+        str,
+        typer.Option(
+            metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
+        ),
+    ] = "+x",
+    rename: RenameOption = None,
+    lidar_frame: LidarFrameOption = None,
+    camera_frame: CameraFrameOption = None,
+    size: SizeOption = None,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a rig to begin a calibration with, by words, a URDF or a search, and how good it is."""
+    from calibgraph.guessing.guess import guess_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
+    from calibgraph.outputs import yaml_mark
+
+    named = [parse_file(text) for text in files]
+    with checked_arguments(), progress_bar("reading") as progress:
+        parts = read_rig_parts(
+            [path for _, path in named],
+            names={path: name for name, path in named if name},
+            rename=parse_names("--rename", rename),
+            lidar_frame=lidar_frame,
+            camera_frames=parse_names("--camera-frame", camera_frame),
+        )
+        found = guess_rig(
+            parts,
+            mountings=parse_names("--mount", mount),
+            data=data or None,
+            search=search or (),
+            forward=forward,
+            size_px=None if size is None else parse_size(size),
+            seed=seed,
+            progress=progress,
+        )
+    found.save(out, first_line=yaml_mark("guess"))
+    if as_json:
+        from calibgraph.report.as_json import print_json
+
+        print_json(found.to_mapping())
+    for line in found.lines:
+        print_plain(terminal(), line)
+    print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")

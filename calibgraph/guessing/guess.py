@@ -1,0 +1,200 @@
+"""A rig with a guess per camera: by words, by a file, or by a search over all headings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError, RigError
+from calibgraph.guessing.heading_search import FoundCamera, search_headings
+from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
+from calibgraph.io.dataset import load_dataset
+from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
+from calibgraph.io.formats.words import describe_rig
+from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
+from calibgraph.model.rig import Rig
+from calibgraph.progress import Progress, no_progress
+
+Array = NDArray[np.float64]
+Source = Literal["words", "file", "search"]
+
+FILE_DEG, FILE_M = 3.0, 0.05
+"""Of extrinsics in files, as a URDF's: drawings, and how exactly cameras are put up; chosen."""
+FOUND_DEG, FOUND_M = 1.0, 0.15
+"""Of cameras that the search found: they are nearer in docs/accuracy.md, where one place's frames
+err together."""
+SIGMAS = 2.0  # of the guess, which the search of a calibration has to reach
+
+
+@dataclass(frozen=True)
+class CameraGuess:
+    """Where a guess is from, and how good it is.
+
+    Attributes:
+        source: words, a file, or the search over all headings.
+        rotation_sigma_deg: one standard deviation, of the worst axis.
+        translation_sigma_m: the same.
+        z_score: of the search; None of the others.
+        text: how that is, in words.
+    """
+
+    source: Source
+    rotation_sigma_deg: float
+    translation_sigma_m: float
+    text: str
+    z_score: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RigGuess:
+    """A rig to begin a calibration with.
+
+    Attributes:
+        rig: with the guess as its extrinsics.
+        cameras: how good each is.
+    """
+
+    rig: Rig
+    cameras: Mapping[str, CameraGuess] = field(default_factory=dict)
+
+    @property
+    def search_deg(self) -> float:
+        """The range of rotation that a calibration should search, per axis [deg]."""
+        widest = max(camera.rotation_sigma_deg for camera in self.cameras.values())
+        return float(min(MAX_SEARCH_DEG, math.ceil(SIGMAS * widest)))
+
+    @property
+    def search_m(self) -> float:
+        """The same of the translation [m]."""
+        widest = max(camera.translation_sigma_m for camera in self.cameras.values())
+        return min(MAX_SEARCH_M, math.ceil(10 * SIGMAS * widest) / 10)
+
+    @property
+    def lines(self) -> list[str]:
+        """A line per camera: where it is by the guess, from what, how good; then what to do."""
+        where = describe_rig(self.rig)
+        return [
+            *(f"{sentence}; {guess.text}; 1 sigma: {guess.rotation_sigma_deg:.2g} deg, "
+              f"{guess.translation_sigma_m:.2g} m"
+              for sentence, guess in zip(where, self.cameras.values(), strict=False)),
+            f"calibrate with --search-deg {self.search_deg:g} --search-m {self.search_m:g}",
+        ]  # fmt: skip
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As plain values, without the rig."""
+        cameras = {name: vars(guess) for name, guess in self.cameras.items()}
+        return {"cameras": cameras, "search_deg": self.search_deg, "search_m": self.search_m}
+
+    def save(self, path: Path | str, *, first_line: str = "") -> None:
+        """Write the rig file, with the lines as comments."""
+        comments = "\n".join(f"# {line}" for line in self.lines)
+        self.rig.save(path, first_line=f"{first_line}\n{comments}" if first_line else comments)
+
+
+def guess_rig(
+    files: RigParts | Sequence[Path | str],
+    *,
+    mountings: Mapping[str, str] | None = None,
+    data: Path | str | Sequence[Path | str] | None = None,
+    search: Sequence[str] = (),
+    forward: str = "+x",
+    size_px: tuple[int, int] | None = None,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> RigGuess:
+    """Guess the extrinsics of a rig: from words first, then from files, else by a search.
+
+    Args:
+        files: with the lenses, and extrinsics as far as they are known, as of :func:`import_rig`;
+            or what :func:`calibgraph.io.formats.rig_import.read_rig_parts` returns.
+        mountings: per camera, words such as "rear-left 60 deg right, 0.4 m ahead of the LiDAR".
+        data: images and clouds, in which cameras of which nothing is known are searched for over
+            all headings; None for no search.
+        search: cameras to search for although a file has an extrinsic.
+        forward: the axis of the LiDAR frame that points ahead: +x, -x, +y or -y; z is up.
+        size_px: width and height of images whose file has none.
+        seed: of the search.
+        progress: called as the search goes on.
+
+    Raises:
+        ValueError: if ``forward`` is no axis.
+        CalibrationError: if words are not understood, or a camera has no guess or is not found.
+    """
+    axis = check_forward(forward)
+    parts = files if isinstance(files, RigParts) else read_rig_parts(files)
+    words = {name: parse_mounting(text, name) for name, text in (mountings or {}).items()}
+    _require_cameras(parts, words, search)
+    unknown = [name for name in parts.lenses if _is_unknown(name, parts, words, search)]
+    if unknown and data is None:
+        raise _nothing_known(unknown[0])
+    level = {name: Mounting(0.0).T_camera_lidar(axis) for name in unknown}
+    said = {name: mounting.T_camera_lidar(axis) for name, mounting in words.items()}
+    rig = parts.to_rig({**said, **level}, size_px=size_px)
+    found: dict[str, FoundCamera] = {}
+    if unknown and data is not None:
+        dataset = load_dataset(data, rig)
+        found = search_headings(dataset, rig, unknown, forward=axis, seed=seed, progress=progress)
+        _require_found(found)
+    rig = rig.moved_to({name: one.T_camera_lidar for name, one in found.items()})
+    return RigGuess(rig, {name: _describe(name, words, found) for name in rig.cameras})
+
+
+def _is_unknown(
+    name: str, parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]
+) -> bool:
+    return name in search or (name not in words and name not in parts.T_camera_lidar)
+
+
+def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]) -> None:
+    for name in (*words, *search):
+        if name not in parts.lenses:
+            raise RigError(
+                f"no camera {name!r}; the files have {', '.join(parts.lenses)}", camera=name
+            )
+    for name in search:
+        if name in words:
+            raise RigError(
+                f"camera {name!r} is both described and to be searched for; choose one", camera=name
+            )
+
+
+def _nothing_known(name: str) -> RigError:
+    return RigError(
+        f"camera {name!r}: nothing says where it is; describe it with --mount {name}=WORDS "
+        f"({GRAMMAR}), add a URDF or a sensor kit, or give --data to search over all headings",
+        camera=name,
+    )
+
+
+def _require_found(found: Mapping[str, FoundCamera]) -> None:
+    missed = {name: one for name, one in found.items() if not one.accepted}
+    if missed:
+        scores = ", ".join(f"{n!r} ({one.z_score:.1f})" for n, one in missed.items())
+        least = min(one.needed for one in missed.values())
+        raise CalibrationError(
+            f"not found at any heading: {scores}; a z-score of {least:.1f} is needed; describe "
+            "them with --mount NAME=WORDS, or give frames of other places"
+        )
+
+
+def _describe(
+    name: str, words: Mapping[str, Mounting], found: Mapping[str, FoundCamera]
+) -> CameraGuess:
+    if name in words:
+        mounting = words[name]
+        return CameraGuess(
+            "words", mounting.rotation_sigma_deg, mounting.translation_sigma_m, "by words"
+        )
+    if name not in found:
+        return CameraGuess("file", FILE_DEG, FILE_M, "by a file")
+    one = found[name]
+    text = f"found with a z-score of {one.z_score:.1f}" + (
+        f", as {one.seen_by} sees it" if one.seen_by else ""
+    )
+    return CameraGuess("search", FOUND_DEG, FOUND_M, text, one.z_score)

@@ -1,0 +1,158 @@
+"""A rig from words, files, or the search over all headings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import CalibrationError, RigError, export_calibration, guess_rig, load_rig
+from calibgraph.guessing import heading_search
+from calibgraph.guessing.guess import FILE_DEG, FOUND_DEG
+from calibgraph.guessing.mounting import Mounting
+from calibgraph.matching.structure.bodies import Body, lead, place
+from calibgraph.matching.structure.pose_refinement import Candidate
+from calibgraph.matching.structure.pose_search import PoseSearch
+from calibgraph.model.geometry import pose_difference
+from tests.cli.conftest import error_line
+from tests.conftest import SAMPLE, Call
+from tests.io.formats.test_import import KALIBR, URDF, write
+
+TRUTH = load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture
+def lenses(tmp_path: Path) -> Path:
+    """The lenses of the sample, with no extrinsics."""
+    export_calibration(TRUTH, tmp_path / "lenses.yaml", "opencv")
+    text = (tmp_path / "lenses.yaml").read_text().replace("T_camera_lidar:", "other:")
+    (tmp_path / "lenses.yaml").write_text(text)
+    return tmp_path / "lenses.yaml"
+
+
+def near_truth(search: PoseSearch, body: Body, roll_rad: float, *, effort: int) -> Candidate:
+    """Finds the truth from a heading nearby, as a search, and else nothing."""
+    name = next(iter(body))
+    degrees, _ = pose_difference(lead(body).T_camera_lidar, TRUTH.T_camera_lidar[name])
+    if degrees < 25.0:
+        return Candidate(place(body, TRUTH.T_camera_lidar[name]), 60.0)
+    return Candidate(body, 5.0)
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PoseSearch, "with_roll", near_truth)
+    monkeypatch.setattr(PoseSearch, "seen_by", lambda *_: None)
+
+
+MOUNTED = {
+    "front_left": "front, 30 cm left",
+    "front_right": "front, 30 cm right, 0.4 m ahead, 0.3 m below",
+    "left": "left, 0.3 m below",
+}
+
+
+def test_words_are_near_enough_for_the_search_that_is_proposed(lenses: Path) -> None:
+    found = guess_rig([lenses], mountings=MOUNTED)
+    for name, T in TRUTH.T_camera_lidar.items():
+        degrees, centimetres = pose_difference(found.rig.T_camera_lidar[name], T)
+        assert degrees < found.search_deg
+        assert centimetres < 100 * found.search_m
+    assert (found.search_deg, found.search_m) == (20.0, 1.8)
+    assert found.cameras["left"].source == "words"
+
+
+def test_frames_of_a_urdf_are_surer_than_words(tmp_path: Path) -> None:
+    rig = guess_rig(write(tmp_path, camchain__yaml=KALIBR.replace("T_cam_lidar", "T_cam_imu"),
+                          car__urdf=URDF.replace("front", "cam0")))  # fmt: skip
+    assert {name: guess.source for name, guess in rig.cameras.items()} == {
+        "cam0": "file", "cam1": "file",
+    }  # fmt: skip
+    assert rig.search_deg == 2 * FILE_DEG
+    assert rig.search_m == 0.1
+
+
+def test_words_stand_in_for_a_file(tmp_path: Path) -> None:
+    files = write(tmp_path, camchain__yaml=KALIBR)
+    found = guess_rig(files, mountings={"cam0": "rear, 1 m above"})
+    np.testing.assert_allclose(
+        found.rig.T_camera_lidar["cam0"], Mounting(180.0, place_m=(0, 0, 1)).T_camera_lidar(),
+        atol=1e-12,
+    )  # fmt: skip
+    assert found.cameras["cam1"].source == "file"
+
+
+@pytest.mark.usefixtures("made_up")
+def test_a_camera_with_nothing_is_found_from_some_heading(lenses: Path) -> None:
+    mountings = {name: MOUNTED[name] for name in ("front_left", "front_right")}
+    done: list[tuple[int, int]] = []
+    found = guess_rig(
+        [lenses], mountings=mountings, data=SAMPLE, progress=lambda _, *n: done.append(n)
+    )
+    np.testing.assert_allclose(found.rig.T_camera_lidar["left"], TRUTH.T_camera_lidar["left"])
+    assert found.cameras["left"].source == "search"
+    assert found.cameras["left"].z_score == 60.0
+    assert found.cameras["left"].rotation_sigma_deg == FOUND_DEG
+    assert done == [(k, 12) for k in range(12)]
+    np.testing.assert_allclose(
+        found.rig.T_camera_lidar["front_left"][2, :3], (1, 0, 0), atol=1e-12
+    )  # by its words
+
+
+@pytest.mark.usefixtures("made_up")
+def test_a_camera_that_is_not_found_is_no_guess(
+    lenses: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(heading_search, "HEADINGS_DEG", (150, 180, 210))
+    with pytest.raises(CalibrationError, match=r"not found at any heading: 'left' \(5\.0\)"):
+        guess_rig([lenses], mountings={n: MOUNTED[n] for n in MOUNTED if n != "left"}, data=SAMPLE)
+
+
+def test_a_camera_of_which_nothing_is_known_needs_images(lenses: Path) -> None:
+    with pytest.raises(RigError, match="camera 'left': nothing says where it is; describe it"):
+        guess_rig([lenses], mountings={"front_left": "front", "front_right": "front"})
+
+
+def test_cameras_that_are_not_there_are_refused(lenses: Path) -> None:
+    with pytest.raises(RigError, match="no camera 'rear'; the files have front_left"):
+        guess_rig([lenses], mountings={"rear": "rear"})
+    with pytest.raises(RigError, match="both described and to be searched for"):
+        guess_rig([lenses], mountings=MOUNTED, search=["left"], data=SAMPLE)
+
+
+def test_the_command_writes_a_rig_that_states_how_good_it_is(
+    call: Call, lenses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "rig.yaml"
+    mounts = [part for name, text in MOUNTED.items() for part in ("--mount", f"{name}={text}")]
+    code, stdout, err = call("guess", lenses, *mounts, "--out", out, "--json")
+    assert code == 0
+    assert json.loads(stdout)["cameras"]["left"]["source"] == "words"
+    assert json.loads(stdout)["search_deg"] == 20.0
+    text = out.read_text()
+    assert text.startswith("# Written by calibgraph guess\n# front_left looks along LiDAR +x")
+    line = (
+        "left looks along LiDAR +y, sits 0.30 m below the LiDAR; by words; 1 sigma: 10 deg, 0.8 m"
+    )
+    assert f"# {line}" in text and line in err
+    assert "# calibrate with --search-deg 20 --search-m 1.8" in text
+    assert load_rig(out).cameras.keys() == TRUTH.cameras.keys()
+    assert call("guess", lenses, *mounts, "--out", out)[0] == 0  # its own file may be replaced
+    said = error_line(*call("guess", lenses, "--mount", "left=lft", "--out", out))
+    assert "camera 'left': 'lft' has 'lft', which is not understood" in said
+    error_line(*call("guess", lenses, "--mount", "left", "--out", out))
+    error_line(*call("guess", lenses, *mounts, "--forward", "up", "--out", out))
+    error_line(*call("guess", lenses, *mounts, "--out", lenses))
+
+
+@pytest.mark.slow
+def test_the_sample_is_calibrated_from_lenses_and_images_alone(lenses: Path) -> None:
+    """Of nothing but lenses, every camera is found within what is stated of it."""
+    found = guess_rig([lenses], data=SAMPLE)
+    for name, T in TRUTH.T_camera_lidar.items():
+        degrees, centimetres = pose_difference(found.rig.T_camera_lidar[name], T)
+        guess = found.cameras[name]
+        assert degrees < 3 * guess.rotation_sigma_deg
+        assert centimetres < 300 * guess.translation_sigma_m
