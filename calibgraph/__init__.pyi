@@ -71,3 +71,5 @@ from .tracking import Event as Event
 from .tracking import IncrementalCalibrator as IncrementalCalibrator
 from .tracking import Update as Update
 from .tracking import warm_up_tracker as warm_up_tracker
+from .view.mcap_file import write_mcap as write_mcap
+from .view.rerun_file import write_rerun as write_rerun

@@ -30,6 +30,7 @@ from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
+from calibgraph.cli.view import view
 
 if TYPE_CHECKING:
     from calibgraph.outputs import Output
@@ -76,6 +77,7 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     match: outputs.table,
     solve: outputs.result,
     report: outputs.page,
+    view: outputs.recordings,
     evaluate: outputs.nothing,
     perturb: outputs.guess,
     bag: outputs.rig_of_bag,

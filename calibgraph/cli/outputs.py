@@ -14,6 +14,8 @@ Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
 
 TABLE_SUFFIXES = (".parquet", ".csv")
+WRITTEN = ("out", "rerun", "mcap")
+"""The options that name what a command writes."""
 
 
 def result(given: Given) -> list[Output]:
@@ -38,6 +40,15 @@ def page(given: Given) -> list[Output]:
 
     folder = given["result"] if given["result"].is_dir() else given["result"].parent
     return [Output(given["out"] or folder / REPORT_FILE, "report", is_report, (".html", ".htm"))]
+
+
+def recordings(given: Given) -> list[Output]:
+    """A result for viewers."""
+    from calibgraph.view.mcap_file import output_of_mcap
+    from calibgraph.view.rerun_file import output_of_rerun
+
+    makers = {"rerun": output_of_rerun, "mcap": output_of_mcap}
+    return [make(given[name]) for name, make in makers.items() if given[name] is not None]
 
 
 def fleet_page(given: Given) -> list[Output]:
@@ -133,7 +144,8 @@ def keep_files(
     """A command that refuses, before any work, to replace what it reads or did not write.
 
     Args:
-        command: a function for typer. What it reads is every path among its arguments but ``out``.
+        command: a function for typer. What it reads is every path among its arguments but those in
+            ``WRITTEN``.
         outputs: the files that it writes with given arguments.
     """
 
@@ -141,7 +153,7 @@ def keep_files(
     def run(**given: Any) -> None:
         from calibgraph.outputs import require_free
 
-        require_free(outputs(given), [path for name in given if name != "out"
+        require_free(outputs(given), [path for name in given if name not in WRITTEN
                                       for path in _files_at(given[name])])  # fmt: skip
         command(**given)
 

@@ -1,0 +1,1 @@
+"""A result for viewers: Rerun recordings, and MCAP files for Foxglove."""

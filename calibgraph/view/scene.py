@@ -1,0 +1,133 @@
+"""What viewers show of a frame: the cloud, the images, and its points on them, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError
+from calibgraph.io.clouds import load_cloud
+from calibgraph.io.images import load_image
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.rig import Camera
+from calibgraph.report.point_overlay import depth_colours
+
+Array = NDArray[np.float64]
+Colours = NDArray[np.uint8]
+
+SECONDS_PER_FRAME = 1.0
+"""Results have no stamps: frames are shown one after another."""
+_MAX_POINTS = 20_000  # on an image: viewers draw each
+_JPEG_QUALITY = 90
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Points of a cloud on an image.
+
+    Attributes:
+        pixels_px: (n, 2) column and row; (0, 0) is the centre of the top-left pixel.
+        colours: (n, 3) RGB by distance.
+    """
+
+    pixels_px: Array
+    colours: Colours
+
+
+@dataclass(frozen=True, eq=False)
+class ViewImage:
+    """One camera in one frame.
+
+    Attributes:
+        jpeg: the image as recorded.
+        before: the points by the guess.
+        after: the points by the result.
+    """
+
+    jpeg: bytes
+    before: Projected
+    after: Projected
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFrame:
+    """One frame.
+
+    Attributes:
+        number: of the frame in its dataset.
+        name: of the frame.
+        time_s: when it is shown.
+        points_lidar_m: (n, 3) float32 in the LiDAR frame.
+        colours: (n, 3) RGB by distance from the LiDAR.
+        images: by camera.
+    """
+
+    number: int
+    name: str
+    time_s: float
+    points_lidar_m: NDArray[np.float32]
+    colours: Colours
+    images: Mapping[str, ViewImage]
+
+
+def read_frames(result: Calibration) -> Iterator[ViewFrame]:
+    """The frames of a result, one after another, from its clouds and images.
+
+    Raises:
+        CalibrationError: if the result names no frames, or a file is missing or damaged.
+    """
+    if not result.frames:
+        raise CalibrationError(
+            "the result names no images and clouds, as that of a table; give those that the table "
+            "was made from with --dataset"
+        )
+    for number, entry in enumerate(result.frames):
+        points = load_cloud(Path(entry["cloud"]))[:, :3]
+        points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], np.float32)
+        yield ViewFrame(
+            number=entry["frame"],
+            name=entry["name"],
+            time_s=number * SECONDS_PER_FRAME,
+            points_lidar_m=points,
+            colours=_by_distance(points),
+            images={
+                name: _view_image(Path(path), points, name, result)
+                for name, path in entry["images"].items()
+                if name in result.rig.cameras
+            },
+        )
+
+
+def _view_image(
+    path: Path, points: NDArray[np.float32], name: str, result: Calibration
+) -> ViewImage:
+    camera = result.rig.cameras[name]
+    image = load_image(path, camera)
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    before = project_cloud(result.initial_rig.cameras[name], points)
+    return ViewImage(data.tobytes(), before, project_cloud(camera, points))
+
+
+def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> Projected:
+    """The points of a cloud (n, 3) on a camera's image, an even choice of very many."""
+    T = camera.T_camera_lidar
+    points = points_lidar_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    pixels, valid = camera.lens.project(points)
+    seen = np.flatnonzero(valid & camera.in_image(pixels))
+    seen = seen[:: max(1, -(-len(seen) // _MAX_POINTS))]
+    return Projected(pixels[seen], _by_distance(points[seen]))
+
+
+def _by_distance(points: NDArray[np.floating]) -> Colours:
+    return np.ascontiguousarray(depth_colours(np.linalg.norm(points, axis=1))[:, ::-1])
+
+
+def state_verdict(result: Calibration) -> str:
+    """The verdict of a result in words, a line per reason."""
+    verdict = result.verdict
+    return "\n".join([f"{verdict.status}", *verdict.reasons])

@@ -1,0 +1,235 @@
+"""Recordings for Rerun and Foxglove, read back by the formats' own readers."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibgraph import (
+    Calibration,
+    CalibrationError,
+    load_dataset,
+    load_rig,
+    perturb,
+    simulate_correspondences,
+    solve,
+)
+from calibgraph.model.geometry import invert
+from calibgraph.view.mcap_file import write_mcap
+from calibgraph.view.rerun_file import write_rerun
+from calibgraph.view.scene import project_cloud
+from tests.cli.conftest import error_line
+from tests.conftest import SAMPLE, Call
+
+pytest.importorskip("rerun")
+pytest.importorskip("mcap_protobuf")
+
+FRAMES = 2
+CAMERA = "left"
+Entities = Mapping[tuple[str, int | None], Mapping[str, Any]]
+"""The components of each entity at each frame; frame None: at all times."""
+
+
+@pytest.fixture(scope="module")
+def result() -> Calibration:
+    """A result of the sample's truth, with two of its frames."""
+    truth = load_rig(SAMPLE / "reference.yaml")
+    table = simulate_correspondences(truth, frames=5, matches=100)
+    solved = solve(perturb(truth, rotation_deg=2, translation_m=0.2, seed=1), table)
+    frames = load_dataset(SAMPLE, truth).frames[:FRAMES]
+    return replace(solved, frames=tuple(frame.entry() for frame in frames))
+
+
+def read_rerun(path: Path) -> Entities:
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(path)
+    assert [entry.application_id for entry in reader.recordings()] == ["calibgraph-view"]
+    found: dict[tuple[str, int | None], dict[str, Any]] = {}
+    for chunk in reader.stream().to_chunks():
+        for row in chunk.to_record_batch().to_pylist():
+            place = found.setdefault((chunk.entity_path, row.get("frame")), {})
+            place.update({name: value for name, value in row.items() if value is not None})
+    return found
+
+
+def read_mcap(path: Path) -> list[tuple[str, str, int, Any]]:
+    """Topic, schema, time [ns] and message."""
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [
+            (channel.topic, schema.name, message.log_time, decoded)
+            for schema, channel, message, decoded in reader.iter_decoded_messages()
+            if schema is not None
+        ]
+
+
+@pytest.fixture(scope="module")
+def entities(result: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Entities:
+    return read_rerun(write_rerun(result, tmp_path_factory.mktemp("rerun") / "view.rrd"))
+
+
+@pytest.fixture(scope="module")
+def messages(
+    result: Calibration, tmp_path_factory: pytest.TempPathFactory
+) -> list[tuple[str, str, int, Any]]:
+    return read_mcap(write_mcap(result, tmp_path_factory.mktemp("mcap") / "view.mcap"))
+
+
+def cloud_of(result: Calibration, number: int) -> np.ndarray:
+    cloud = np.load(result.frames[number]["cloud"])[:, :3]
+    return cloud[np.isfinite(cloud).all(axis=1)]
+
+
+def test_rerun_has_the_cloud_and_image_of_every_frame(
+    entities: Entities, result: Calibration
+) -> None:
+    for number in range(FRAMES):
+        points = np.array(entities["/lidar", number]["Points3D:positions"])
+        np.testing.assert_array_equal(points, cloud_of(result, number))
+        (blob,) = entities[f"/images/{CAMERA}", number]["EncodedImage:blob"]
+        image = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_COLOR)
+        recorded = cv2.imread(result.frames[number]["images"][CAMERA])
+        assert np.abs(image.astype(int) - recorded).mean() < 3  # encoded once more
+    assert {frame for entity, frame in entities if entity == "/lidar"} == {None, 0, 1}
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_rerun_draws_points_where_the_lens_projects_them(
+    when: str, entities: Entities, result: Calibration
+) -> None:
+    rig = result.initial_rig if when == "before" else result.rig
+    expected = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1))
+    pixels = np.array(entities[f"/images/{CAMERA}/{when}", 1]["Points2D:positions"])
+    # Rerun counts pixels from the corner of the first one; float32.
+    np.testing.assert_allclose(pixels, expected.pixels_px + 0.5, atol=1e-4)
+    assert len(pixels) > 1000
+    (T,) = entities[f"/lidar/{when}/{CAMERA}", None]["Transform3D:translation"]
+    np.testing.assert_allclose(T, invert(rig.T_camera_lidar[CAMERA])[:3, 3], atol=1e-6)
+    (R,) = entities[f"/lidar/{when}/{CAMERA}", None]["Transform3D:mat3x3"]
+    columns = np.reshape(R, (3, 3)).T  # stored column by column
+    np.testing.assert_allclose(columns, invert(rig.T_camera_lidar[CAMERA])[:3, :3], atol=1e-6)
+
+
+def test_rerun_states_the_verdict(entities: Entities, result: Calibration) -> None:
+    (text,) = entities["/verdict", None]["TextDocument:text"]
+    assert text.startswith(result.verdict.status)
+
+
+def test_mcap_has_foxglove_s_types_and_a_second_per_frame(
+    messages: list[tuple[str, str, int, Any]],
+) -> None:
+    assert {(topic, schema) for topic, schema, _, _ in messages} == {
+        ("/tf", "foxglove.FrameTransforms"),
+        ("/lidar", "foxglove.PointCloud"),
+        ("/verdict", "foxglove.Log"),
+        *((f"/{n}/image", "foxglove.CompressedImage") for n in load_rig(SAMPLE).cameras),
+        *((f"/{n}/calibration", "foxglove.CameraCalibration") for n in load_rig(SAMPLE).cameras),
+        *((f"/{n}/before", "foxglove.ImageAnnotations") for n in load_rig(SAMPLE).cameras),
+        *((f"/{n}/after", "foxglove.ImageAnnotations") for n in load_rig(SAMPLE).cameras),
+    }
+    assert {stamp for _, _, stamp, _ in messages} == {0, 10**9}
+    for topic, _, stamp, message in messages:
+        if topic not in ("/tf", f"/{CAMERA}/before", f"/{CAMERA}/after"):
+            assert not hasattr(message, "timestamp") or message.timestamp.ToNanoseconds() == stamp
+
+
+def test_mcap_has_cloud_image_lens_and_points(
+    messages: list[tuple[str, str, int, Any]], result: Calibration
+) -> None:
+    second = {topic: message for topic, _, stamp, message in messages if stamp}
+    cloud = second["/lidar"]
+    offsets = {field.name: field.offset for field in cloud.fields}
+    packed = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+    x = packed[:, offsets["x"] : offsets["x"] + 4].copy().view("<f4")[:, 0]
+    np.testing.assert_array_equal(x, cloud_of(result, 1)[:, 0])
+    camera = result.rig.cameras[CAMERA]
+    lens = second[f"/{CAMERA}/calibration"]
+    assert (lens.width, lens.height, lens.distortion_model) == (640, 360, "plumb_bob")
+    np.testing.assert_array_equal(np.reshape(lens.K, (3, 3)), camera.matrix_px)
+    assert list(lens.D) == list(camera.distortion)
+    image = cv2.imdecode(np.frombuffer(second[f"/{CAMERA}/image"].data, np.uint8), 1)
+    assert image.shape == (360, 640, 3)
+    for when, rig in (("before", result.initial_rig), ("after", result.rig)):
+        (points,) = second[f"/{CAMERA}/{when}"].points
+        expected = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1)).pixels_px
+        np.testing.assert_allclose([(p.x, p.y) for p in points.points], expected, atol=1e-9)
+        assert len(points.outline_colors) == len(expected) > 1000
+        assert points.type == points.POINTS
+
+
+def test_mcap_places_the_optical_frames_in_the_lidar_s(
+    messages: list[tuple[str, str, int, Any]], result: Calibration
+) -> None:
+    (transforms,) = (m for topic, _, stamp, m in messages if topic == "/tf" and stamp)
+    found = {}
+    for one in transforms.transforms:
+        assert one.parent_frame_id == "lidar"
+        T = np.eye(4)
+        q = one.rotation
+        T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        T[:3, 3] = one.translation.x, one.translation.y, one.translation.z
+        found[one.child_frame_id] = T
+    for name in result.rig.cameras:
+        after, before = found[f"{name}_optical_frame"], found[f"{name}_before"]
+        np.testing.assert_allclose(after, invert(result.T_camera_lidar[name]), atol=1e-12)
+        guess = result.initial_rig.T_camera_lidar[name]
+        np.testing.assert_allclose(before, invert(guess), atol=1e-12)
+
+
+def test_a_result_without_frames_has_nothing_to_show(result: Calibration, tmp_path: Path) -> None:
+    for write in (write_rerun, write_mcap):
+        with pytest.raises(CalibrationError, match="names no images and clouds"):
+            write(replace(result, frames=()), tmp_path / "file")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("write", "package"), [(write_rerun, "rerun"), (write_mcap, "mcap_protobuf")]
+)
+def test_a_missing_package_is_named(
+    write: Callable[..., Path],
+    package: str,
+    result: Calibration,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real = builtins.__import__
+
+    def missing(name: str, *args: Any, **options: Any) -> Any:
+        if name.split(".", maxsplit=1)[0] == package:
+            raise ImportError(name)
+        return real(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[view\]'"):
+        write(result, tmp_path / "file")
+
+
+def test_the_command_writes_both_and_replaces_only_its_own(
+    call: Call, result: Calibration, tmp_path: Path
+) -> None:
+    result.save(tmp_path / "result")
+    rrd, mcap = tmp_path / "a.rrd", tmp_path / "a.mcap"
+    for _ in range(2):
+        code, _, err = call("view", tmp_path / "result", "--rerun", rrd, "--mcap", mcap)
+        assert code == 0
+        assert f"{rrd}: written; the verdict is {result.verdict.status}\n" in err
+    assert len(read_mcap(mcap)) == FRAMES * (3 + 4 * len(result.rig.cameras))
+    rrd.write_text("mine")
+    said = error_line(*call("view", tmp_path / "result", "--rerun", rrd))
+    assert "was not written by calibgraph view" in said
+    assert "nothing to write; give --rerun" in error_line(*call("view", tmp_path / "result"))
+    said = error_line(*call("view", tmp_path / "result", "--mcap", tmp_path / "a.bag"))
+    assert "must end in .mcap" in said
