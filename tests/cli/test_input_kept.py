@@ -147,7 +147,8 @@ def test_an_argument_longer_than_a_name_is_no_file(tmp_path: Path, call: Call) -
 
 def test_every_command_with_an_output_declares_it() -> None:
     for command, written in {**COMMANDS, paper: outputs.benchmark}.items():
-        has_output = "out" in inspect.signature(command).parameters
+        options = inspect.signature(command).parameters.keys()
+        has_output = bool(options & set(outputs.WRITTEN))
         refuses_itself = command in (simulate, fleet)  # simulate any data, fleet what is no row
         assert (written is not outputs.nothing) == (has_output and not refuses_itself)
 
