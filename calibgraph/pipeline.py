@@ -11,10 +11,11 @@ starts from. With ``cmrnext`` and with tables of correspondences, Stage 1 is the
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.io.dataset import Dataset, hash_source
+from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
@@ -28,6 +29,8 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
 from calibgraph.trust.observability import weaknesses
+
+_log = logging.getLogger(__name__)
 
 
 def calibrate(
@@ -125,7 +128,7 @@ def to_calibration(evidence: Evidence, checks: Checks) -> Calibration:
         checks: per camera, all of them.
     """
     solution, cameras = evidence.solution, evidence.cameras
-    return Calibration(
+    result = Calibration(
         rig=solution.solved_rig,
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
@@ -143,11 +146,10 @@ def to_calibration(evidence: Evidence, checks: Checks) -> Calibration:
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
     )
+    _log.info("%s %s", result.verdict.status, "; ".join(result.verdict.reasons))
+    return result
 
 
 def hash_inputs(dataset: Dataset) -> dict[str, str]:
     """SHA-256 of every cloud and image, by path."""
-    files = [
-        path for frame in dataset.frames for path in (frame.cloud_path, *frame.image_paths.values())
-    ]
-    return {str(path): hash_source(path) for path in files}
+    return {path: digest for frame in dataset.frames for path, digest in frame.hashes().items()}

@@ -6,6 +6,7 @@ coarse and is run again from every better estimate.
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -37,6 +38,8 @@ from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str
+
+_log = logging.getLogger(__name__)
 
 _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
@@ -77,6 +80,7 @@ def match_in_rounds(
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
+        _log.info("round %d: %s", index, _in_words(rounds[-1]))
         estimate = solution.solved_rig
         if out_of_time():
             break
@@ -116,7 +120,9 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
-    return (data if most_frames is None else data.spread_out(most_frames)), guess
+    data = data if most_frames is None else data.spread_out(most_frames)
+    _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
+    return data, guess
 
 
 def find_same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
@@ -179,6 +185,14 @@ def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSum
             "moved_cm": 100.0 * float(np.linalg.norm(delta[:3, 3])),
         }
     return cameras
+
+
+def _in_words(summary: RoundSummary) -> str:
+    return "; ".join(
+        f"{name} {each['matches']:.0f} matches, moved {each['moved_deg']:.2f} deg, "
+        f"{each['moved_cm']:.1f} cm"
+        for name, each in summary.items()
+    )
 
 
 def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool]) -> MatchingRun:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.block_arrays import RobustBlock, check_shape, join_roots, rows_of_root
 from factors.block_sums import BlockSums, square_root, unpack_sums
+from factors.compiled import one_at_a_time
 from factors.kernel import (
     accumulate_alone,
     accumulate_shared,
@@ -171,7 +172,8 @@ class ProjectionBlock(RobustBlock):
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None
     ) -> Array:
         evaluations = int((runs[:, 1] - runs[:, 0]).sum())
-        run = accumulate_alone if evaluations < _WORTH_SHARING else accumulate_shared
+        shared = evaluations >= _WORTH_SHARING
+        run = one_at_a_time(accumulate_shared) if shared else accumulate_alone
         scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
@@ -193,7 +195,8 @@ class ProjectionBlock(RobustBlock):
             T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
             runs: (r, 2) as in :meth:`run_sums`.
         """
-        run = residuals_alone if len(self) < _WORTH_SHARING else residuals_shared
+        shared = len(self) >= _WORTH_SHARING
+        run = one_at_a_time(residuals_shared) if shared else residuals_alone
         residuals, projectable = run(
             self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
             runs,

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from types import BuiltinFunctionType, CodeType
 from typing import Any
 
@@ -39,6 +40,13 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _VERSIONS_KEPT = 4  # of one kernel, for checkouts side by side; each takes up to 0.2 MB
 _log = logging.getLogger(__name__)
 
+_all_cores = Lock()
+os.register_at_fork(  # no child is made while another thread holds it
+    before=_all_cores.acquire,
+    after_in_parent=_all_cores.release,
+    after_in_child=_all_cores.release,
+)
+
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function without Python objects (``numba.njit``) when it is first called.
@@ -54,6 +62,19 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return kernel
 
     return decorate
+
+
+def one_at_a_time(kernel: Any) -> Callable[..., Any]:
+    """A kernel with ``parallel=True``, for threads: a call waits until such calls of others end.
+
+    Each takes all cores, and without OpenMP or TBB numba ends the process if two run at once.
+    """
+
+    def run(*arguments: Any) -> Any:
+        with _all_cores:
+            return kernel(*arguments)
+
+    return run
 
 
 def fingerprint(kernel: Any) -> str:

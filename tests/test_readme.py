@@ -25,6 +25,20 @@ TRACKER = example("docs/tracking.md")
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
+def arrays_of_sample() -> dict[str, object]:
+    """What the first example takes from the reader's program."""
+    dataset = calibgraph.load_dataset(SAMPLE)
+    cameras = dataset.rig.cameras
+    return {
+        "clouds": [frame.load_cloud() for frame in dataset.frames],
+        "images": {n: [f.load_image(n, c) for f in dataset.frames] for n, c in cameras.items()},
+        "size": (640, 360),
+        "K": {name: camera.matrix_px for name, camera in cameras.items()},
+        "distortion": {name: camera.distortion for name, camera in cameras.items()},
+        "T_guess": dataset.rig.T_camera_lidar,
+    }
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the examples are run."""
@@ -35,8 +49,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(folder: Path) -> calibgraph.Calibration:
-    """The sample as the first example calibrates it, from 2 deg and 0.2 m."""
-    names: dict[str, object] = {}
+    """The sample in memory, as the first example calibrates it, from 2 deg and 0.2 m."""
+    names: dict[str, object] = arrays_of_sample()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         exec(compile(FIRST, "README.md", "exec"), names)

@@ -57,7 +57,19 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
     readers = {".npy": _read_npy, ".bin": _read_bin, ".pcd": _read_open3d, ".ply": _read_open3d}
     if path.suffix.lower() not in readers:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
-    cloud = readers[path.suffix.lower()](path)
+    return check_points(readers[path.suffix.lower()](path), path)
+
+
+def check_points(cloud: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """The rows of a cloud (n, 4) with a return.
+
+    Args:
+        cloud: with NaN in x, y and z where there is none.
+        path: of the cloud, or its name.
+
+    Raises:
+        FileError: if there is no point, or one is not finite.
+    """
     returned = cloud[~np.isnan(cloud[:, :3]).all(axis=1)]
     if not len(returned):
         raise FileError(path, "holds no point")
@@ -90,7 +102,7 @@ def _read_npy(path: Path) -> NDArray[np.float32]:
         )
     if array.shape[1] > _MOST_COLUMNS:
         raise FileError(path, f"has {array.shape[1]} columns, expected 3 or 4; is it transposed?")
-    return _with_intensity(array[:, :3], array[:, 3] if array.shape[1] >= _XYZI else None)
+    return with_intensity(array[:, :3], array[:, 3] if array.shape[1] >= _XYZI else None)
 
 
 def _read_bin(path: Path) -> NDArray[np.float32]:
@@ -102,9 +114,10 @@ def _read_bin(path: Path) -> NDArray[np.float32]:
     return np.fromfile(path, dtype="<f4").reshape(-1, 4)
 
 
-def _with_intensity(
+def with_intensity(
     xyz: NDArray[np.floating], intensity: NDArray[np.floating] | None
 ) -> NDArray[np.float32]:
+    """(n, 4) float32 of (n, 3) points and (n,) intensities, NaN if there are none."""
     cloud = np.full((len(xyz), 4), np.nan, dtype=np.float32)
     with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
         cloud[:, :3] = xyz
@@ -134,7 +147,7 @@ def _read_open3d(path: Path) -> NDArray[np.float32]:
         raise FileError(path, f"{found} of {expected} points could be read; is it complete?")
     names = [name for name in ("intensity", "reflectivity", "i") if name in cloud.point]
     intensity = cloud.point[names[0]].numpy().ravel() if names else None
-    return _with_intensity(cloud.point.positions.numpy(), intensity)
+    return with_intensity(cloud.point.positions.numpy(), intensity)
 
 
 def _require_complete(path: Path) -> int:

@@ -59,6 +59,11 @@ class Frame:
         gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
         return np.asarray(gray, dtype=np.uint8)
 
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the cloud and the images, by path."""
+        paths = (self.cloud_path, *self.image_paths.values())
+        return {str(path): hash_source(path) for path in paths}
+
     def entry(self) -> dict[str, Any]:
         """The frame's number and files, as a result keeps them."""
         return {

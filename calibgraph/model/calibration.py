@@ -18,7 +18,7 @@ from calibgraph.files import sha256, write_yaml
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import relative_covariance, relative_transform
+from calibgraph.model.geometry import invert, relative_covariance, relative_transform
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
@@ -140,6 +140,11 @@ class Calibration:
     def T_camera_lidar(self) -> dict[str, Array]:
         """Each camera's (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
         return self.rig.T_camera_lidar
+
+    @property
+    def T_lidar_camera(self) -> dict[str, Array]:
+        """The (4, 4) inverses, each camera's pose in the LiDAR frame, as ROS's tf has it."""
+        return {name: invert(T) for name, T in self.T_camera_lidar.items()}
 
     def sigmas(self, name: str) -> tuple[Array, Array] | None:
         """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.

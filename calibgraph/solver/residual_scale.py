@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.solver.spread_kernel import spreads_alone, spreads_shared
+from factors.compiled import one_at_a_time
 
 Array = NDArray[np.float64]
 
@@ -81,7 +82,8 @@ def robust_spread(values: Array) -> float:
 
 def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
     """(r,) :func:`robust_spread` of the finite values in each of (r, 2) runs of (n,) values."""
-    run = spreads_shared if len(values) >= _WORTH_SHARING else spreads_alone
+    shared = len(values) >= _WORTH_SHARING
+    run = one_at_a_time(spreads_shared) if shared else spreads_alone
     spreads: Array = run(
         np.ascontiguousarray(values), runs, (_START_QUANTILE, _START_FACTOR), _HALF, _CUT
     )

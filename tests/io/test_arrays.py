@@ -1,0 +1,78 @@
+"""Datasets of arrays are those of files; what does not fit together is refused in one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibgraph import CalibrationError, Dataset, Rig, dataset_from_arrays
+from calibgraph.pipeline import hash_inputs
+from tests.conftest import make_camera
+
+SMALL = make_camera().model_copy(update={"width_px": 8, "height_px": 6})
+RIG = Rig(cameras={"front": SMALL})
+CLOUD = np.array([[1.0, 2.0, 3.0, 0.5], [4.0, 5.0, 6.0, 0.25]], np.float32)
+IMAGE = np.arange(8 * 6 * 3, dtype=np.uint8).reshape(6, 8, 3)
+
+
+def dataset(cloud: Any = CLOUD, image: Any = IMAGE, rig: Rig = RIG) -> Dataset:
+    return dataset_from_arrays(rig, [cloud, cloud], {"front": [image, image]})
+
+
+def test_frames_hold_what_was_given() -> None:
+    data = dataset()
+    assert [frame.index for frame in data.frames] == [0, 1]
+    np.testing.assert_array_equal(data.frames[1].load_cloud(), CLOUD)
+    np.testing.assert_array_equal(data.frames[1].load_image("front", SMALL), IMAGE)
+    assert data.neighbour(data.frames[0], 1) is data.frames[1]
+
+
+def test_clouds_of_three_columns_and_of_doubles_and_without_returns_are_taken() -> None:
+    given = np.vstack([CLOUD[:, :3], [[np.nan] * 3]]).astype(np.float64)
+    found = dataset(cloud=given).frames[0].load_cloud()
+    np.testing.assert_array_equal(found[:, :3], CLOUD[:, :3])
+    assert found.dtype == np.float32
+    assert np.isnan(found[:, 3]).all()
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+def test_gray_images_and_those_with_alpha_become_bgr(channels: int) -> None:
+    gray = IMAGE[:, :, 0]
+    given = gray if channels == 1 else np.dstack([IMAGE, gray])
+    found = dataset(image=given).frames[0].load_image("front", SMALL)
+    expected = np.dstack([gray] * 3) if channels == 1 else IMAGE
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_equal_arrays_have_equal_hashes_under_names_of_their_own() -> None:
+    one, two = (hash_inputs(dataset()) for _ in range(2))
+    assert sorted(one.values()) == sorted(two.values())
+    assert not one.keys() & two.keys()  # caches tell datasets apart by the paths
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cloud": CLOUD[:, :2]}, r"cloud 0 has shape \(2, 2\) of float32, expected \(n, 3\)"),
+        ({"cloud": CLOUD[0]}, r"cloud 0 has shape \(4,\)"),
+        ({"cloud": CLOUD.astype(object)}, "cloud 0 has shape .* of object"),
+        ({"cloud": CLOUD[:0]}, "holds no point"),
+        ({"cloud": np.full((2, 3), np.inf)}, "not finite"),
+        ({"image": IMAGE.astype(float)}, r"image 0 has shape \(6, 8, 3\) of float64, expected"),
+        ({"image": IMAGE[:, :7]}, r"image 0 has shape \(6, 7, 3\) of uint8, expected \(6, 8, 3\)"),
+        ({"image": IMAGE[None]}, "image 0 has shape"),
+        ({"rig": Rig(cameras={"rear": SMALL})}, "images are of front, the rig has rear"),
+    ],
+)
+def test_what_does_not_fit_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        dataset(**given)
+
+
+def test_numbers_of_clouds_and_images_must_agree() -> None:
+    with pytest.raises(CalibrationError, match="2 clouds, but 1 images"):
+        dataset_from_arrays(RIG, [CLOUD, CLOUD], {"front": [IMAGE]})
+    with pytest.raises(CalibrationError, match="no frame given"):
+        dataset_from_arrays(RIG, [], {"front": []})

@@ -1,0 +1,90 @@
+"""Threads of a program: several calls at a time, and other work beside them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from calibgraph import Calibration, Correspondences, Rig, simulate_correspondences, solve
+from factors import Lens, ProjectionBlock
+from tests.conftest import ROOT, make_camera
+
+RIG = Rig(
+    cameras={
+        "left": make_camera((0.2, 0.5, -0.1)),
+        "right": make_camera((0.2, -0.5, -0.1), yaw_deg=-20.0),
+    }
+)
+
+
+def bits(result: Calibration) -> list[bytes]:
+    arrays = [*result.T_camera_lidar.values(), *result.covariance.values()]
+    return [array.tobytes() for array in arrays] + [result.verdict.status.encode()]
+
+
+def test_solves_in_threads_equal_solves_one_after_another() -> None:
+    tables = [simulate_correspondences(RIG, frames=8, matches=300, seed=k) for k in range(3)]
+
+    def run(table: Correspondences) -> list[bytes]:
+        return bits(solve(RIG, table))
+
+    alone = [run(table) for table in tables]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(run, tables * 2))
+    assert together == alone * 2
+    assert len({tuple(each) for each in alone}) == 3
+
+
+def test_another_thread_goes_on_while_a_kernel_runs() -> None:
+    """If the kernel held the GIL, the other thread would make no turn until its end."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-3, -2, 4), (3, 2, 30), (300_000, 3))
+    lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)
+    block = ProjectionBlock(lens, points, lens.project(points)[0], scale=2.0)
+    runs, T = np.tile([0, len(points)], (40, 1)), np.eye(4)[None]
+    block.run_sums(T, runs[:1])  # compiled
+    with ThreadPoolExecutor(1) as pool:
+        start = last = time.perf_counter()
+        running, longest = pool.submit(block.run_sums, T, runs), 0.0
+        while not running.done():
+            now = time.perf_counter()
+            longest, last = max(longest, now - last), now
+            time.sleep(0)
+    assert longest < 0.5 * (last - start)
+
+
+def test_kernels_that_take_all_cores_wait_for_each_other() -> None:
+    """numba ends the process at the second of two such calls where it has no OpenMP."""
+    code = (
+        "import threading, numpy as np\n"
+        "from calibgraph.solver.residual_scale import robust_spread\n"
+        "values = np.ones(2_000_000)\n"
+        "run = lambda: [robust_spread(values) for _ in range(3)]\n"
+        "threads = [threading.Thread(target=run) for _ in range(3)]\n"
+        "[thread.start() for thread in threads]\n"
+        "[thread.join() for thread in threads]\n"
+        "import numba; print(numba.threading_layer())"
+    )
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=False, cwd=ROOT, env=environment, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "workqueue\n"), done.stderr
+
+
+def test_the_library_prints_nothing_and_logs(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, logger="calibgraph"):
+        solve(RIG, simulate_correspondences(RIG, frames=6, matches=100))
+    assert capfd.readouterr() == ("", "")
+    assert [record.name for record in caplog.records] == ["calibgraph.pipeline"]
+    assert caplog.messages[0].startswith("PASS")
