@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +18,12 @@ from calibgraph.io.dataset import load_dataset
 from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
+from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 
 Array = NDArray[np.float64]
-Source = Literal["words", "file", "search"]
+Source = Literal["words", "pair", "file", "search"]
 
 FILE_DEG, FILE_M = 3.0, 0.05
 """Of extrinsics in files, as a URDF's: drawings, and how exactly cameras are put up; chosen."""
@@ -37,7 +38,8 @@ class CameraGuess:
     """Where a guess is from, and how good it is.
 
     Attributes:
-        source: words, a file, or the search over all headings.
+        source: words, the relative pose to a camera that has words, a file, or the search over all
+            headings.
         rotation_sigma_deg: one standard deviation, of the worst axis.
         translation_sigma_m: the same.
         z_score: of the search; None of the others.
@@ -110,6 +112,9 @@ def guess_rig(
 ) -> RigGuess:
     """Guess the extrinsics of a rig: from words first, then from files, else by a search.
 
+    A camera that a relative pose in a file (Kalibr's T_cn_cnm1) ties to one with words is placed by
+    it, if no file has its extrinsic.
+
     Args:
         files: with the lenses, and extrinsics as far as they are known, as of :func:`import_rig`;
             or what :func:`calibgraph.io.formats.rig_import.read_rig_parts` returns.
@@ -130,25 +135,55 @@ def guess_rig(
     parts = files if isinstance(files, RigParts) else read_rig_parts(files)
     words = {name: parse_mounting(text, name) for name, text in (mountings or {}).items()}
     _require_cameras(parts, words, search)
-    unknown = [name for name in parts.lenses if _is_unknown(name, parts, words, search)]
+    said = {name: mounting.T_camera_lidar(axis) for name, mounting in words.items()}
+    missing = [n for n in parts.lenses if n in search or n not in {**said, **parts.T_camera_lidar}]
+    tied = _tied_cameras(parts, said, set(missing) - set(search))
+    unknown = [name for name in missing if name not in tied]
     if unknown and data is None:
         raise _nothing_known(unknown[0])
     level = {name: Mounting(0.0).T_camera_lidar(axis) for name in unknown}
-    said = {name: mounting.T_camera_lidar(axis) for name, mounting in words.items()}
-    rig = parts.to_rig({**said, **level}, size_px=size_px)
+    placed = {name: one.T_camera_lidar for name, one in tied.items()}
+    rig = parts.to_rig({**said, **placed, **level}, size_px=size_px)
     found: dict[str, FoundCamera] = {}
     if unknown and data is not None:
         dataset = load_dataset(data, rig)
         found = search_headings(dataset, rig, unknown, forward=axis, seed=seed, progress=progress)
         _require_found(found)
     rig = rig.moved_to({name: one.T_camera_lidar for name, one in found.items()})
-    return RigGuess(rig, {name: _describe(name, words, found) for name in rig.cameras})
+    by_words = {name: _of_words(mounting) for name, mounting in words.items()}
+    by_pair = {name: _of_pair(one, by_words[one.to]) for name, one in tied.items()}
+    by_search = {name: _of_search(one) for name, one in found.items()}
+    by_file = CameraGuess("file", FILE_DEG, FILE_M, "by a file")
+    described = {**by_words, **by_pair, **by_search}
+    return RigGuess(rig, {name: described.get(name, by_file) for name in rig.cameras})
 
 
-def _is_unknown(
-    name: str, parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]
-) -> bool:
-    return name in search or (name not in words and name not in parts.T_camera_lidar)
+@dataclass(frozen=True, eq=False)
+class _TiedCamera:
+    """A camera that relative poses tie to another.
+
+    Attributes:
+        to: the other.
+        T_camera_lidar: (4, 4).
+        apart_m: from the other.
+    """
+
+    to: str
+    T_camera_lidar: Array
+    apart_m: float
+
+
+def _tied_cameras(
+    parts: RigParts, said: Mapping[str, Array], names: Collection[str]
+) -> dict[str, _TiedCamera]:
+    """Those of some cameras that are tied to one with words, to the first if to several."""
+    tied: dict[str, _TiedCamera] = {}
+    for to, T in said.items():
+        for name, T_camera_lidar in parts.tied_to(to, T).items():
+            if name in names and name not in tied:
+                apart_m = np.linalg.norm(camera_center(T_camera_lidar) - camera_center(T))
+                tied[name] = _TiedCamera(to, T_camera_lidar, float(apart_m))
+    return tied
 
 
 def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]) -> None:
@@ -183,17 +218,19 @@ def _require_found(found: Mapping[str, FoundCamera]) -> None:
         )
 
 
-def _describe(
-    name: str, words: Mapping[str, Mounting], found: Mapping[str, FoundCamera]
-) -> CameraGuess:
-    if name in words:
-        mounting = words[name]
-        return CameraGuess(
-            "words", mounting.rotation_sigma_deg, mounting.translation_sigma_m, "by words"
-        )
-    if name not in found:
-        return CameraGuess("file", FILE_DEG, FILE_M, "by a file")
-    one = found[name]
+def _of_words(mounting: Mounting) -> CameraGuess:
+    rotation_deg, translation_m = mounting.rotation_sigma_deg, mounting.translation_sigma_m
+    return CameraGuess("words", rotation_deg, translation_m, "by words")
+
+
+def _of_pair(one: _TiedCamera, other: CameraGuess) -> CameraGuess:
+    """The other's sigmas; its turn moves the camera by as much as they are apart."""
+    shift_m = one.apart_m * math.radians(other.rotation_sigma_deg)
+    translation_m = math.hypot(other.translation_sigma_m, shift_m)
+    return CameraGuess("pair", other.rotation_sigma_deg, translation_m, f"by its pose to {one.to}")
+
+
+def _of_search(one: FoundCamera) -> CameraGuess:
     text = f"found with a z-score of {one.z_score:.1f}" + (
         f", as {one.seen_by} sees it" if one.seen_by else ""
     )

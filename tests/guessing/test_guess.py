@@ -15,7 +15,7 @@ from calibgraph.guessing.mounting import Mounting
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import PoseSearch
-from calibgraph.model.geometry import pose_difference
+from calibgraph.model.geometry import camera_center, pose_difference
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 from tests.io.formats.test_import import KALIBR, URDF, write
@@ -82,6 +82,21 @@ def test_words_stand_in_for_a_file(tmp_path: Path) -> None:
         atol=1e-12,
     )  # fmt: skip
     assert found.cameras["cam1"].source == "file"
+
+
+def test_a_camera_is_placed_by_its_pose_to_one_with_words(tmp_path: Path) -> None:
+    """cam1 is 0.11 m to the right of cam0, which looks ahead from the LiDAR."""
+    files = write(tmp_path, camchain__yaml=KALIBR.replace("T_cam_lidar", "T_cam_imu"))
+    found = guess_rig(files, mountings={"cam0": "front, 10 cm above"})
+    centre = camera_center(found.rig.T_camera_lidar["cam1"])
+    np.testing.assert_allclose(centre, (0.0, -0.11, 0.1), atol=1e-12)
+    one, two = found.cameras.values()
+    assert (one.source, two.source, two.text) == ("words", "pair", "by its pose to cam0")
+    assert two.rotation_sigma_deg == one.rotation_sigma_deg
+    shift_m = 0.11 * np.radians(one.rotation_sigma_deg)
+    assert two.translation_sigma_m == pytest.approx(np.hypot(one.translation_sigma_m, shift_m))
+    both = guess_rig(files, mountings={"cam0": "front", "cam1": "rear"})
+    assert both.cameras["cam1"].source == "words"
 
 
 @pytest.mark.usefixtures("made_up")

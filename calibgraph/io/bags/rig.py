@@ -140,8 +140,8 @@ def _content(name: str, camera: BagCamera, read: BagRig) -> dict[str, Any]:
         raise DatasetError(
             f"{camera.where}: /tf_static does not connect the LiDAR's frame {read.lidar!r} with "
             f"the frame {camera.lens.frame!r} of camera {name!r}; its frames are "
-            f"{', '.join(read.frames) or 'none'}: give a rig with the guess (--rig), or import the "
-            "bag together with a URDF",
+            f"{', '.join(read.frames) or 'none'}: describe its mounting to calibgraph guess, give "
+            "a rig with the guess (--rig), or import the bag together with a URDF",
             camera=name,
         )
     return {**camera.lens.content, "T_camera_lidar": camera.T_camera_lidar}

@@ -84,6 +84,10 @@ class RigParts:
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
 
+    def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
+        """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
+        return _by_pairs({camera: T_camera_lidar}, self.pairs)
+
     def to_rig(
         self,
         extrinsics: Mapping[str, Array] | None = None,
