@@ -22,6 +22,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from calibgraph.errors import CalibrationError, FileError
+from calibgraph.io.bags.livox import LIVOX_CLOUDS, read_custom_msg
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 MESSAGE_SUFFIX = ".message"
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+CLOUDS = (POINT_CLOUD, *LIVOX_CLOUDS)
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _METADATA, _HEAD_BYTES = "metadata.yaml", 1000
@@ -243,7 +245,15 @@ def _time_of(entry: Any) -> int:
 def _deserializer(path: Path) -> Callable[[bytes, str], Any]:
     ros1 = path.suffix.lower() == ".bag"
     store = type_store(ros1=ros1)
-    read: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    of_store: Callable[[bytes, str], Any] = (
+        store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    )
+
+    def read(data: bytes, type_: str) -> Any:
+        if type_ in LIVOX_CLOUDS:
+            return read_custom_msg(data, store.types, ros1=ros1)
+        return of_store(data, type_)
+
     return read
 
 

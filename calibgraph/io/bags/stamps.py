@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.bags.messages import POINT_CLOUD, Bag, Message
+from calibgraph.io.bags.messages import CLOUDS, Bag, Message
 from calibgraph.io.bags.options import Stamps
 from calibgraph.io.bags.point_clouds import has_points
 
@@ -46,7 +46,7 @@ class TopicStamps:
             return
         self._seen.add(stamp_ns)
         path = message.path_in(bag.path)
-        is_cloud = bag.topics[message.topic].type == POINT_CLOUD
+        is_cloud = bag.topics[message.topic].type in CLOUDS
         if is_cloud and not has_points(message.content, str(path)):
             self.empty += 1
             return

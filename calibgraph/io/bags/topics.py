@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from calibgraph.errors import DatasetError
-from calibgraph.io.bags.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD, Bag
+from calibgraph.io.bags.messages import CAMERA_INFO, CLOUDS, COMPRESSED_IMAGE, IMAGE, Bag
 from calibgraph.io.bags.options import LIDAR
 from calibgraph.io.bags.pictures import is_depth
 
@@ -76,12 +76,12 @@ def choose_topics(
 
 
 def _lidar_topic(bag: Bag) -> str:
-    found = bag.of_type(POINT_CLOUD)
+    found = bag.of_type(*CLOUDS)
     if len(found) == 1:
         return found[0].name
     listed = ", ".join(f"{each.name} ({each.count})" for each in found)
-    what = f"has {len(found)} topics of PointCloud2: {listed}; name" if found else (
-        "has no PointCloud2 messages; convert the driver's packets first, then name"
+    what = f"has {len(found)} topics of clouds: {listed}; name" if found else (
+        "has no messages of PointCloud2 or of Livox; convert the driver's packets first, then name"
     )  # fmt: skip
     raise DatasetError(f"{bag.path}: {what} the LiDAR's by --topic lidar=/TOPIC")
 
@@ -150,7 +150,7 @@ def _short_names(namespaces: Iterable[str]) -> dict[str, str]:
 
 def _listed(bag: Bag) -> str:
     """The topics of images and clouds, for errors."""
-    found = bag.of_type(IMAGE, COMPRESSED_IMAGE, POINT_CLOUD)
+    found = bag.of_type(IMAGE, COMPRESSED_IMAGE, *CLOUDS)
     if not found:
         return "it has neither images nor PointCloud2"
     return "it has " + ", ".join(f"{each.name} ({each.count})" for each in found)

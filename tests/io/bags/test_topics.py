@@ -87,7 +87,7 @@ def test_topics_are_chosen_by_name(tmp_path: Path) -> None:
 
 def test_what_cannot_be_chosen_is_offered(tmp_path: Path) -> None:
     bag = bag_of(tmp_path / "two", "/a/image_raw", "/a/camera_info", clouds=("/p", "/q"))
-    with pytest.raises(DatasetError, match=r"2 topics of PointCloud2: /p \(1\), /q \(1\); name"):
+    with pytest.raises(DatasetError, match=r"2 topics of clouds: /p \(1\), /q \(1\); name"):
         choose_topics(bag, {})
     with pytest.raises(DatasetError, match=r"no messages of /r \(lidar\); it has /a/image_raw"):
         choose_topics(bag, {"lidar": "/r"})
@@ -96,5 +96,5 @@ def test_what_cannot_be_chosen_is_offered(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="--topic b: the rig has no such camera, but a"):
         choose_topics(bag, {"lidar": "/p", "b": "/a/image_raw"}, ["a"])
     empty = bag_of(tmp_path / "none", "/a/image_raw", "/a/camera_info", clouds=())
-    with pytest.raises(DatasetError, match="has no PointCloud2 messages"):
+    with pytest.raises(DatasetError, match="has no messages of PointCloud2"):
         choose_topics(empty, {})
