@@ -138,9 +138,8 @@ def _describe(data: Dataset) -> Iterator[Finding]:
     """What is there, and whether the frames are enough."""
     count = len(data.frames)
     yield Finding("note", f"{count} frames, {len(data.rig.cameras)} cameras")
-    notes = data.notes if any(map(is_bag, data.folders)) else ()
-    yield from (Finding("note", note) for note in notes)
-    if not set(describe_rig(data.rig)) & set(notes):
+    yield from (Finding("note", note) for note in data.notes)
+    if not set(describe_rig(data.rig)) & set(data.notes):
         yield from (Finding("note", line) for line in describe_rig(data.rig))
     if count < ENOUGH_FRAMES:
         yield Finding(

@@ -43,7 +43,7 @@ app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
     "T_a_b maps coordinates in b to coordinates in a: p_camera = T_camera_lidar * p_lidar. "
     "A RIG, ESTIMATE or REFERENCE is a rig file, a result (file or folder), a dataset folder "
-    "(its rig.yaml), a KITTI odometry sequence folder or a ROS bag.",
+    "(its rig.yaml), a KITTI odometry sequence folder, a nuScenes folder or a ROS bag.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

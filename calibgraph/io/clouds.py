@@ -1,4 +1,4 @@
-"""Point clouds from disk: .npy, .bin (KITTI), .pcd and .ply, as x y z intensity."""
+"""Point clouds from disk: .npy, .bin (KITTI, nuScenes), .pcd and .ply, as x y z intensity."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ _UNREADABLE = (
 """Of numpy, which takes the header of a file as Python, and memory for all that it claims."""
 
 _XYZ, _XYZI = 3, 4
+_NUSCENES = ".pcd.bin"
 _MOST_COLUMNS = 64
 
 
@@ -38,8 +39,8 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
     """Read a cloud.
 
     Args:
-        path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), .pcd or .ply;
-            or the address of a message in a bag.
+        path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), a nuScenes
+            .pcd.bin (and the ring), .pcd or .ply; or the address of a message in a bag.
 
     Returns:
         (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
@@ -107,11 +108,15 @@ def _read_npy(path: Path) -> NDArray[np.float32]:
 
 def _read_bin(path: Path) -> NDArray[np.float32]:
     size = path.stat().st_size
-    if size % 16:
+    columns = ["x", "y", "z", "intensity"]
+    columns += ["ring"] * path.name.lower().endswith(_NUSCENES)
+    if size % (4 * len(columns)):
         raise FileError(
-            path, f"{size} bytes is not a whole number of float32 x y z intensity; is it complete?"
+            path,
+            f"{size} bytes is not a whole number of float32 {' '.join(columns)}; is it complete?",
         )
-    return np.fromfile(path, dtype="<f4").reshape(-1, 4)
+    points = np.fromfile(path, dtype="<f4").reshape(-1, len(columns))
+    return np.ascontiguousarray(points[:, :_XYZI])
 
 
 def with_intensity(

@@ -24,6 +24,7 @@ from calibgraph.io.clouds import load_cloud
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.images import load_image
+from calibgraph.io.nuscenes import describe_motion, is_nuscenes
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Camera, Rig
 
@@ -83,7 +84,7 @@ class Dataset:
         frames: in order of time.
         folders: their sources.
         recorded: all frames of the folders, where only some of them were selected.
-        notes: what was found in a bag and what was left out of it, a line each.
+        notes: what was found in a bag or in tables and what was left out of it, a line each.
     """
 
     rig: Rig
@@ -137,7 +138,7 @@ def load_dataset(
     frames: str | None = None,
     bag: BagOptions | None = None,
 ) -> Dataset:
-    """Find the frames of a dataset folder, a KITTI odometry sequence, a bag, or several of one rig.
+    """Find the frames of a dataset folder, a KITTI sequence, nuScenes, a bag, or several of a rig.
 
     Args:
         folders: one or several; several form one calibration problem.
@@ -182,6 +183,8 @@ def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> D
             frames_of_folder(path, list(data.rig.cameras), complete=complete)
         )
     )
+    if is_nuscenes(path) and (motion := describe_motion(path)):
+        data = replace(data, notes=(*data.notes, motion))
     return _with(data, found, found)
 
 
@@ -247,11 +250,12 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
     for path in paths:
-        if is_bag(path) or folder_layout(path).clouds.is_dir():
+        if is_bag(path) or is_nuscenes(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():
             raise FileError(
-                path, "no such folder or ROS bag; expected a dataset, a KITTI sequence or a bag"
+                path,
+                "no such folder or ROS bag; expected a dataset, KITTI sequence, nuScenes or bag",
             )
         for recorded in (*path.glob("*.mcap"), *path.glob("*.db3")):
             raise FileError(

@@ -14,6 +14,7 @@ from calibgraph.files import is_utf8
 from calibgraph.io import kitti
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.nuscenes import is_nuscenes, nuscenes_frames
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,15 @@ def frames_of_folder(
     """The frames of a folder, one per cloud, sorted by stem.
 
     Args:
-        folder: a dataset folder or a KITTI odometry sequence.
+        folder: a dataset folder, a KITTI odometry sequence, or a nuScenes folder or scene.
         cameras: the rig's.
         complete: whether every cloud must have an image of every camera, and every image a cloud.
 
     Raises:
         FileError, DatasetError: if a folder is missing or empty, or frames do not pair up.
     """
+    if is_nuscenes(folder):
+        return _frames_of_nuscenes(folder, cameras, complete=complete)
     layout = folder_layout(folder)
     clouds = _files(layout.clouds, CLOUD_SUFFIXES)
     images = {name: _files(_image_folder(folder, layout, name), IMAGE_SUFFIXES) for name in cameras}
@@ -74,6 +77,20 @@ def frames_of_folder(
         FrameFiles(stem, cloud, {n: images[n][stem] for n in cameras if stem in images[n]})
         for stem, cloud in clouds.items()
     ]
+
+
+def _frames_of_nuscenes(
+    folder: Path, cameras: Sequence[str], *, complete: bool
+) -> list[FrameFiles]:
+    """The samples; complete ones have an image of every camera."""
+    found = [
+        FrameFiles(stem, cloud, {name: images[name] for name in cameras if name in images})
+        for stem, cloud, images in nuscenes_frames(folder)
+    ]
+    for name in cameras if complete else ():
+        stems = ({f.stem for f in found}, {f.stem for f in found if name in f.images})
+        _require_pairs(folder, name, *stems)
+    return found
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:

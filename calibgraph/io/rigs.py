@@ -1,4 +1,4 @@
-"""Rigs from disk: a rig file, a result, a dataset folder, a KITTI sequence or a ROS bag."""
+"""Rigs from disk: rig files, results, dataset folders, KITTI sequences, nuScenes, ROS bags."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import rig_of_bag
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.nuscenes import is_nuscenes, load_nuscenes_rig
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Rig
 
@@ -17,10 +18,10 @@ RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 
 
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
-    """Read a rig from a rig file, a result (file or folder), a dataset, a KITTI sequence or a bag.
+    """Read a rig from a rig file, a result, a dataset, a KITTI sequence, nuScenes or a bag.
 
-    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``, a bag
-    those of its /tf_static.
+    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``, a
+    nuScenes folder those of its calibrated_sensor, a bag those of its /tf_static.
 
     Args:
         path: a file or folder.
@@ -32,6 +33,8 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     path = rig_file(path)
     if is_bag(path):
         return rig_of_bag(path, bag)
+    if is_nuscenes(path):
+        return load_nuscenes_rig(path)
     if path.name == CALIBRATION_NAME:
         return load_kitti_rig(path.parent)
     content = read_yaml(path)
@@ -49,20 +52,20 @@ def rig_file(path: Path | str) -> Path:
         FileError: if there is no such path, or a folder holds none.
     """
     found = find_rig_file(path)
-    if found is None or not found.exists():
+    if found is None or not (found.exists() or is_nuscenes(found)):
         what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
         raise FileError(
             path,
             f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
-            "dataset folder with a rig.yaml, a KITTI odometry sequence, or a ROS bag",
+            "dataset folder with a rig.yaml, a KITTI odometry sequence, nuScenes, or a ROS bag",
         )
     return found
 
 
 def find_rig_file(path: Path | str) -> Path | None:
-    """The path itself, or the rig file of a folder that is no bag; None if it holds none."""
+    """The path itself, or the rig file of a folder of files; None if it holds none."""
     folder = Path(path)
-    if not folder.is_dir() or is_bag(folder):
+    if not folder.is_dir() or is_bag(folder) or is_nuscenes(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it

@@ -1,0 +1,142 @@
+"""nuScenes folders: the rig of calibrated_sensor, and the key frames of one vehicle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import DatasetError, FileError
+from calibgraph.files import checked_model
+from calibgraph.io.nuscenes_tables import (
+    LIDAR,
+    Instant,
+    SampleData,
+    Tables,
+    find_tables,
+    read_ego_poses,
+    read_tables,
+)
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+
+_MATRIX_ROWS = 3
+
+
+def is_nuscenes(path: Path | str) -> bool:
+    """Whether a path is a nuScenes folder, its tables, or a scene of them."""
+    return find_tables(Path(path)) is not None
+
+
+def load_nuscenes_rig(path: Path) -> Rig:
+    """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted.
+
+    Raises:
+        FileError, DatasetError: if a table is malformed, or the scenes are of several rigs.
+    """
+    tables = read_tables(path)
+    instants = [each for each in tables.instants if LIDAR in each.taken]
+    if not instants:
+        raise FileError(path, f"has no scan of {LIDAR}")
+    _require_one_rig(path, tables, instants)
+    taken = {name: one for each in reversed(instants) for name, one in each.taken.items()}
+    where = tables.folder / "calibrated_sensor.json"
+    T_ego_lidar = tables.calibration_of(taken[LIDAR]).matrix(where)
+    cameras = {
+        name: _camera(tables, taken[name], T_ego_lidar, where)
+        for name in tables.cameras
+        if name in taken
+    }
+    return checked_model(Rig, {"lidar": LIDAR, "cameras": cameras}, path)
+
+
+def _camera(tables: Tables, taken: SampleData, T_ego_lidar: Array, where: Path) -> Camera:
+    sensor = tables.calibration_of(taken)
+    K = np.array(sensor.camera_intrinsic)
+    if len(K) != _MATRIX_ROWS:
+        raise FileError(where, f"record {sensor.token} of a camera has no camera_intrinsic")
+    content = {
+        "width_px": taken.width,
+        "height_px": taken.height,
+        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "T_camera_lidar": invert(sensor.matrix(where)) @ T_ego_lidar,
+    }
+    return checked_model(Camera, content, f"{where}: {sensor.token}")
+
+
+def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> None:
+    """Check that all scenes have the same sensors at the same poses.
+
+    Raises:
+        DatasetError: with the scenes of each rig.
+    """
+    for name in (LIDAR, *tables.cameras):
+        scenes: dict[str, dict[str, None]] = {}  # by what the sensor's record holds
+        for each in instants:
+            if name in each.taken:
+                record = tables.calibration_of(each.taken[name]).model_dump(exclude={"token"})
+                scenes.setdefault(str(record), {})[each.scene] = None
+        if len(scenes) > 1:
+            groups = "; ".join(", ".join(each) for each in scenes.values())
+            raise DatasetError(
+                f"{path}: its scenes have {len(scenes)} calibrations of {name} ({groups}); name "
+                f"scenes of one, as {path / instants[0].scene}"
+            )
+
+
+def nuscenes_frames(path: Path) -> list[tuple[str, Path, dict[str, Path]]]:
+    """The stem (the stamp), the scan and the images by camera of every sample, in order of time.
+
+    Raises:
+        FileError: if a table is malformed, or there is no scan.
+    """
+    tables = read_tables(path)
+    root = tables.folder.parent
+    frames = [
+        (
+            str(each.stamp_us),
+            root / each.taken[LIDAR].filename,
+            {
+                name: root / each.taken[name].filename
+                for name in tables.cameras
+                if name in each.taken
+            },
+        )
+        for each in tables.instants
+        if LIDAR in each.taken
+    ]
+    if not frames:
+        raise FileError(path, f"has no scan of {LIDAR}")
+    return frames
+
+
+def describe_motion(path: Path) -> str:
+    """How far the vehicle moves between scans and images, in a line; empty without ego_pose.
+
+    Raises:
+        FileError: if a table is malformed.
+    """
+    tables = read_tables(path)
+    poses = read_ego_poses(tables)
+    if not poses:
+        return ""
+    moved = [
+        max(_apart_m(poses, each.taken[LIDAR], each.taken[name])
+            for name in tables.cameras if name in each.taken)
+        for each in tables.instants
+        if LIDAR in each.taken and any(name in each.taken for name in tables.cameras)
+    ]  # fmt: skip
+    return (
+        f"{path}: the vehicle moves {np.median(moved):.2f} m (median), at most "
+        f"{np.max(moved):.2f} m, between a scan and its images"
+    )
+
+
+def _apart_m(poses: dict[str, Array], one: SampleData, other: SampleData) -> float:
+    both = [poses.get(each.ego_pose_token) for each in (one, other)]
+    if both[0] is None or both[1] is None:
+        return 0.0
+    return float(np.linalg.norm(both[0][:3, 3] - both[1][:3, 3]))
