@@ -122,7 +122,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
     Raises:
         ValueError: if they are not six.
     """
-    from calibgraph.io.formats.rotations import pose_of_angles
+    from calibgraph.io.rotations import pose_of_angles
 
     try:
         x, y, z, roll, pitch, yaw = (float(word) for word in text.replace(",", " ").split())

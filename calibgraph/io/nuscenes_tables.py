@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text
-from calibgraph.io.formats.rotations import pose_of_quaternion
+from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.rig import Finite
 
 Array = NDArray[np.float64]

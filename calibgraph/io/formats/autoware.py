@@ -14,7 +14,7 @@ from calibgraph.files import checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport, frame_id
-from calibgraph.io.formats.rotations import pose_of_angles, roll_pitch_yaw
+from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.rig import Finite
 

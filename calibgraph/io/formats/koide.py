@@ -22,7 +22,7 @@ from calibgraph.io.formats.lenses import (
 )
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import RigExport
-from calibgraph.io.formats.rotations import pose_of_quaternion, quaternion_xyzw
+from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera as RigCamera
 from calibgraph.model.rig import Finite, Positive

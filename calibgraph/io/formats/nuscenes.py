@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.io.formats.lenses import require_undistorted
 from calibgraph.io.formats.rig_export import RigExport
-from calibgraph.io.formats.rotations import quaternion_xyzw
+from calibgraph.io.rotations import quaternion_xyzw
 
 
 def write_nuscenes(export: RigExport) -> str:

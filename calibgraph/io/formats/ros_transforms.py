@@ -14,7 +14,7 @@ from calibgraph.files import checked_model
 from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
-from calibgraph.io.formats.rotations import pose_of_quaternion, quaternion_xyzw
+from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
 from calibgraph.model.rig import Finite
 
 _DIRECTION = (

@@ -15,7 +15,7 @@ from calibgraph.files import read_text
 from calibgraph.io.formats.comments import commented_xml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
-from calibgraph.io.formats.rotations import pose_of_angles, roll_pitch_yaw
+from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
 
 _DIRECTION = (
     "each joint's origin is the pose of the optical frame (child) in the LiDAR frame (parent): "
