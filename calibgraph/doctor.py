@@ -17,6 +17,7 @@ from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs
+from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.standstill import same_places
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.rig import Camera, Rig
@@ -95,7 +96,9 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
-    examined = data.spread_out(MOST_FRAMES)
+    choice = choose_frames(data, data.rig, MOST_FRAMES)
+    examined = choice.dataset
+    findings += [Finding("note", choice.text)] if choice.text else []
     clouds = _examine_frames(examined.frames, data.rig, findings)
     findings += _examine_places(examined)
     seen: dict[str, int] = {}

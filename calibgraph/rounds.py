@@ -19,6 +19,7 @@ import numpy as np
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
+from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
@@ -120,7 +121,11 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
-    data = data if most_frames is None else data.spread_out(most_frames)
+    if most_frames is not None:
+        choice = choose_frames(data, guess, most_frames)
+        data = choice.dataset
+        if choice.text:
+            _log.info(choice.text)
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     return data, guess
 

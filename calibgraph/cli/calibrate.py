@@ -152,7 +152,10 @@ def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path
 def _print_frames_used(used: int, data: Dataset) -> None:
     """Print how many frames were matched, unless all were."""
     if used < len(data.frames):
-        text = f"{used} of {len(data.frames)} frames, evenly spread; --frames takes others"
+        text = (
+            f"{used} of {len(data.frames)} frames, spread over them, the clearest of neighbours; "
+            "--frames takes others"
+        )
         print_plain(terminal(), text)
 
 

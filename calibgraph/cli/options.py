@@ -123,7 +123,7 @@ FramesOption = Annotated[
     typer.Option(
         metavar="A:B:STEP",
         help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
-        "all; of more than 30 the matcher structure takes 30, evenly spread)",
+        "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
     ),
 ]
 _BAGS = "ROS bags"

@@ -105,7 +105,7 @@ class Dataset:
 
     def spread_out(self, most: int) -> Dataset:
         """At most ``most`` of the frames, evenly spread over them."""
-        return self._only(spread_out(self.frames, most))
+        return self.only(spread_out(self.frames, most))
 
     def select(self, frames: str) -> Dataset:
         """Keep some frames, by their position among the frames sorted by name, from 0.
@@ -125,9 +125,10 @@ class Dataset:
             ) from error
         if not kept:
             raise ValueError(f"frames {frames!r} selects none of the {len(self.frames)} frames")
-        return self._only(kept)
+        return self.only(kept)
 
-    def _only(self, frames: Sequence[Frame]) -> Dataset:
+    def only(self, frames: Sequence[Frame]) -> Dataset:
+        """Some of the frames; the others remain ``recorded``."""
         return replace(self, frames=tuple(frames), recorded=self.recorded or self.frames)
 
 

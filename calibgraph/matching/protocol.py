@@ -87,7 +87,7 @@ class FullMatcher(Matcher, Protocol):
 
     @property
     def most_frames(self) -> int | None:
-        """Most frames of a dataset to use, evenly spread over it; None (default) for all."""
+        """Most frames of a dataset to use, chosen of more; None (default) for all."""
         ...
 
     @property

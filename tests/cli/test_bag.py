@@ -71,7 +71,7 @@ def test_the_clouds_topic_is_asked_for_and_taken_by_name(
     bag = write_bag(tmp_path, "mcap", [*sample_messages(make), other])
     options = ("match", bag, "--matcher", table, "--out", tmp_path / "table.parquet")
     line = error_line(*call(*options))
-    assert "2 topics of PointCloud2: /points (6), /rear_points (1); name the LiDAR's by" in line
+    assert "2 topics of clouds: /points (6), /rear_points (1); name the LiDAR's by" in line
     assert call(*options, "--topic", "lidar=/points")[0] == 0
 
 

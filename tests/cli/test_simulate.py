@@ -28,7 +28,10 @@ def test_command_writes_a_dataset_and_none_over_it(call: Call, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("street", "--rig", "nosuch"), "known are kitti, walkley, surround, fisheye, sample"),
+        (
+            ("street", "--rig", "nosuch"),
+            "known are kitti, walkley, surround, fisheye, omni, panorama, sample",
+        ),
         (("nowhere",), "unknown scenario 'nowhere'; known are street"),
         (("street", "--beams", 3), "3 beams"),
     ],

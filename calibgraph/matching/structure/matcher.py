@@ -65,7 +65,7 @@ class StructureMatcher:
         search_deg: largest error of the guess, per axis [deg]; None for no search: the rounds begin
             at the guess, which may be off by about 2.5 degrees and 25 cm.
         search_m: the same of the translation [m].
-        most_frames: most frames of a dataset that are used, evenly spread over it; None for all.
+        most_frames: most frames of a dataset that are used, chosen of more; None for all.
         levels: the rounds, coarse to fine.
 
     Raises:

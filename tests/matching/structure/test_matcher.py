@@ -172,8 +172,8 @@ class TestRounds:
         for matcher in (everything, Counting(**settings)):  # type: ignore[arg-type]
             match_in_rounds(drive, matcher=matcher, progress=no_progress)
         assert seen[0] == list(range(100))
-        assert len(seen[-1]) == 30 and seen[-1][0] == 0 and seen[-1][-1] == 99
-        assert set(np.diff(seen[-1])) == {3, 4}
+        assert len(seen[-1]) == 30 and seen[-1][0] < 4 and seen[-1][-1] > 95
+        assert np.diff(seen[-1]).max() < 8  # one of each thirtieth: of neighbours the clearest
 
     @pytest.mark.slow
     def test_the_number_of_threads_does_not_matter(

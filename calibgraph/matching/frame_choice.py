@@ -1,0 +1,131 @@
+"""Which frames of a long recording are matched: of places apart, neither blurred nor dark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CalibrationError
+from calibgraph.io.dataset import Dataset, Frame, spread_out
+from calibgraph.matching.standstill import View
+from calibgraph.model.rig import Rig
+from calibgraph.parallel import map_on_cores
+
+CANDIDATES = 3
+"""Images are read of so many frames for each that is chosen: there is a clear one in three, unless
+a lens is covered, and more would take longer than the matching."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameChoice:
+    """Some frames of a dataset.
+
+    Attributes:
+        dataset: with these alone.
+        text: how they were chosen, in one line; empty if they are all.
+    """
+
+    dataset: Dataset
+    text: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A frame that may be chosen.
+
+    Attributes:
+        clarity: (cameras,) mean gradient of each image, which blur and darkness lower; NaN if it
+            cannot be read.
+        view: of the first camera that can be read, with its place in the rig; None without any.
+    """
+
+    frame: Frame
+    clarity: NDArray[np.float64]
+    view: tuple[int, View] | None
+
+
+def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
+    """At most so many frames, spread over the recording; all of them if there are no more.
+
+    While the vehicle stands, one is taken. Of neighbours, that with the clearest images is: the
+    largest product over the cameras of their images' mean gradient.
+
+    Args:
+        dataset: in the order of time.
+        rig: its cameras' names and sizes.
+        most: number of frames.
+    """
+    if len(dataset.frames) <= most:
+        return FrameChoice(dataset)
+    frames = spread_out(dataset.frames, CANDIDATES * most)
+    candidates = map_on_cores(_examine, frames, [rig] * len(frames))
+    scores = _scores(candidates)
+    places = list(_places(candidates))
+    best = [max(place, key=scores.__getitem__) for place in places]
+    parts = np.array_split(best, min(most, len(best)))
+    chosen = {int(max(part, key=scores.__getitem__)) for part in parts}
+    rest = [number for number in range(len(frames)) if number not in chosen]
+    chosen.update(spread_out(rest, most - len(chosen)))  # stands: they count as one, but are there
+    text = (
+        f"{most} of {len(dataset.frames)} frames are matched (--frames chooses others): of "
+        f"{len(frames)} evenly spread, the clearest of neighbours"
+    )
+    standing, unread = len(frames) - len(places), int(np.isneginf(scores).sum())
+    text += f"; in {standing} the vehicle stands where it stood" if standing else ""
+    text += f"; {unread} have an image that cannot be read" if unread else ""
+    return FrameChoice(dataset.only([frames[number] for number in sorted(chosen)]), text)
+
+
+def _examine(frame: Frame, rig: Rig) -> _Candidate:
+    clarity, view = np.full(len(rig.cameras), np.nan), None
+    for index, (name, camera) in enumerate(rig.cameras.items()):
+        try:
+            gray = frame.load_gray(name, camera)
+        except (CalibrationError, OSError, KeyError):
+            continue
+        clarity[index] = _clarity(gray)
+        view = view or (index, View.of(gray))
+    return _Candidate(frame, clarity, view)
+
+
+def _clarity(gray: NDArray[np.uint8]) -> float:
+    """Mean gradient of the image at half its size, where noise is less and edges are as sharp."""
+    half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    along_x, along_y = cv2.spatialGradient(half)
+    return float(cv2.norm(along_x, cv2.NORM_L1) + cv2.norm(along_y, cv2.NORM_L1)) / half.size
+
+
+def _scores(candidates: Sequence[_Candidate]) -> NDArray[np.float64]:
+    """(n,) the sum over cameras of log clarity: -inf where an image is missing.
+
+    The scene that a camera mostly sees does not count: it adds the same to all candidates.
+    """
+    clarity = np.array([each.clarity for each in candidates])
+    seeing = np.nan_to_num(clarity).max(axis=0) > 0.0  # the others are covered, or have no images
+    logs = np.log(np.maximum(clarity[:, seeing], np.finfo(np.float64).tiny))  # NaN stays
+    scores: NDArray[np.float64] = np.where(np.isnan(logs), -np.inf, logs).sum(axis=1)
+    return scores
+
+
+def _places(candidates: Sequence[_Candidate]) -> Iterator[list[int]]:
+    """Runs of candidates during which the vehicle stands."""
+    place = [0]
+    for (_, before), (number, candidate) in pairwise(enumerate(candidates)):
+        if _stands(before, candidate):
+            place.append(number)
+        else:
+            yield place
+            place = [number]
+    yield place
+
+
+def _stands(before: _Candidate, candidate: _Candidate) -> bool:
+    """Whether one camera has not moved between two candidates."""
+    if before.view is None or candidate.view is None or before.view[0] != candidate.view[0]:
+        return False
+    return before.view[1].stands(candidate.view[1]) is True

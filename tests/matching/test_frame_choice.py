@@ -1,0 +1,108 @@
+"""Of a long recording the clear frames are matched, spread over it, and one where it stands."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibgraph import Dataset, Frame, Rig, dataset_from_arrays
+from calibgraph.matching.frame_choice import CANDIDATES, choose_frames
+from calibgraph.rounds import _open
+from tests.conftest import make_camera
+
+CLOUD = np.ones((5, 4), np.float32)
+WIDTH, HEIGHT = 320, 200
+RIG = Rig(
+    cameras={
+        name: make_camera().model_copy(update={"width_px": WIDTH, "height_px": HEIGHT})
+        for name in ("front", "rear")
+    }
+)
+WALL = cv2.resize(
+    np.random.default_rng(0).integers(0, 255, (60, 2000), dtype=np.uint8), (20_000, HEIGHT * 3),
+    interpolation=cv2.INTER_CUBIC,
+)  # fmt: skip
+
+
+def drive(at_px: list[int], spoilt: dict[int, str] | None = None) -> Dataset:
+    """Frames along a wall, of which the front camera's images of some are spoilt."""
+    images: dict[str, list[np.ndarray]] = {"front": [], "rear": []}
+    for number, place in enumerate(at_px):
+        view = np.ascontiguousarray(WALL[:HEIGHT, place : place + WIDTH])
+        images["rear"].append(view)
+        how = (spoilt or {}).get(number, "")
+        if how == "blurred":
+            view = cv2.blur(view, (41, 1))
+        elif how == "dark":
+            view = view // 20
+        images["front"].append(view)
+    return dataset_from_arrays(RIG, [CLOUD] * len(at_px), images)
+
+
+def chosen(data: Dataset, most: int) -> list[int]:
+    return [frame.index for frame in choose_frames(data, RIG, most).dataset.frames]
+
+
+@pytest.mark.parametrize("how", ["blurred", "dark"])
+def test_the_clear_one_of_neighbours_is_chosen(how: str) -> None:
+    clear = [1, 5, 6, 9]
+    spoilt = {number: how for number in range(12) if number not in clear}
+    assert chosen(drive([100 * k for k in range(12)], spoilt), 4) == clear
+
+
+def test_frames_are_spread_over_the_recording() -> None:
+    found = chosen(drive([50 * k for k in range(300)]), 10)
+    thirds = np.linspace(0, 299, 10 * CANDIDATES).round()
+    assert set(found) <= set(thirds)
+    assert [number // 30 for number in found] == list(range(10))
+
+
+def test_one_frame_is_chosen_while_the_vehicle_stands() -> None:
+    """Of 24 frames 16 are at one place: the other 8 places are all among the chosen."""
+    at_px = [0] * 16 + [200 * k for k in range(1, 9)]
+    choice = choose_frames(drive(at_px), RIG, 9)
+    found = [frame.index for frame in choice.dataset.frames]
+    assert found[1:] == list(range(16, 24)) and found[0] < 16
+    assert "in 15 the vehicle stands where it stood" in choice.text
+
+
+def test_where_it_always_stands_there_are_as_many_frames_as_asked_for() -> None:
+    assert len(chosen(drive([0] * 20), 6)) == 6
+
+
+def test_an_image_that_cannot_be_read_is_left_out() -> None:
+    data = drive([100 * k for k in range(9)])
+    frames = list(data.frames)
+    gone = Frame(4, "gone", frames[4].cloud_path, {"front": Path("no.png"), "rear": Path("no.png")})
+    frames[4] = gone
+    choice = choose_frames(replace(data, frames=tuple(frames)), RIG, 3)
+    assert 4 not in [frame.index for frame in choice.dataset.frames]
+    assert choice.text.endswith("1 have an image that cannot be read")
+
+
+def test_few_frames_are_all_taken_and_none_is_read() -> None:
+    frames = tuple(Frame(k, str(k), Path("none"), {}) for k in range(3))
+    data = Dataset(RIG, frames, ())
+    assert choose_frames(data, RIG, 3).dataset is data
+
+
+def test_a_covered_camera_does_not_choose() -> None:
+    data = drive([100 * k for k in range(12)], {k: "blurred" for k in range(12) if k not in (4, 7)})
+    covered = [
+        replace(frame, images={**frame.images, "rear": np.zeros((HEIGHT, WIDTH, 3), np.uint8)})  # type: ignore[call-arg, attr-defined]
+        for frame in data.frames
+    ]
+    assert chosen(replace(data, frames=tuple(covered)), 2) == [4, 7]
+
+
+def test_the_choice_is_logged_and_the_others_stay_known(caplog: pytest.LogCaptureFixture) -> None:
+    data = drive([100 * k for k in range(12)])
+    with caplog.at_level(logging.INFO, logger="calibgraph"):
+        few, _ = _open(data, RIG, 4)
+    assert caplog.messages[0].startswith("4 of 12 frames are matched (--frames chooses others)")
+    assert len(few.frames) == 4 and len(few.recorded) == 12
