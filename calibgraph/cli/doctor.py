@@ -13,6 +13,7 @@ from calibgraph.cli.options import (
     EverySecondsOption,
     FramesOption,
     JsonOption,
+    MotionOption,
     RigOption,
     StampsOption,
     ToleranceOption,
@@ -35,6 +36,7 @@ def doctor(
     every_s: EverySecondsOption = None,
     tolerance_s: ToleranceOption = None,
     stamps: StampsOption = None,
+    motion: MotionOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
@@ -44,7 +46,9 @@ def doctor(
 
     if out is not None:
         require_place_for_folder(out)
-    bag = bag_options_from(topic, every_s=every_s, tolerance_s=tolerance_s, stamps=stamps)
+    bag = bag_options_from(
+        topic, every_s=every_s, tolerance_s=tolerance_s, stamps=stamps, motion=motion
+    )
     with checked_arguments(), progress_bar("reading"):
         guess = load_rig(rig) if rig else None
         found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)

@@ -19,6 +19,7 @@ from calibgraph.cli.options import (
     HalfOption,
     IterationsOption,
     MatcherOption,
+    MotionOption,
     OcclusionOption,
     RigOption,
     SearchDegOption,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 SEARCH_LIMIT_S = 1800.0
-_OF_BAGS = ("topic", "every_s", "tolerance_s", "stamps")
+_OF_BAGS = ("topic", "every_s", "tolerance_s", "stamps", "motion")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +61,7 @@ class MatchingOptions:
     every_s: EverySecondsOption = None
     tolerance_s: ToleranceOption = None
     stamps: StampsOption = None
+    motion: MotionOption = None
 
     @property
     def limit_s(self) -> float | None:

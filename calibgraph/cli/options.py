@@ -131,7 +131,8 @@ TopicOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=/TOPIC",
-        help="Topic of a camera's images, or of the clouds as lidar=/TOPIC; may be repeated. "
+        help="Topic of a camera's images, of the clouds as lidar=/TOPIC, or of odometry=/TOPIC; "
+        "may be repeated. "
         "(default: found by the messages' types)",
         rich_help_panel=_BAGS,
     ),
@@ -159,6 +160,15 @@ StampsOption = Annotated[
     typer.Option(
         metavar="header|record",
         help="Stamps of the sensors, or of recording. (default: header)",
+        rich_help_panel=_BAGS,
+    ),
+]
+MotionOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="none|odometry|tf|scans",
+        help="Correct clouds for the motion of the vehicle, to the stamps of the images: by "
+        "Odometry, /tf, or registration of neighbouring scans. (default: none)",
         rich_help_panel=_BAGS,
     ),
 ]

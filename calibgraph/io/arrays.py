@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.clouds import check_points, with_intensity
-from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera, Rig
 
 _XYZ = 3

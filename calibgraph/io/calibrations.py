@@ -23,7 +23,7 @@ from calibgraph.model.result_files import (
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
 )
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Finite, Rig
 from calibgraph.model.verdict import Check, Verdict
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def load_calibration(path: Path | str) -> Calibration:
         config=checked_model(Config, parts.config, path),
         camera_verdicts={k: Verdict(v.checks) for k, v in parts.camera_verdicts.items()},
         bootstrap=parts.bootstrap_covariance,
-        frames=tuple(frame.model_dump() for frame in parts.frames_used),
+        frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
         camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
         **{name: getattr(parts, name) for name in _PLAIN},
@@ -82,11 +82,17 @@ Matrix6 = Annotated[Any, _matrix(_POSE)]
 Square = Annotated[Any, _matrix(None)]
 
 
+class _Motion(BaseModel):
+    twist_per_s: tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+    to_s: Finite
+
+
 class _FrameEntry(BaseModel):
     frame: int
     name: str
     cloud: str
     images: dict[str, str]
+    motion: _Motion | None = None
 
 
 class _Checks(BaseModel):

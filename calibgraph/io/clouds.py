@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_file
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
+from calibgraph.io.motion import ScanMotion
 
 CLOUD_SUFFIXES = (".npy", ".bin", ".pcd", ".ply")
 MAX_CLOUD_BYTES = 2 * 2**30
@@ -35,12 +36,13 @@ _NUSCENES = ".pcd.bin"
 _MOST_COLUMNS = 64
 
 
-def load_cloud(path: Path | str) -> NDArray[np.float32]:
+def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np.float32]:
     """Read a cloud.
 
     Args:
         path: a .npy array (n, 3) or (n, 4+), a KITTI .bin (float32 x y z intensity), a nuScenes
             .pcd.bin (and the ring), .pcd or .ply; or the address of a message in a bag.
+        motion: for which points of a bag's message are corrected; None for none.
 
     Returns:
         (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
@@ -52,7 +54,7 @@ def load_cloud(path: Path | str) -> NDArray[np.float32]:
     """
     path = Path(path)
     if path.suffix == MESSAGE_SUFFIX:
-        return load_bag_cloud(path)
+        return load_bag_cloud(path, motion)
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     readers = {".npy": _read_npy, ".bin": _read_bin, ".pcd": _read_open3d, ".ply": _read_open3d}

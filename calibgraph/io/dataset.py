@@ -7,72 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.files import sha256
-from calibgraph.io.bags import MESSAGE_SUFFIX, BagOptions, hash_message, is_bag
-from calibgraph.io.bags.frames import frames_of_bag
+from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.rig import doubtful_axes
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
-from calibgraph.io.images import load_image
+from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.nuscenes import describe_motion, is_nuscenes
 from calibgraph.io.rigs import load_rig
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One cloud and the images taken with it.
-
-    Attributes:
-        index: number of the frame in its dataset, the ``frame`` of its correspondences.
-        name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
-        cloud_path: the cloud's file, or its address in a bag.
-        image_paths: the same of the image, per camera that has one.
-    """
-
-    index: int
-    name: str
-    cloud_path: Path
-    image_paths: dict[str, Path]
-
-    def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
-        return load_cloud(self.cloud_path)
-
-    def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
-        return load_image(self.image_paths[name], camera)
-
-    def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """(height, width) the same image, gray."""
-        gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-        return np.asarray(gray, dtype=np.uint8)
-
-    def hashes(self) -> dict[str, str]:
-        """SHA-256 of the cloud and the images, by path."""
-        paths = (self.cloud_path, *self.image_paths.values())
-        return {str(path): hash_source(path) for path in paths}
-
-    def entry(self) -> dict[str, Any]:
-        """The frame's number and files, as a result keeps them."""
-        return {
-            "frame": self.index,
-            "name": self.name,
-            "cloud": str(self.cloud_path),
-            "images": {name: str(path) for name, path in self.image_paths.items()},
-        }
 
 
 @dataclass(frozen=True)
@@ -193,12 +146,15 @@ def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Da
     """The dataset with the frames of a bag."""
     start = _next_index(data)
     found = frames_of_bag(path, list(data.rig.cameras), options)
-    recorded = tuple(
-        Frame(start + each.number, f"{prefix}{each.stamp_ns}", each.cloud, each.images)
-        for each in found.recorded
-    )
+    find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
+    recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
     data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
     return _with(data, tuple(recorded[i] for i in found.picked), recorded)
+
+
+def _bag_frame(found: BagFrame, start: int, prefix: str, find: MotionOf | None) -> Frame:
+    named = start + found.number, f"{prefix}{found.stamp_ns}", found.cloud, found.images
+    return Frame(*named) if find is None else MovingFrame(*named, partial(find, found))
 
 
 def _with(data: Dataset, frames: tuple[Frame, ...], recorded: tuple[Frame, ...]) -> Dataset:
@@ -226,11 +182,6 @@ def _complete(data: Dataset) -> Dataset:
             )
     recorded = (frame for frame in data.recorded if cameras <= frame.image_paths.keys())
     return replace(data, recorded=tuple(recorded))
-
-
-def hash_source(path: Path) -> str:
-    """SHA-256 of an image's or a cloud's file, or of its message in a bag."""
-    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)
 
 
 def spread_out(items: Sequence[Item], most: int) -> list[Item]:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.dataset import Dataset, Frame, spread_out
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
 from calibgraph.matching.standstill import View
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores

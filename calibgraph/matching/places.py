@@ -12,7 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
 
 Gray = NDArray[np.uint8]

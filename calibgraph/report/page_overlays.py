@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Camera
@@ -83,7 +83,7 @@ def draw_overlays(
         return {}, "the result was made from a table, which names no images"
     drawn: dict[str, Overlays] = {}
     try:
-        cloud = load_cloud(shown["cloud"])[:, :3].astype(np.float64)
+        cloud = load_entry_cloud(shown)[:, :3].astype(np.float64)
         for name in result.rig.cameras:
             if name in shown["images"]:
                 drawn[name] = _overlays(result, name, shown, cloud, errors.get(name))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_atomically
-from calibgraph.io.dataset import Frame
+from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera, Rig
 
 Array = NDArray[np.float64]

@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame, spread_out
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.augmented_fit import MIN_ROWS, fit_augmented

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Camera
@@ -87,7 +87,7 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
             "was made from with --dataset"
         )
     for number, entry in enumerate(result.frames):
-        points = load_cloud(Path(entry["cloud"]))[:, :3]
+        points = load_entry_cloud(entry)[:, :3]
         points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], np.float32)
         yield ViewFrame(
             number=entry["frame"],

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph import Correspondences, Dataset, Rig
-from calibgraph.io.dataset import Frame
+from calibgraph.io.frame import Frame
 from calibgraph.model.correspondences import concatenate
 from calibgraph.solver.camera_twist import project_with_jacobian
 from calibgraph.trust.image_checks import offset_checks

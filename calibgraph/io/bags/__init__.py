@@ -17,16 +17,22 @@ from calibgraph.io.bags.messages import is_bag as is_bag
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.options import BagOptions as BagOptions
 from calibgraph.io.bags.pictures import picture_of
-from calibgraph.io.bags.point_clouds import points_of
+from calibgraph.io.bags.point_clouds import points_of, timed_points_of
+from calibgraph.io.motion import ScanMotion
 
 
-def load_bag_cloud(path: Path) -> NDArray[np.float32]:
-    """(n, 4) the cloud in the message with this address.
+def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.float32]:
+    """(n, 4) the cloud in the message with this address, corrected for motion if it is given.
 
     Raises:
         FileError, DatasetError: if it cannot be read, or holds no point.
     """
-    cloud = points_of(read_message(path)[1], str(path))
+    content = read_message(path)[1]
+    if motion is None:
+        cloud = points_of(content, str(path))
+    else:
+        cloud, times_s = timed_points_of(content, str(path))
+        cloud[:, :3] = motion.correct(cloud[:, :3], times_s)
     if not len(cloud):
         raise FileError(path, "holds no point")
     return cloud

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import Bag
-from calibgraph.io.bags.options import BagOptions
+from calibgraph.io.bags.options import BagOptions, Motion
 from calibgraph.io.bags.point_clouds import time_fields
 from calibgraph.io.bags.stamps import TopicStamps, nearest, read_stamps, to_every_ns, windows_of
 from calibgraph.io.bags.topics import RigTopics, choose_topics
@@ -30,12 +30,14 @@ class BagFrame:
         stamp_ns: of the cloud.
         cloud: its address.
         images: the address of each camera's image.
+        to_s: the median stamp of the images, in seconds after that of the cloud.
     """
 
     number: int
     stamp_ns: int
     cloud: Path
     images: dict[str, Path]
+    to_s: float
 
 
 @dataclass(frozen=True)
@@ -86,19 +88,34 @@ def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> Ba
             stamp_ns=clouds.stamp_ns[row],
             cloud=clouds.paths[row],
             images={n: stamps[images[n]].paths[rows[row]] for n, rows in pairs.items()},
+            to_s=float(
+                np.median(
+                    [
+                        stamps[images[n]].stamp_ns[rows[row]] - clouds.stamp_ns[row]
+                        for n, rows in pairs.items()
+                    ]
+                )
+            )
+            / _S,
         )
         for row, cell in zip(complete, cells, strict=True)
     )
     picked = _picked(record_ns, cells, windows) if options.every_s else range(len(recorded))
-    return BagFrames(recorded, tuple(picked), f"{summary}{_note_on_times(bag, topics.lidar)}")
+    return BagFrames(recorded, tuple(picked), summary + _note(bag, topics.lidar, options.motion))
 
 
-def _note_on_times(bag: Bag, topic: str) -> str:
-    """What to do if the points of a topic have times."""
+def _note(bag: Bag, topic: str, motion: Motion) -> str:
+    """How clouds are corrected for motion, or what to do if points have times."""
     times = time_fields(bag.first(topic))
+    if motion != "none":
+        of = times[0] if times else "stamp of the cloud, as points have no times"
+        return f"; clouds are corrected for motion by {motion}, with the {of}"
     if not times:
         return ""
-    return f"; points have a {times[0]}: correct the clouds for motion, or stand still"
+    return (
+        f"; points have a {times[0]}: unless they are corrected for motion, give --motion "
+        "odometry, tf or scans, or stand still"
+    )
 
 
 def _cells(record_ns: Rows, start_ns: int, every_s: float | None) -> Rows:

@@ -8,8 +8,9 @@ from types import MappingProxyType
 from typing import Literal, get_args
 
 Stamps = Literal["header", "record"]
-LIDAR = "lidar"
-"""The key of the clouds' topic in :attr:`BagOptions.topics`."""
+Motion = Literal["none", "odometry", "tf", "scans"]
+LIDAR, ODOMETRY = "lidar", "odometry"
+"""The keys of the clouds' topic and of the odometry's in :attr:`BagOptions.topics`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,13 +18,17 @@ class BagOptions:
     """What is read of a bag.
 
     Attributes:
-        topics: the clouds' topic under ``lidar``, and image topics by camera name; those that are
+        topics: the clouds' topic under ``lidar``, and image topics by camera name,
+            and that of the ``odometry``; those that are
             not given are found by their types.
         every_s: seconds between frames, of which only the surroundings are read; all if None.
         tolerance_s: largest difference of the stamps of a cloud and its images. The default is half
             a turn of a LiDAR at 10 Hz: streams of equal rates pair, whatever their phase.
         stamps: ``header``, those of the sensors; or ``record``, when a message was recorded, for
             sensors whose clocks differ.
+        motion: how clouds are corrected for the motion of the vehicle, to the median stamp of a
+            frame's images: by Odometry, by /tf, by registration of neighbouring scans; or
+            ``none``: they are as recorded, or corrected already.
 
     Raises:
         ValueError: if a value is out of range.
@@ -33,6 +38,7 @@ class BagOptions:
     every_s: float | None = None
     tolerance_s: float = 0.05
     stamps: Stamps = "header"
+    motion: Motion = "none"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topics", MappingProxyType(dict(self.topics)))
@@ -42,3 +48,7 @@ class BagOptions:
             raise ValueError(f"tolerance_s must not be negative, found {self.tolerance_s}")
         if self.stamps not in get_args(Stamps):
             raise ValueError(f"stamps {self.stamps!r}: known are {', '.join(get_args(Stamps))}")
+        if self.motion not in get_args(Motion):
+            raise ValueError(f"motion {self.motion!r}: known are {', '.join(get_args(Motion))}")
+        if self.motion != "none" and self.stamps != "header":
+            raise ValueError("motion is corrected by the stamps of the headers; leave out stamps")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from calibgraph.errors import DatasetError
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY = ("intensity", "reflectivity", "i")
 _TIMES = ("t", "time", "timestamp", "offset_time", "time_offset")  # Ouster, Velodyne, Hesai, Livox
+_STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smaller, since 1970 larger
+_LONGEST_S = 1.0
 
 
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
@@ -28,6 +31,52 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
     Raises:
         DatasetError: if it has no x y z, or less data than it declares.
     """
+    cloud, returned = _all_points(message, where)
+    return np.asarray(cloud[returned], dtype=np.float32)
+
+
+def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The points of a message that are returns, and when each was taken.
+
+    Times are whole numbers of nanoseconds after the stamp (Ouster, Livox), float32 seconds after it
+    (Velodyne), or float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
+
+    Returns:
+        (n, 4) as :func:`points_of`; (n,) seconds after the stamp, zeros if points have no times.
+
+    Raises:
+        DatasetError: as :func:`points_of`, or if times are not within a second of the stamp.
+    """
+    cloud, returned = _all_points(message, where)
+    points = np.asarray(cloud[returned], dtype=np.float32)
+    names = time_fields(message)
+    if not names:
+        return points, np.zeros(len(points))
+    times = _structured(message, where, names[:1])[names[0]][returned]
+    return points, _seconds_after(message.header.stamp, times, f"{where}: {names[0]}")
+
+
+def _seconds_after(stamp: Any, times: NDArray[Any], where: str) -> NDArray[np.float64]:
+    """(n,) seconds after a stamp."""
+    if times.dtype.kind in "iu":
+        seconds = times.astype(np.float64) / 1e9
+    elif times.max(initial=0.0) > _NANOSECOND_STAMPS:
+        stamp_ns = stamp.sec * 1e9 + stamp.nanosec
+        seconds = (times.astype(np.float64) - stamp_ns) / 1e9
+    elif times.max(initial=0.0) > _STAMPS:
+        seconds = times.astype(np.float64) - stamp.sec - stamp.nanosec / 1e9
+    else:
+        seconds = times.astype(np.float64)
+    if not np.all(np.abs(seconds) <= _LONGEST_S):  # not finite, too
+        raise DatasetError(
+            f"{where}: times from {np.min(seconds):.3g} to {np.max(seconds):.3g} s after the "
+            "stamp are not those of one scan; leave out --motion, or record it again"
+        )
+    return seconds
+
+
+def _all_points(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(n, 4) all points, and (n,) which are returns."""
     points = _structured(message, where)
     cloud = np.full((len(points), 4), np.nan, dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, or is a signalling NaN
@@ -35,7 +84,7 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
             cloud[:, column] = points[name]
         xyz = cloud[:, :3]
         returned: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
-    return np.asarray(cloud[returned], dtype=np.float32)
+    return cloud, returned
 
 
 def has_points(message: Any, where: str) -> bool:
@@ -50,10 +99,10 @@ def time_fields(message: Any) -> list[str]:
     return [each.name for each in message.fields if each.name in _TIMES]
 
 
-def _structured(message: Any, where: str) -> NDArray[np.void]:
-    """(n,) structured array of x, y, z and the intensity if there is one, without a copy."""
+def _structured(message: Any, where: str, chosen: Sequence[str] = ()) -> NDArray[np.void]:
+    """(n,) structured array of fields, by default x, y, z and an intensity, without a copy."""
     fields = {each.name: each for each in message.fields}
-    names = ["x", "y", "z", *[name for name in _INTENSITY if name in fields][:1]]
+    names = [*chosen] or ["x", "y", "z", *[name for name in _INTENSITY if name in fields][:1]]
     order = ">" if message.is_bigendian else "<"
     try:
         kind = np.dtype(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import CAMERA_INFO, CLOUDS, COMPRESSED_IMAGE, IMAGE, Bag
-from calibgraph.io.bags.options import LIDAR
+from calibgraph.io.bags.options import LIDAR, ODOMETRY
 from calibgraph.io.bags.pictures import is_depth
 
 _BEST_FIRST = ("image_raw", "image", "image_color", "image_mono", "image_rect_color", "image_rect")
@@ -56,7 +56,7 @@ def choose_topics(
     for name, topic in named.items():
         if topic not in bag.topics or not bag.topics[topic].count:
             raise DatasetError(f"{bag.path}: has no messages of {topic} ({name}); {_listed(bag)}")
-    chosen = {name: topic for name, topic in named.items() if name != LIDAR}
+    chosen = {name: topic for name, topic in named.items() if name not in (LIDAR, ODOMETRY)}
     wanted = list(chosen) if cameras is None else list(cameras)
     for name in set(chosen) - set(wanted):
         raise DatasetError(f"--topic {name}: the rig has no such camera, but {', '.join(wanted)}")

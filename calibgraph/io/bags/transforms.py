@@ -7,6 +7,7 @@ with the parent in ``header.frame_id``.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,10 @@ def static_tree(bag: Bag) -> Tree:
     for message in bag.messages(names):
         for stamped in message.content.transforms:
             child, parent = stamped.child_frame_id, stamped.header.frame_id
-            tree[child.lstrip("/")] = parent.lstrip("/"), _matrix(stamped.transform)
+            tree[child.lstrip("/")] = (
+                parent.lstrip("/"),
+                matrix_of(stamped.transform.translation, stamped.transform.rotation),
+            )
     return tree
 
 
@@ -54,9 +58,8 @@ def _ancestors(tree: Tree, frame: str) -> dict[str, Array]:
     return found
 
 
-def _matrix(transform: object) -> Array:
-    """(4, 4) of a geometry_msgs Transform."""
-    shift, turn = transform.translation, transform.rotation  # type: ignore[attr-defined]
+def matrix_of(shift: Any, turn: Any) -> Array:
+    """(4, 4) of a geometry_msgs Vector3 or Point, and a Quaternion."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     T[:3, 3] = shift.x, shift.y, shift.z

@@ -9,7 +9,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Dataset, Frame, spread_out
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.surfaces import planes_at

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Frame
+from calibgraph.io.frame import Frame
 from calibgraph.matching.cmrnext import confidence
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
 from calibgraph.matching.cmrnext.inputs import (

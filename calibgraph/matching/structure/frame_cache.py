@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.dataset import Frame
+from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.window_table import WindowTables

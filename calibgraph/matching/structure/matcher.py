@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph.io.dataset import Dataset, Frame, spread_out
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
 from calibgraph.matching.protocol import Stage1Source, Start
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibgraph import BagOptions, Dataset, DatasetError, Frame, calibrate, load_dataset, load_rig
-from calibgraph.io.dataset import hash_source
+from calibgraph.io.frame import hash_source
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     KINDS,
@@ -242,7 +242,10 @@ def test_times_of_points_are_noticed(tmp_path: Path) -> None:
         return replace(each, content=make.cloud(points, stamp_of(each)))
 
     data = load_dataset(changed(tmp_path, with_times))
-    assert data.notes[-1].endswith("points have a t: correct the clouds for motion, or stand still")
+    assert data.notes[-1].endswith(
+        "points have a t: unless they are corrected for motion, give --motion odometry, tf or "
+        "scans, or stand still"
+    )
 
 
 def test_a_file_of_a_bag_is_a_bag(tmp_path: Path) -> None:

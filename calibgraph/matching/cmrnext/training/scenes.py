@@ -8,7 +8,8 @@ from pathlib import Path
 
 from calibgraph.errors import DatasetError
 from calibgraph.io import kitti
-from calibgraph.io.dataset import Dataset, Frame, load_dataset
+from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Camera, Rig
 

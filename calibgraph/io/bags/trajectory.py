@@ -1,0 +1,208 @@
+"""How the LiDAR of a bag moves, from odometry, from /tf, or by registration of its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.bags.frames import BagFrame
+from calibgraph.io.bags.messages import TRANSFORMS, Bag, read_message
+from calibgraph.io.bags.options import ODOMETRY, BagOptions
+from calibgraph.io.bags.point_clouds import points_of
+from calibgraph.io.bags.transforms import matrix_of, static_tree, transform_between
+from calibgraph.io.motion import ScanMotion, twist_between
+
+Array = NDArray[np.float64]
+MotionOf = Callable[[BagFrame], ScanMotion]
+
+_ODOMETRY_TYPE, _MOVING_TOPIC = "nav_msgs/msg/Odometry", "tf"
+_HALF_S = 0.05  # half a turn of a LiDAR at 10 Hz: the velocity is the mean of a scan
+_GAP_S = 0.5
+"""Poses farther apart are not interpolated: at 2 m/s^2 the mean is off by 0.25 m/s, 1 cm a scan."""
+_COARSE_M, _FINE_M = 1.0, 0.25
+_REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s
+_NEIGHBOUR_S = 0.35  # of a scan, that is registered with it
+
+
+def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -> MotionOf:
+    """A function of a frame that returns the motion during its scan.
+
+    Args:
+        path: of the bag.
+        frames: all that were recorded, in order.
+        options: where the motion is from.
+
+    Raises:
+        FileError, DatasetError: if the bag has no such topic or no such transforms.
+    """
+    if options.motion == "scans":
+        return _ByScans(frames)
+    bag = Bag(path)
+    lidar = read_message(frames[0].cloud)[1].header.frame_id.lstrip("/")
+    poses = _odometry if options.motion == "odometry" else _moving_transforms
+    return _ByPoses(_Trajectory.of(path, poses(bag, lidar, options)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trajectory:
+    """Poses of the LiDAR in a fixed frame: (n,) stamps [s] after the first [ns], and (n, 4, 4)."""
+
+    path: Path
+    start_ns: int
+    stamps_s: Array
+    T_world_lidar: Array
+
+    @staticmethod
+    def of(path: Path, poses: Iterator[tuple[int, Array]]) -> _Trajectory:
+        """Of stamps [ns] and poses in any order; of several with one stamp, the last.
+
+        Raises:
+            DatasetError: if there are less than two.
+        """
+        by_stamp = dict(sorted(dict(poses).items()))
+        if len(by_stamp) < 2:  # noqa: PLR2004
+            raise DatasetError(f"{path}: has {len(by_stamp)} poses of the LiDAR; --motion needs "
+                               "those of the drive, or --motion scans")  # fmt: skip
+        start_ns = next(iter(by_stamp))
+        stamps = np.array([stamp - start_ns for stamp in by_stamp], np.float64) / 1e9
+        return _Trajectory(path, start_ns, stamps, np.array(list(by_stamp.values())))
+
+    def at(self, stamp_s: float) -> Array:
+        """(4, 4) between the poses before and after.
+
+        Raises:
+            DatasetError: if they are farther apart than can be interpolated.
+        """
+        after = int(np.clip(np.searchsorted(self.stamps_s, stamp_s), 1, len(self.stamps_s) - 1))
+        both = self.stamps_s[after - 1 : after + 1]
+        if not both[0] - _HALF_S <= stamp_s <= both[1] + _HALF_S or both[1] - both[0] > _GAP_S:
+            raise DatasetError(
+                f"{self.path}: no poses of the LiDAR within {_GAP_S} s at "
+                f"{self.start_ns / 1e9 + stamp_s:.3f} s; choose frames that have them (--frames), "
+                "or --motion scans"
+            )
+        share = (stamp_s - both[0]) / (both[1] - both[0])
+        pair = self.T_world_lidar[after - 1 : after + 1]
+        T = np.eye(4)
+        T[:3, 3] = (1 - share) * pair[0, :3, 3] + share * pair[1, :3, 3]
+        turn = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))
+        T[:3, :3] = turn(np.clip(share, 0, 1)).as_matrix()
+        return T
+
+
+@dataclass(frozen=True, eq=False)
+class _ByPoses:
+    trajectory: _Trajectory
+
+    def __call__(self, frame: BagFrame) -> ScanMotion:
+        middle_s = (frame.stamp_ns - self.trajectory.start_ns) / 1e9 + frame.to_s / 2
+        before, after = (self.trajectory.at(middle_s + t) for t in (-_HALF_S, _HALF_S))
+        return _motion(twist_between(before, after, 2 * _HALF_S), frame)
+
+
+@dataclass(frozen=True, eq=False)
+class _ByScans:
+    frames: Sequence[BagFrame]
+
+    def __call__(self, frame: BagFrame) -> ScanMotion:
+        """The mean velocity from the scan before to this one, and to the one after.
+
+        Raises:
+            DatasetError: if there is neither, or they do not fit.
+        """
+        place = next(k for k, other in enumerate(self.frames) if other.number == frame.number)
+        beside = [*self.frames[max(place - 1, 0) : place], *self.frames[place + 1 : place + 2]]
+        near = [f for f in beside if 0 < abs(f.stamp_ns - frame.stamp_ns) < _NEIGHBOUR_S * 1e9]
+        if not near:
+            raise DatasetError(
+                f"{frame.cloud}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
+                "motion could be found; choose other frames, or --motion odometry or tf"
+            )
+        cloud = _xyz(frame)
+        twists = [
+            twist_between(np.eye(4), _register(cloud, _xyz(other), frame.cloud),
+                          (other.stamp_ns - frame.stamp_ns) / 1e9)
+            for other in near
+        ]  # fmt: skip
+        return _motion(np.mean(twists, axis=0), frame)
+
+
+def _motion(twist: Array, frame: BagFrame) -> ScanMotion:
+    return ScanMotion(tuple(float(value) for value in twist), frame.to_s)
+
+
+def _xyz(frame: BagFrame) -> Array:
+    points = points_of(read_message(frame.cloud)[1], str(frame.cloud))
+    return np.ascontiguousarray(points[:, :3], dtype=np.float64)
+
+
+def _register(target: Array, source: Array, where: Path) -> Array:
+    """(4, 4) T_target_source of two scans, coarse and then fine.
+
+    Raises:
+        CalibrationError: if small_gicp is missing.
+        DatasetError: if they do not fit.
+    """
+    try:
+        import small_gicp
+    except ImportError as error:
+        raise CalibrationError(
+            f"--motion scans needs small_gicp: pip install 'calibgraph[motion]' ({error})"
+        ) from error
+    T = np.eye(4)
+    for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
+        found = small_gicp.align(
+            target, source, T, downsampling_resolution=size_m, max_correspondence_distance=reach_m
+        )
+        T = np.asarray(found.T_target_source)
+    if not found.converged:
+        raise DatasetError(f"{where}: its scan and that beside it do not fit; choose other frames")
+    return T
+
+
+def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
+    """Stamps and T_world_lidar of Odometry: the pose of its child_frame_id in its frame_id."""
+    found = [topic.name for topic in bag.of_type(_ODOMETRY_TYPE)]
+    named = options.topics.get(ODOMETRY)
+    if named is None and len(found) != 1:
+        raise DatasetError(
+            f"{bag.path}: has {len(found)} topics of Odometry ({', '.join(found) or 'none'}); name "
+            f"one by --topic {ODOMETRY}=/TOPIC, or use --motion tf or scans"
+        )
+    tree = static_tree(bag)
+    for message in bag.messages([named or found[0]]):
+        child = message.content.child_frame_id.lstrip("/")
+        T_child_lidar = transform_between(tree, child, lidar)
+        if T_child_lidar is None:
+            raise DatasetError(
+                f"{bag.path}: /tf_static does not connect the LiDAR's frame {lidar!r} with "
+                f"{child!r} of the odometry; use --motion scans"
+            )
+        pose = message.content.pose.pose
+        T_world_child = matrix_of(pose.position, pose.orientation)
+        yield _stamp_ns(message.content), T_world_child @ T_child_lidar
+
+
+def _moving_transforms(bag: Bag, lidar: str, _: BagOptions) -> Iterator[tuple[int, Array]]:
+    """Stamps and T_parent_lidar of the /tf transforms of a frame that the LiDAR hangs from."""
+    tree = static_tree(bag)
+    topics = [t.name for t in bag.of_type(TRANSFORMS) if t.name.split("/")[-1] == _MOVING_TOPIC]
+    for message in bag.messages(topics):
+        for each in message.content.transforms:
+            child = each.child_frame_id.lstrip("/")
+            T_child_lidar = transform_between(tree, child, lidar)
+            if T_child_lidar is not None:
+                T = matrix_of(each.transform.translation, each.transform.rotation)
+                yield _stamp_ns(each), T @ T_child_lidar
+
+
+def _stamp_ns(stamped: Any) -> int:
+    stamp = stamped.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -1,0 +1,106 @@
+"""A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.files import sha256
+from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
+from calibgraph.io.clouds import load_cloud
+from calibgraph.io.images import load_image
+from calibgraph.io.motion import ScanMotion
+from calibgraph.model.rig import Camera
+
+_MOTION = "motion"
+"""The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One cloud and the images taken with it.
+
+    Attributes:
+        index: number of the frame in its dataset, the ``frame`` of its correspondences.
+        name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
+        cloud_path: the cloud's file, or its address in a bag.
+        image_paths: the same of the image, per camera that has one.
+    """
+
+    index: int
+    name: str
+    cloud_path: Path
+    image_paths: dict[str, Path]
+
+    def load_cloud(self) -> NDArray[np.float32]:
+        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
+        return load_cloud(self.cloud_path)
+
+    def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
+        """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
+        return load_image(self.image_paths[name], camera)
+
+    def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
+        """(height, width) the same image, gray."""
+        gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
+        return np.asarray(gray, dtype=np.uint8)
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the cloud and the images, by path."""
+        paths = (self.cloud_path, *self.image_paths.values())
+        return {str(path): hash_source(path) for path in paths}
+
+    def entry(self) -> dict[str, Any]:
+        """The frame's number and files, as a result keeps them."""
+        return {
+            "frame": self.index,
+            "name": self.name,
+            "cloud": str(self.cloud_path),
+            "images": {name: str(path) for name, path in self.image_paths.items()},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MovingFrame(Frame):
+    """A frame whose cloud is corrected for the motion during its scan.
+
+    Attributes:
+        find_motion: computes the motion; called once, when the cloud or the entry is needed.
+    """
+
+    find_motion: Callable[[], ScanMotion]
+
+    @cached_property
+    def motion(self) -> ScanMotion:
+        """During the scan."""
+        return self.find_motion()
+
+    def load_cloud(self) -> NDArray[np.float32]:
+        """(n, 4) x y z [m] at the stamp of the images, intensity."""
+        return load_cloud(self.cloud_path, self.motion)
+
+    def entry(self) -> dict[str, Any]:
+        """The frame's number, files and motion, as a result keeps them."""
+        return {**super().entry(), _MOTION: self.motion.entry()}
+
+
+def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
+    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was.
+
+    Raises:
+        FileError, DatasetError: if it cannot be read.
+    """
+    motion = entry.get(_MOTION)
+    return load_cloud(entry["cloud"], None if motion is None else ScanMotion.of_entry(motion))
+
+
+def hash_source(path: Path) -> str:
+    """SHA-256 of an image's or a cloud's file, or of its message in a bag."""
+    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)

@@ -1,0 +1,251 @@
+"""Scans of a vehicle that drives a bend, in bags: corrected, they are those of one instant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
+from calibgraph.io.bags.point_clouds import timed_points_of
+from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.motion import ScanMotion
+from calibgraph.model.geometry import invert
+from tests.conftest import SAMPLE
+from tests.io.bags.writing import (
+    PERIOD_NS,
+    START_NS,
+    Messages,
+    Stamped,
+    tree_of,
+    write_bag,
+)
+
+RIG = load_rig(SAMPLE)
+MAKE = Messages("mcap")
+TWIST = np.array([0.0, 0.0, 0.3, 10.0, 0.0, 0.0])  # of base: 36 km/h along a bend
+T_BASE_LIDAR = tree_of(RIG)[0][2]
+IMAGE_S = 0.04  # after the start of the scan
+FRAMES = 4
+
+
+def T_world_lidar(seconds: float) -> np.ndarray:
+    T_world_base = gtsam.Pose3.Expmap(TWIST * seconds).matrix()
+    return np.asarray(T_world_base @ T_BASE_LIDAR)
+
+
+def world(seed: int, count: int = 12_000) -> np.ndarray:
+    """(n, 3) a road between walls and boxes; other points of the same surfaces with each seed."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-30, 40, (2, count)), rng.uniform(0, 4, count)
+    ground = np.column_stack([u[0], u[1], 0.0 * v])
+    walls = [np.column_stack([u[0], side + 0.0 * v, v]) for side in (-9.0, 14.0)] + [
+        np.column_stack([far + 0.0 * v, u[1], v]) for far in (-25.0, 35.0)
+    ]
+    boxes = [
+        np.column_stack([x + 2 * np.sign(np.sin(u[0])), y + u[1] % 3, v])
+        for x, y in ((5, -6), (12, 8), (-8, 5), (20, -4), (-14, -7))
+    ]
+    return np.concatenate([ground, *walls, *boxes])[rng.permutation(10 * count)[: 2 * count]]
+
+
+def scan(start_s: float, points: np.ndarray) -> np.ndarray:
+    """(n,) points that are taken one after another in 0.1 s, as a LiDAR turns."""
+    times = np.linspace(0, 0.1, len(points))
+    seen = np.array([
+        inverse[:3, :3] @ p + inverse[:3, 3]
+        for inverse, p in (
+            (invert(T_world_lidar(start_s + t)), p) for t, p in zip(times, points, strict=True)
+        )
+    ])  # fmt: skip
+    kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
+    rows = np.zeros(len(points), kind)
+    rows["x"], rows["y"], rows["z"] = seen.T
+    rows["t"] = np.rint(times * 1e9)
+    return rows
+
+
+def messages() -> tuple[list[Stamped], list[np.ndarray]]:
+    """The messages, and per frame the points of the world."""
+    written = [
+        Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, MAKE.transforms(tree_of(RIG)))
+    ]
+    worlds = []
+    for name, camera in RIG.cameras.items():
+        info = MAKE.camera_info(camera, f"{name}_optical")
+        written.append(
+            Stamped(f"/{name}/camera_info", "sensor_msgs/msg/CameraInfo", START_NS, info)
+        )
+    for number in range(FRAMES):
+        stamp_ns = START_NS + number * PERIOD_NS
+        worlds.append(world(number))
+        cloud = MAKE.cloud(scan(number * PERIOD_NS / 1e9, worlds[-1]), stamp_ns)
+        written.append(Stamped("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud))
+        for name in RIG.cameras:
+            image = MAKE.image(np.zeros((4, 6), np.uint8), "mono8", stamp_ns + int(IMAGE_S * 1e9))
+            written.append(Stamped(f"/{name}/image_raw", "sensor_msgs/msg/Image", stamp_ns, image))
+    for tick in range(-10, 60):  # 50 Hz
+        stamp_ns, T = START_NS + tick * 20_000_000, gtsam.Pose3.Expmap(TWIST * tick * 0.02).matrix()
+        moving = MAKE.transforms([("odom", "base", T)])
+        moving.transforms[0].header.stamp = MAKE.header(stamp_ns, "").stamp
+        elsewhere = MAKE.transforms([("map", "odom", np.eye(4))]).transforms
+        moving.transforms.extend(elsewhere)
+        written.append(Stamped("/tf", "tf2_msgs/msg/TFMessage", stamp_ns, moving))
+        odometry = odometry_of(moving.transforms[0])
+        written.append(Stamped("/odom", "nav_msgs/msg/Odometry", stamp_ns, odometry))
+    return sorted(written, key=lambda each: each.record_ns), worlds
+
+
+def odometry_of(stamped: Any) -> Any:
+    t, q = stamped.transform.translation, stamped.transform.rotation
+    point = MAKE.make("geometry_msgs/msg/Point", x=t.x, y=t.y, z=t.z)
+    pose = MAKE.make("geometry_msgs/msg/Pose", position=point, orientation=q)
+    zero = MAKE.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    twist = MAKE.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    none = np.zeros(36)
+    return MAKE.make(
+        "nav_msgs/msg/Odometry", header=stamped.header, child_frame_id="base",
+        pose=MAKE.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=none),
+        twist=MAKE.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[np.ndarray]]:
+    written, worlds = messages()
+    return write_bag(tmp_path_factory.mktemp("moving"), "mcap", written), worlds
+
+
+def errors_m(bag: tuple[Path, list[np.ndarray]], motion: Any) -> list[float]:
+    """Root mean square per frame, against the points as seen when the images were taken."""
+    data = load_dataset(bag[0], bag=BagOptions(motion=motion))
+    found = []
+    for number, (frame, points) in enumerate(zip(data.frames, bag[1], strict=True)):
+        inverse = invert(T_world_lidar(number * PERIOD_NS / 1e9 + IMAGE_S))
+        expected = points @ inverse[:3, :3].T + inverse[:3, 3]
+        cloud = frame.load_cloud()
+        np.testing.assert_array_equal(cloud, load_entry_cloud(frame.entry()))
+        found.append(float(np.sqrt(np.mean((cloud[:, :3] - expected) ** 2 * 3))))
+    return found
+
+
+def test_scans_of_a_moving_vehicle_are_off_as_they_are(
+    bag: tuple[Path, list[np.ndarray]],
+) -> None:
+    assert min(errors_m(bag, "none")) > 0.25
+    (note,) = [n for n in load_dataset(bag[0]).notes if "points have a t" in n]
+    assert note.endswith("give --motion odometry, tf or scans, or stand still")
+
+
+@pytest.mark.parametrize("motion", ["odometry", "tf"])
+def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> None:
+    assert max(errors_m(bag, motion)) < 2e-4  # on the bend: 10 m/s 0.3 /s (20 ms)^2 / 8
+
+
+def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarray]]) -> None:
+    pytest.importorskip("small_gicp")
+    assert max(errors_m(bag, "scans")) < 0.01  # surfaces without noise, in voxels of 0.25 m
+
+
+def test_the_note_states_the_correction(bag: tuple[Path, list[np.ndarray]]) -> None:
+    notes = load_dataset(bag[0], bag=BagOptions(motion="tf")).notes
+    assert notes[-1].endswith("clouds are corrected for motion by tf, with the t")
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("<u4", [0, 50_000_000]),
+        ("<f4", [0.0, 0.05]),
+        ("<f8", [START_NS / 1e9, START_NS / 1e9 + 0.05]),
+        ("<f8", [float(START_NS), START_NS + 5e7]),
+    ],
+)
+def test_times_of_all_drivers_are_read(kind: str, values: list[float]) -> None:
+    rows = np.ones(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", kind)])
+    rows["timestamp"] = values
+    _, times = timed_points_of(MAKE.cloud(rows, START_NS), "here")
+    np.testing.assert_allclose(times, [0.0, 0.05], atol=1e-6)  # float64 stamps: 0.2 us
+
+
+def test_times_that_are_none_are_refused() -> None:
+    rows = np.ones(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
+    rows["time"] = 7.0, np.nan
+    with pytest.raises(DatasetError, match="time: times from .* are not those of one scan"):
+        timed_points_of(MAKE.cloud(rows, START_NS), "here")
+
+
+def test_what_is_missing_is_named(bag: tuple[Path, list[np.ndarray]], tmp_path: Path) -> None:
+    written, _ = messages()
+    still = [each for each in written if each.topic not in ("/odom", "/tf")]
+    parked = write_bag(tmp_path / "still", "mcap", still)
+    with pytest.raises(DatasetError, match="has 0 topics of Odometry"):
+        load_dataset(parked, bag=BagOptions(motion="odometry"))
+    with pytest.raises(DatasetError, match="has 0 poses of the LiDAR"):
+        load_dataset(parked, bag=BagOptions(motion="tf"))
+    few = [e for e in written if e.topic != "/odom" or e.record_ns < START_NS + PERIOD_NS]
+    short = write_bag(tmp_path / "short", "mcap", few)
+    last = load_dataset(short, bag=BagOptions(motion="odometry")).frames[-1]
+    with pytest.raises(DatasetError, match="no poses of the LiDAR within 0.5 s at"):
+        last.load_cloud()
+    with pytest.raises(ValueError, match="motion 'wheels': known are none, odometry, tf, scans"):
+        BagOptions(motion="wheels")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="by the stamps of the headers"):
+        BagOptions(motion="tf", stamps="record")
+
+
+def driven_sample(folder: Path) -> Path:
+    """The sample as a bag of a vehicle that drives at 8 to 12 m/s in every frame, and turns."""
+    data, rng = load_dataset(SAMPLE), np.random.default_rng(7)
+    tree = MAKE.transforms(tree_of(RIG))
+    written = [Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, tree)]
+    for name, camera in RIG.cameras.items():
+        info = MAKE.camera_info(camera, f"{name}_optical")
+        topic = f"/{name}/camera_info"
+        written.append(Stamped(topic, "sensor_msgs/msg/CameraInfo", START_NS, info))
+    for number, frame in enumerate(data.frames):
+        stamp_ns = START_NS + number * 10 * 10**9
+        twist = np.array([0, 0, rng.uniform(-0.4, 0.4), rng.uniform(8, 12), 0, 0])
+        cloud = MAKE.cloud(turned_scan(frame.load_cloud(), twist), stamp_ns)
+        written.append(Stamped("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud))
+        for name, path in frame.image_paths.items():
+            taken_ns = stamp_ns + int(IMAGE_S * 1e9)
+            jpeg = MAKE.compressed(path.read_bytes(), "jpeg", taken_ns)
+            topic = f"/{name}/image_raw/compressed"
+            written.append(Stamped(topic, "sensor_msgs/msg/CompressedImage", stamp_ns, jpeg))
+        for tick in range(-10, 20):
+            T = gtsam.Pose3.Expmap(twist * tick * 0.02).matrix()
+            stamped = MAKE.transforms([("odom", "base", T)]).transforms[0]
+            tick_ns = stamp_ns + tick * 20_000_000
+            stamped.header.stamp = MAKE.header(tick_ns, "").stamp
+            written.append(Stamped("/odom", "nav_msgs/msg/Odometry", tick_ns, odometry_of(stamped)))
+    return write_bag(folder, "mcap", sorted(written, key=lambda each: each.record_ns))
+
+
+def turned_scan(cloud: np.ndarray, twist_base: np.ndarray) -> np.ndarray:
+    """A cloud of the instant of the images, as a LiDAR that moves sees it in a turn of 0.1 s."""
+    times = (np.pi - np.arctan2(cloud[:, 1], cloud[:, 0])) / (2 * np.pi) * 0.1
+    twist = gtsam.Pose3(invert(T_BASE_LIDAR)).AdjointMap() @ twist_base
+    at_image = ScanMotion(tuple(-twist), to_s=0.0)  # the inverse of the correction
+    rows = np.zeros(
+        len(cloud),
+        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("time", "<f4")],
+    )
+    moved = at_image.correct(cloud[:, :3], times - IMAGE_S)
+    rows["x"], rows["y"], rows["z"] = moved.T
+    rows["intensity"], rows["time"] = cloud[:, 3], times
+    return rows
+
+
+@pytest.mark.slow
+def test_a_calibration_while_driving_is_right_if_scans_are_corrected(tmp_path: Path) -> None:
+    bag, truth = driven_sample(tmp_path), load_rig(SAMPLE / "reference.yaml")
+    errors = {}
+    for motion in ("none", "odometry"):
+        data = load_dataset(bag, bag=BagOptions(motion=motion))  # type: ignore[arg-type]
+        found = evaluate(calibrate(data).rig, truth).cameras.values()
+        errors[motion] = max(error.translation_error_cm for error in found)
+    assert errors["odometry"] < 2.0 < errors["none"]
