@@ -12,8 +12,8 @@ DatasetArgument = Annotated[
     list[Path],
     typer.Argument(
         metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence, "
-        "nuScenes folder or scene, or ROS bag; several of one rig are calibrated together.",
+        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence or raw "
+        "drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated together.",
     ),
 ]
 RigOption = Annotated[

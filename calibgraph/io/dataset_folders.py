@@ -14,6 +14,7 @@ from calibgraph.files import is_utf8
 from calibgraph.io import kitti
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.kitti_raw import is_kitti_raw, kitti_raw_folders
 from calibgraph.io.nuscenes import is_nuscenes, nuscenes_frames
 
 
@@ -46,9 +47,11 @@ class FrameFiles:
 
 
 def folder_layout(folder: Path) -> FolderLayout:
-    """The layout of a KITTI odometry sequence, or of a dataset folder."""
+    """The layout of a KITTI odometry sequence or raw drive, or of a dataset folder."""
     if (folder / kitti.CALIBRATION_NAME).is_file():
         return FolderLayout(folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder))
+    if is_kitti_raw(folder):
+        return FolderLayout(*kitti_raw_folders(folder))
     cameras = {path.name: path for path in sorted((folder / "cameras").glob("*/"))}
     return FolderLayout(folder / "lidar", cameras)
 

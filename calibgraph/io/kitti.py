@@ -12,6 +12,8 @@ from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.images import image_size
 from calibgraph.model.rig import Camera, Rig
 
+Array = NDArray[np.float64]
+
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"
 
@@ -42,45 +44,61 @@ def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
     folders = camera_folders(sequence)
     if not folders:
         raise FileError(sequence, "has no image folder (image_0 .. image_3)")
-    cameras = {
-        name: _camera(path, matrices, f"P{name[-1]}", folder, along_x_only=shift_along_x_only)
-        for name, folder in folders.items()
-    }
+    cameras = {}
+    for name, folder in folders.items():
+        for needed in (f"P{name[-1]}", "Tr"):
+            if needed not in matrices:
+                raise FileError(path, f"line {needed!r} is missing")
+        T_rectified_lidar = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
+        cameras[name] = camera_of_projection(
+            matrices[f"P{name[-1]}"],
+            T_rectified_lidar,
+            first_image_size(folder),
+            f"{path}: P{name[-1]}",
+            along_x_only=shift_along_x_only,
+        )
     return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
 
 
-def _camera(
-    path: Path,
-    matrices: dict[str, NDArray[np.float64]],
-    key: str,
-    folder: Path,
+def camera_of_projection(
+    P: Array,
+    T_rectified_lidar: Array,
+    size_px: tuple[int, int],
+    where: str,
     *,
-    along_x_only: bool,
+    along_x_only: bool = False,
 ) -> Camera:
-    for needed in (key, "Tr"):
-        if needed not in matrices:
-            raise FileError(path, f"line {needed!r} is missing")
-    P, K = matrices[key], matrices[key][:, :3]
+    """A camera of a rectified rig.
+
+    Args:
+        P: (3, 4) K [I | b], from the rectified frame that all cameras share.
+        T_rectified_lidar: (4, 4) to that frame.
+        size_px: width and height.
+        where: the file and its line, for errors.
+        along_x_only: see :func:`load_kitti_rig`.
+
+    Raises:
+        FileError: if P is no such matrix, or the transform is none.
+    """
+    K = P[:, :3]
     if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise FileError(path, f"{key} is no projection matrix of a camera: {P.tolist()}")
+        raise FileError(where, f"is no projection matrix of a camera: {P.tolist()}")
     plain = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
     if not np.allclose(K, plain, rtol=0, atol=_ROUNDED):
         raise FileError(
-            path,
-            f"{key} begins with {K.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; undo its scale, "
+            where,
+            f"begins with {K.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; undo its scale, "
             "and undistort the skew",
         )
     shift = np.eye(4)
     shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
-    lidar_to_rectified = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
-    width, height = _image_size(folder)
     content = {
-        "width_px": width,
-        "height_px": height,
+        "width_px": size_px[0],
+        "height_px": size_px[1],
         "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
-        "T_camera_lidar": shift @ lidar_to_rectified,
+        "T_camera_lidar": shift @ T_rectified_lidar,
     }
-    return checked_model(Camera, content, f"{path}: {key} and Tr")
+    return checked_model(Camera, content, f"{where} and the LiDAR's pose")
 
 
 def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -98,7 +116,12 @@ def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
     return matrices
 
 
-def _image_size(folder: Path) -> tuple[int, int]:
+def first_image_size(folder: Path) -> tuple[int, int]:
+    """Width and height of the first image of a folder.
+
+    Raises:
+        FileError: if there is none.
+    """
     images = sorted(folder.glob("*.png"))
     if not images:
         raise FileError(folder, "holds no .png image")

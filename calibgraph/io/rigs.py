@@ -1,4 +1,4 @@
-"""Rigs from disk: rig files, results, dataset folders, KITTI sequences, nuScenes, ROS bags."""
+"""Rigs from disk: rig files, results, dataset folders, KITTI, nuScenes, ROS bags."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import rig_of_bag
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.kitti_raw import is_kitti_raw, load_kitti_raw_rig
 from calibgraph.io.nuscenes import is_nuscenes, load_nuscenes_rig
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Rig
@@ -20,7 +21,7 @@ RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     """Read a rig from a rig file, a result, a dataset, a KITTI sequence, nuScenes or a bag.
 
-    A result gives the calibrated extrinsics, a KITTI sequence those of its own ``calib.txt``, a
+    A result gives the calibrated extrinsics, KITTI those of its own calibration, a
     nuScenes folder those of its calibrated_sensor, a bag those of its /tf_static.
 
     Args:
@@ -35,6 +36,8 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
         return rig_of_bag(path, bag)
     if is_nuscenes(path):
         return load_nuscenes_rig(path)
+    if is_kitti_raw(path):
+        return load_kitti_raw_rig(path)
     if path.name == CALIBRATION_NAME:
         return load_kitti_rig(path.parent)
     content = read_yaml(path)
@@ -65,7 +68,7 @@ def rig_file(path: Path | str) -> Path:
 def find_rig_file(path: Path | str) -> Path | None:
     """The path itself, or the rig file of a folder of files; None if it holds none."""
     folder = Path(path)
-    if not folder.is_dir() or is_bag(folder) or is_nuscenes(folder):
+    if not folder.is_dir() or is_bag(folder) or is_nuscenes(folder) or is_kitti_raw(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Rig, StructureMatcher
+from calibgraph import Rig
 from calibgraph.matching.structure.common_features import CommonFeatures
+from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.model.geometry import pose_difference
 from calibgraph.parallel import core_pool
 from tests.conftest import SAMPLE
@@ -19,7 +20,7 @@ def common(truth: Rig) -> CommonFeatures:
     lenses = truth.moved_to(dict.fromkeys(truth.cameras, np.eye(4)))
     frames = calibgraph.load_dataset(SAMPLE).select("0:3").frames
     with core_pool() as cores:
-        loaded = StructureMatcher()._load_frames(frames, lenses, cores)
+        loaded = load_camera_frames(FrameCache(), frames, lenses, cores)
         found = CommonFeatures(lenses, loaded, seed=0)
     return found
 

@@ -1,0 +1,97 @@
+"""KITTI raw drives, synchronised and rectified: ``DATE/DATE_drive_0005_sync``."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.files import read_text
+from calibgraph.io.kitti import camera_of_projection, first_image_size
+from calibgraph.model.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+
+_CLOUDS = "velodyne_points"
+_CAMERAS, _LIDAR = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
+
+
+def is_kitti_raw(folder: Path) -> bool:
+    """Whether a folder is a drive."""
+    return (folder / _CLOUDS / "data").is_dir()
+
+
+def kitti_raw_folders(drive: Path) -> tuple[Path, dict[str, Path]]:
+    """The folder of the clouds, and those of the images by camera (image_00 .. image_03)."""
+    images = {each.name: each / "data" for each in sorted(drive.glob("image_0[0-3]"))}
+    return drive / _CLOUDS / "data", images
+
+
+def load_kitti_raw_rig(drive: Path) -> Rig:
+    """The rig of a drive, from the calibration in it or in the folder of its date.
+
+    Camera k projects by P_rect_0k R_rect_00 [R | T], so T_camera_lidar is
+    translate(K^-1 P[:, 3]) R_rect_00 [R | T].
+
+    Raises:
+        FileError: if a file is missing or malformed, or images are not rectified.
+    """
+    cameras, lidar = (_read(drive, name) for name in (_CAMERAS, _LIDAR))
+    T_camera0_lidar, rectify = np.eye(4), np.eye(4)
+    T_camera0_lidar[:3, :3] = _value(lidar, "R", (3, 3))
+    T_camera0_lidar[:3, 3] = _value(lidar, "T", (3,))
+    rectify[:3, :3] = _value(cameras, "R_rect_00", (3, 3))
+    folders = kitti_raw_folders(drive)[1]
+    if not folders:
+        raise FileError(drive, "has no image folder (image_00 .. image_03)")
+    T = rectify @ T_camera0_lidar
+    found = {name: _camera(cameras, name, folder, T) for name, folder in folders.items()}
+    return Rig(lidar=_CLOUDS, cameras=found)
+
+
+def _camera(calibration: _Values, name: str, folder: Path, T_rectified_lidar: Array) -> Camera:
+    number = name.removeprefix("image_")
+    size = first_image_size(folder)
+    rectified = tuple(_value(calibration, f"S_rect_{number}", (2,)).astype(int))
+    if size != rectified:
+        raise FileError(
+            folder, f"images are {size[0]}x{size[1]} px, rectified ones {rectified[0]}x"
+            f"{rectified[1]} px; take the _sync drive, not the _extract one"
+        )  # fmt: skip
+    P = _value(calibration, f"P_rect_{number}", (3, 4))
+    where = f"{calibration.path}: P_rect_{number}"
+    return camera_of_projection(P, T_rectified_lidar, size, where)
+
+
+class _Values(dict[str, list[float]]):
+    """The numbers of each line of a file."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        for line in read_text(path).splitlines():
+            name, _, values = line.partition(":")
+            with suppress(ValueError):  # a date
+                self[name.strip()] = [float(value) for value in values.split()]
+
+
+def _read(drive: Path, name: str) -> _Values:
+    for folder in (drive, drive.parent):
+        if (folder / name).is_file():
+            return _Values(folder / name)
+    raise FileError(
+        drive.parent / name, "no such file; put the calibration of the drive's date there"
+    )
+
+
+def _value(values: _Values, name: str, shape: tuple[int, ...]) -> Array:
+    found = values.get(name, [])
+    if len(found) != np.prod(shape) or not np.isfinite(found).all():
+        raise FileError(
+            values.path,
+            f"line {name!r} has {len(found)} numbers, expected {np.prod(shape)} finite ones",
+        )
+    return np.reshape(np.array(found), shape)

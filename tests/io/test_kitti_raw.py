@@ -1,0 +1,95 @@
+"""KITTI raw drives: frames by their names, extrinsics through the rectified frame."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibgraph import FileError, load_dataset, load_rig
+from tests.conftest import make_camera
+from tests.io.test_clouds import CLOUD
+
+WIDTH, HEIGHT = 1242, 375
+RECTIFY = Rotation.from_euler("xyz", [0.4, -0.3, 0.5], degrees=True).as_matrix()
+T_CAMERA0_LIDAR = make_camera((0.27, 0.0, -0.08), yaw_deg=0.5).T_camera_lidar
+BASELINES = {"02": [0.06, 0.001, 0.003], "03": [-0.47, 0.002, 0.003]}
+
+
+def text_of(name: str, values: np.ndarray) -> str:
+    return f"{name}: " + " ".join(f"{value:.15e}" for value in np.ravel(values))
+
+
+def written_drive(date: Path, frames: int = 2) -> Path:
+    drive = date / "2011_09_26_drive_0005_sync"
+    K = np.array([[721.5, 0, 609.6], [0, 721.5, 172.9], [0, 0, 1]])
+    lines = ["calib_time: 09-Jan-2012 13:57:47", text_of("R_rect_00", RECTIFY)]
+    for number, shift in BASELINES.items():
+        P = K @ np.column_stack([np.eye(3), shift])
+        lines += [text_of(f"S_rect_{number}", np.array([WIDTH, HEIGHT])),
+                  text_of(f"P_rect_{number}", P)]  # fmt: skip
+        images = drive / f"image_{number}" / "data"
+        images.mkdir(parents=True)
+        for frame in range(frames):
+            pixels = np.full((HEIGHT, WIDTH, 3), 50 + frame, np.uint8)
+            cv2.imwrite(str(images / f"{frame:010}.png"), pixels)
+    (date / "calib_cam_to_cam.txt").write_text("\n".join(lines))
+    lines = ["calib_time: 15-Mar-2012 11:37:16", text_of("R", T_CAMERA0_LIDAR[:3, :3]),
+             text_of("T", T_CAMERA0_LIDAR[:3, 3]), "delta_f: 0 0"]  # fmt: skip
+    (date / "calib_velo_to_cam.txt").write_text("\n".join(lines))
+    scans = drive / "velodyne_points" / "data"
+    scans.mkdir(parents=True)
+    for frame in range(frames):
+        CLOUD.tofile(scans / f"{frame:010}.bin")
+    return drive
+
+
+def test_frames_and_extrinsics_are_those_of_the_drive(tmp_path: Path) -> None:
+    data = load_dataset(written_drive(tmp_path))
+    assert [frame.name for frame in data.frames] == ["0000000000", "0000000001"]
+    np.testing.assert_array_equal(data.frames[1].load_cloud(), CLOUD)
+    assert list(data.rig.cameras) == ["image_02", "image_03"]
+    p_lidar = np.array([12.0, 1.5, -0.4, 1.0])
+    rectified = RECTIFY @ (T_CAMERA0_LIDAR @ p_lidar)[:3]
+    for number, shift in BASELINES.items():
+        camera = data.rig.cameras[f"image_{number}"]
+        assert (camera.width_px, camera.height_px) == (WIDTH, HEIGHT)
+        assert camera.intrinsics_px.fx == 721.5
+        found = (camera.T_camera_lidar @ p_lidar)[:3]
+        np.testing.assert_allclose(found, rectified + shift, atol=1e-12)
+        image = data.frames[1].load_image(f"image_{number}", camera)
+        assert image[0, 0, 0] == 51
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("calib_cam_to_cam.txt", "R_rect_00: 1 0 0", "line 'R_rect_00' has 3 numbers, expected 9"),
+        ("calib_cam_to_cam.txt", "S_rect_02: 1392 512", "take the _sync drive, not the _extract"),
+        ("calib_cam_to_cam.txt", "P_rect_03: a b", "line 'P_rect_03' has 0 numbers, expected 12"),
+        ("calib_velo_to_cam.txt", "T: 0 nan 0", "line 'T' has 3 numbers, expected 3 finite ones"),
+        ("calib_velo_to_cam.txt", "R: 1 0 0 0 1 0 0 0 -1", "P_rect_02 and the LiDAR's pose"),
+    ],
+)
+def test_a_wrong_calibration_is_one_line(
+    tmp_path: Path, file: str, line: str, message: str
+) -> None:
+    drive = written_drive(tmp_path)
+    key = line.partition(":")[0]
+    kept = [
+        each for each in (tmp_path / file).read_text().splitlines() if each.split(":")[0] != key
+    ]
+    (tmp_path / file).write_text("\n".join([*kept, line]))
+    with pytest.raises(FileError, match=re.escape(message)):
+        load_rig(drive)
+
+
+def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
+    drive = written_drive(tmp_path)
+    (tmp_path / "calib_velo_to_cam.txt").unlink()
+    with pytest.raises(FileError, match="calib_velo_to_cam.txt: no such file"):
+        load_rig(drive)
