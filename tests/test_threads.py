@@ -12,9 +12,18 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from calibgraph import Calibration, Correspondences, Rig, simulate_correspondences, solve
+from calibgraph import (
+    Calibration,
+    Correspondences,
+    Rig,
+    StructureMatcher,
+    calibrate,
+    load_dataset,
+    simulate_correspondences,
+    solve,
+)
 from factors import Lens, ProjectionBlock
-from tests.conftest import ROOT, make_camera
+from tests.conftest import ROOT, SAMPLE, make_camera
 
 RIG = Rig(
     cameras={
@@ -40,6 +49,17 @@ def test_solves_in_threads_equal_solves_one_after_another() -> None:
         together = list(pool.map(run, tables * 2))
     assert together == alone * 2
     assert len({tuple(each) for each in alone}) == 3
+
+
+@pytest.mark.slow
+def test_calibrations_in_threads_equal_one_alone() -> None:
+    def run(frames: str) -> list[bytes]:
+        matcher = StructureMatcher(search_deg=None, search_m=None)
+        return bits(calibrate(load_dataset(SAMPLE, frames=frames), matcher=matcher))
+
+    alone = [run("0:4"), run("1:6")]
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(run, ("0:4", "1:6"))) == alone
 
 
 def test_another_thread_goes_on_while_a_kernel_runs() -> None:
