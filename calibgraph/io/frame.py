@@ -39,6 +39,11 @@ class Frame:
     cloud_path: Path
     image_paths: dict[str, Path]
 
+    @property
+    def motion(self) -> ScanMotion | None:
+        """For which the cloud is corrected; None if it is as recorded."""
+        return None
+
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
         return load_cloud(self.cloud_path)
@@ -77,9 +82,13 @@ class MovingFrame(Frame):
 
     find_motion: Callable[[], ScanMotion]
 
-    @cached_property
+    @property
     def motion(self) -> ScanMotion:
         """During the scan."""
+        return self._found_motion
+
+    @cached_property
+    def _found_motion(self) -> ScanMotion:
         return self.find_motion()
 
     def load_cloud(self) -> NDArray[np.float32]:

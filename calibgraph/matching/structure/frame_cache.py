@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.frame import Frame
+from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.window_table import WindowTables
@@ -32,21 +33,21 @@ class FrameCache:
     """
 
     def __init__(self) -> None:
-        self._clouds: Once[FileVersion, PreparedCloud] = Once()
+        self._clouds: Once[tuple[FileVersion, ScanMotion | None], PreparedCloud] = Once()
         self._images: Once[tuple[FileVersion, int, int], NDArray[np.uint8]] = Once()
         self._tables = WindowTables()
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
-        self._clouds.keep_only(lambda key: key[0] in kept)
+        self._clouds.keep_only(lambda key: key[0][0] in kept)
         self._images.keep_only(lambda key: key[0][0] in kept)
         self._tables.keep_only(self._clouds.values())
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
         cloud = self._clouds.get(
-            _file_version(frame.cloud_path),
+            (_file_version(frame.cloud_path), frame.motion),
             lambda: PreparedCloud.from_points(frame.load_cloud(), self._tables),
         )
         self._clouds.keep_last(MAX_CLOUD_BYTES, lambda cloud: cloud.nbytes)

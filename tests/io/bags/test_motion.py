@@ -13,6 +13,7 @@ from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_datas
 from calibgraph.io.bags.point_clouds import timed_points_of
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
+from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -148,6 +149,19 @@ def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> 
 def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarray]]) -> None:
     pytest.importorskip("small_gicp")
     assert max(errors_m(bag, "scans")) < 0.01  # surfaces without noise, in voxels of 0.25 m
+
+
+def test_a_cache_tells_corrected_clouds_from_those_as_recorded(
+    bag: tuple[Path, list[np.ndarray]],
+) -> None:
+    cache = FrameCache()
+    options = (BagOptions(), BagOptions(motion="tf"))
+    frames = [load_dataset(bag[0], bag=each).frames[1] for each in options]
+    one, two = (cache.cloud(frame) for frame in frames)
+    assert one is not two
+    assert cache.cloud(frames[1]) is two
+    cache.keep_only(frames[:1])
+    assert cache.cloud(frames[0]) is one
 
 
 def test_the_note_states_the_correction(bag: tuple[Path, list[np.ndarray]]) -> None:
