@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.data_cases import Folders
+from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Dataset, Rig, StructureMatcher, evaluate, perturb
 from calibgraph.matching.structure import (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from benchmarks.accuracy import image_cases
 from benchmarks.accuracy.rig_changes import (
     Rng,
     compose_extrinsics,
@@ -22,117 +22,18 @@ from benchmarks.accuracy.rig_changes import (
     with_focal,
     with_stereo,
 )
+from benchmarks.accuracy.scenes import (
+    FEW_FRAMES,
+    MOTORWAY,
+    ONE_CAMERA,
+    Case,
+    Folders,
+    Scene,
+    with_clouds,
+    with_images,
+)
 from benchmarks.accuracy.worlds import Problem
-from calibgraph import Dataset, Frame, Rig, calibrate, load_dataset, load_rig, perturb
-
-Array = np.ndarray
-
-GUESS_DEG, GUESS_M = 2.0, 0.2
-MOTORWAY = "01"
-SEQUENCES = {
-    "tune": ("00",),
-    "count": ("05", "06", "07", "08", "06+07+08", "05+06+07+08"),
-}
-OTHER = {"00": "01", "01": "00", "05": "06", "06": "07", "07": "08", "08": "05", "06+07+08": "05"}
-"""Which sequence's images replace a sequence's own, of the same rig; else its own other half."""
-
-
-@dataclass(frozen=True)
-class Folders:
-    """Where the data are.
-
-    Attributes:
-        realdata: of the recordings, or None.
-        scenes: of simulated streets ``scene_0``, ``scene_1``, ..., or None.
-    """
-
-    realdata: Path | None
-    scenes: Path | None
-
-    def names(self, which: str) -> list[str]:
-        """The data of a set, but for the motorway: sequences, and scenes by odd or even number."""
-        names = list(SEQUENCES[which]) if self.realdata is not None else []
-        found = sorted(self.scenes.glob("scene_*")) if self.scenes is not None else []
-        odd = which == "count"
-        return names + [path.name for path in found if int(path.name.split("_")[1]) % 2 == odd]
-
-    def load(self, name: str) -> tuple[Dataset, Rig]:
-        """Data by name, and the true rig."""
-        if name.startswith("scene_"):
-            folder = _known(self.scenes, "--scenes") / name
-            return load_dataset(folder), load_rig(folder / "reference.yaml")
-        recorded = _known(self.realdata, "--realdata")
-        if (recorded / name / "reference.yaml").is_file():
-            return load_dataset(recorded / name), load_rig(recorded / name / "reference.yaml")
-        sequences = recorded / "kitti_odometry" / "sequences"
-        data = load_dataset([sequences / part for part in name.split("+")])
-        return data, data.rig
-
-    def images_for(self, name: str) -> Dataset:
-        """Data of the same rig whose images show another place."""
-        if not name.startswith("scene_"):
-            return self.load(OTHER.get(name, name))[0]
-        own = int(name.split("_")[1])
-        others = [n for which in SEQUENCES for n in self.names(which) if n.startswith("scene_")]
-        same_set = [n for n in others if n != name and (int(n.split("_")[1]) - own) % 2 == 0]
-        return self.load(same_set[0] if same_set else name)[0]
-
-
-def _known(folder: Path | None, option: str) -> Path:
-    if folder is None:
-        raise ValueError(f"this case needs {option}")
-    return folder
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Good data, for a case to spoil.
-
-    Attributes:
-        name: of the data.
-        data: the frames.
-        truth: the true rig.
-        folders: where other data are.
-        scratch: an empty folder, removed after the case.
-        seed: of the guess.
-    """
-
-    name: str
-    data: Dataset
-    truth: Rig
-    folders: Folders
-    scratch: Path
-    seed: int
-
-    def guess(self, deg: float = GUESS_DEG, m: float = GUESS_M) -> Rig:
-        """The truth, displaced."""
-        return perturb(self.truth, rotation_deg=deg, translation_m=m, seed=self.seed)
-
-    @property
-    def pair(self) -> tuple[str, str]:
-        """The two cameras that look ahead."""
-        first, second = list(self.truth.cameras)[:2]
-        return first, second
-
-
-Case = tuple[Dataset, Rig, dict[str, Any]]
-"""The data, the rig with its guess, and what was drawn for this kind of case."""
-
-
-def with_images(data: Dataset, paths: Callable[[int, Frame], dict[str, Path]]) -> Dataset:
-    """The data with other images."""
-    frames = (replace(f, image_paths=paths(i, f)) for i, f in enumerate(data.frames))
-    return replace(data, frames=tuple(frames))
-
-
-def with_clouds(scene: Scene, change: Callable[[Array], Array]) -> Dataset:
-    """The data with changed clouds, in the scratch folder."""
-    frames = []
-    for frame in scene.data.frames:
-        path = scene.scratch / f"{frame.index:06d}.npy"
-        np.save(path, change(frame.load_cloud()).astype(np.float32))
-        frames.append(replace(frame, cloud_path=path))
-    return replace(scene.data, frames=tuple(frames))
+from calibgraph import Frame, calibrate
 
 
 def good(scene: Scene, rng: Rng) -> Case:
@@ -260,14 +161,25 @@ KINDS: dict[str, Callable[[Scene, Rng], Case]] = {
     "blurred": partial(covered, blurred=True),
     "wrong_units": wrong_units,
     "inverted": inverted_guess,
+    **image_cases.KINDS,
 }
+
+BETWEEN_CAMERAS = ("swapped", "swapped_unknown", "distant_swap")
+BETWEEN_FRAMES = ("shuffled", "shifted", "moved_halfway", "frozen", "few_frames")
+"""Kinds that need two cameras, and three frames."""
+UNDETECTABLE = ("scaled",)
+"""A wrong scale of all distances looks like another place of the camera: not counted."""
 
 
 def data_for(kind: str, names: list[str], seed: int) -> str | None:
     """The name of a case's data, or None if there is none."""
     if kind == "motorway":
         return MOTORWAY
-    return names[seed % len(names)] if names else None
+    lacking = (ONE_CAMERA if kind in BETWEEN_CAMERAS else ()) + (
+        FEW_FRAMES if kind in BETWEEN_FRAMES else ()
+    )
+    fit = [name for name in names if name not in lacking]
+    return fit[(seed + zlib.crc32(kind.encode())) % len(fit)] if fit else None
 
 
 def data_problem(kind: str, name: str, seed: int, folders: Folders, scratch: Path) -> Problem:

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.data_cases import OTHER, Folders, with_images
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import OTHER, Folders, with_images
 from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import Dataset, StructureMatcher, perturb
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE

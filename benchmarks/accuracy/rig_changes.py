@@ -37,6 +37,17 @@ def with_focal(rig: Rig, factor: float) -> Rig:
     return with_lenses(rig, change)
 
 
+def with_half_resolution(rig: Rig) -> Rig:
+    """The rig with the intrinsics of images of half the size."""
+
+    def change(camera: Camera) -> dict[str, Any]:
+        k = camera.intrinsics_px
+        half = {name: getattr(k, name) / 2 for name in ("fx", "fy", "cx", "cy")}
+        return {"intrinsics_px": k.model_copy(update=half)}
+
+    return with_lenses(rig, change)
+
+
 def with_stereo(rig: Rig, truth: Rig, a: str, b: str) -> Rig:
     """The rig with the true relative pose of two cameras in its file, as a stereo calibration."""
     T = truth.T_camera_lidar

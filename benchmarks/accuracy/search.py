@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.data_cases import Folders, Scene, with_clouds, with_images
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import Folders, Scene, with_clouds, with_images
 from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
 

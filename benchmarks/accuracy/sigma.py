@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.data_cases import GUESS_DEG, GUESS_M, Folders
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import GUESS_DEG, GUESS_M, Folders
 from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import calibrate, perturb
 

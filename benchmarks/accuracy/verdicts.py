@@ -29,8 +29,9 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.accuracy import data_cases, ledger, table_cases
-from benchmarks.accuracy.data_cases import Folders, data_for, data_problem
+from benchmarks.accuracy.data_cases import data_for, data_problem
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import MOTORWAY, Folders
 from benchmarks.accuracy.table_cases import UNDETECTABLE, rig_for, table_problem
 from benchmarks.tables import ROOT, Table, add_record_option
 
@@ -78,7 +79,10 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=0, help="number of the first case of a kind")
     parser.add_argument("--kinds", type=_names, help=", ".join(known))
     parser.add_argument(
-        "--uncounted", type=_names, default=UNDETECTABLE, help="left out of the sums"
+        "--uncounted",
+        type=_names,
+        default=(*UNDETECTABLE, *data_cases.UNDETECTABLE),
+        help="left out of the sums",
     )
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
@@ -108,7 +112,7 @@ def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
         if seed < first + arguments.data:
             for kind in data_cases.KINDS:
                 name = data_for(kind, names, seed)
-                missing = name is None or (name == data_cases.MOTORWAY and not folders.realdata)
+                missing = name is None or (name == MOTORWAY and not folders.realdata)
                 if not missing:
                     yield Key("data", kind, name, seed)
 
