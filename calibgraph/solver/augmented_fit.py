@@ -98,10 +98,15 @@ class LinearRows:
         Args:
             unknowns: their numbers, from 0.
             weights: (n,) of the rows.
+
+        Returns:
+            (6, k); NaN where the rows do not determine the pose, as without any.
         """
         which = np.array([*range(6), *(6 + k for k in unknowns)])
         products = weighted_products(self.columns, which, weights)
         scaled, units = unit_diagonal(products[:6, :6])
+        if np.linalg.matrix_rank(scaled, hermitian=True) < len(scaled):
+            return np.full((6, len(unknowns)), np.nan)
         twists = np.linalg.solve(scaled, products[:6, 6:] / units[:, None])
         return np.asarray(twists / units[:, None])
 

@@ -18,10 +18,15 @@ def apply_twist(camera: Camera, twist: Array) -> Camera:
         camera: at its estimate.
         twist: (6,) rotation [rad] and translation [m], in the camera's axes.
     """
+    return camera.moved_to(twisted(camera.T_camera_lidar, twist))
+
+
+def twisted(T_camera_lidar: Array, twist: Array) -> Array:
+    """(4, 4) exp(twist) T_camera_lidar, to first order in the translation, however far it is."""
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
     step[:3, 3] = twist[3:]
-    return camera.moved_to(step @ camera.T_camera_lidar)
+    return np.asarray(step @ T_camera_lidar)
 
 
 def project_with_jacobian(camera: Camera, points_lidar_m: Array) -> tuple[Array, Array]:

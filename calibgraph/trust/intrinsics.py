@@ -17,7 +17,7 @@ from calibgraph.model.verdict import Check, grade
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.augmented_fit import AugmentedFit, linearize
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.camera_twist import twisted
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -138,8 +138,8 @@ def displacement_fields(camera: Camera, pixels_px: Array) -> dict[str, Array]:
 
 
 def _free(name: str, fit: AugmentedFit, camera: Camera) -> FreedParameter:
-    moved = apply_twist(camera, fit.twist).T_camera_lidar
-    degrees, centimetres = pose_difference(moved, camera.T_camera_lidar)
+    T = camera.T_camera_lidar
+    degrees, centimetres = pose_difference(twisted(T, fit.twist), T)
     return FreedParameter(name, fit.values, fit.sigmas, degrees, centimetres)
 
 
@@ -174,9 +174,11 @@ def _check_sensitivity(camera: Camera, twist: Array) -> Check:
         camera: at the solution.
         twist: (6,) by which its pose compensates for a unit relative change of the focal length.
     """
-    moved = apply_twist(camera, 0.01 * twist)
-    _, centimetres = pose_difference(moved.T_camera_lidar, camera.T_camera_lidar)
-    return threshold("focal_sensitivity").check(centimetres)
+    row, T = threshold("focal_sensitivity"), camera.T_camera_lidar
+    if np.isnan(twist).any():
+        return row.describe(np.nan, "WARN", "matches within the gate do not determine the camera")
+    centimetres = pose_difference(twisted(T, 0.01 * twist), T)[1]
+    return row.check(centimetres)
 
 
 def _describe(freed: FreedParameter) -> str:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from calibgraph import Correspondences
 from calibgraph.solver.augmented_fit import compensating_twists, fit_augmented, linearize
@@ -68,3 +69,15 @@ def test_rows_made_once_give_the_fit_of_every_choice_of_unknowns() -> None:
         assert alone is not None and together is not None
         np.testing.assert_array_equal(together.values, alone.values)
         np.testing.assert_array_equal(together.sigmas, alone.sigmas)
+
+
+@pytest.mark.parametrize("inside", [0, 2])
+def test_no_pose_compensates_where_too_few_rows_determine_one(inside: int) -> None:
+    camera, points = make_camera(), points_in_front(np.random.default_rng(7), 50)
+    pixels, jacobian = project_with_jacobian(camera, points)
+    table = Correspondences.from_arrays(
+        camera="front", frame=0, pixels_px=pixels, points_lidar_m=points
+    )
+    rows = linearize(camera, table, lambda predicted: jacobian[:, :, :1])
+    weights = (np.arange(50) < inside).astype(np.float64)
+    assert np.isnan(rows.compensating_twists((0,), weights)).all()

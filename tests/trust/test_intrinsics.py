@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Correspondences, Rig, solve
+from calibgraph import Camera, CorrespondenceError, Correspondences, Rig, solve
+from calibgraph.solver.augmented_fit import AugmentedFit
+from calibgraph.trust.intrinsics import _free
 from tests.trust.conftest import named, simulated
 
 
@@ -98,3 +100,23 @@ def test_a_wall_hides_a_wrong_focal_length_which_is_a_warning(pair: Rig) -> None
     result = solve(rig, flat)
     (check,) = named(result, "left", "per 1 % of the focal length")
     assert check.status == "WARN" and check.value == pytest.approx(20.0, rel=0.02)
+
+
+def test_points_that_no_focal_length_explains_fail_without_a_fault(pair: Rig) -> None:
+    """Of mirrored clouds some fits leave the Earth; of random ones none has a pose."""
+    table = simulated(pair)
+    for points in (
+        table.points_lidar_m * [1, -1, 1],
+        np.random.default_rng(0).permutation(table.points_lidar_m),
+    ):
+        try:
+            result = solve(pair, replace(table, points_lidar_m=points))
+        except CorrespondenceError:
+            continue
+        assert result.verdict.status == "FAIL"
+
+
+def test_a_fit_that_moves_the_camera_beyond_any_length_is_measured(pair: Rig) -> None:
+    camera = pair.cameras["left"]
+    fit = AugmentedFit(np.array([0, 0, 0, 0, 0, 1e8]), np.ones(1), np.ones(1), np.ones(1))
+    assert _free("focal length", fit, camera).moved_cm == pytest.approx(1e10)
