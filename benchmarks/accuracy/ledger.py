@@ -163,10 +163,13 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
         "error_cm": error.translation_error_cm,
         "xi_deg": np.degrees(xi[:3]).tolist(),
         "xi_cm": (100 * xi[3:]).tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
         "sigma_deg": None if sigmas is None else sigmas[0].tolist(),
         "sigma_cm": None if sigmas is None else sigmas[1].tolist(),
         "normalised_squared": squared,
-        "checks": [[c.name, c.status, _number(c.value)] for c in verdict.checks],
+        "checks": [
+            [c.kind or c.name, c.status, _number(c.value), c.severity] for c in verdict.checks
+        ],
     }
 
 

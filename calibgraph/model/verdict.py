@@ -26,6 +26,7 @@ class Check:
         warn: the limit of PASS, which itself passes, if there is one.
         fail: the limit of WARN, which itself does not fail, if there is one.
         unit: of value, warn and fail.
+        kind: what it is of, the same for all cameras and numbers; the name if it is empty.
     """
 
     name: str
@@ -35,6 +36,39 @@ class Check:
     warn: float | None = None
     fail: float | None = None
     unit: str = ""
+    kind: str = ""
+
+    @property
+    def severity(self) -> float:
+        """How bad it is: 0 to 1 is PASS, 1 to 2 WARN, 2 to 3 FAIL, without steps at the limits."""
+        low = float(_ORDER.index(self.status))
+        if self.value is None or self.warn is None or self.fail is None:
+            return low + 0.5 if low else 0.0
+        if math.isnan(self.value):
+            return low + 1.0
+        return float(min(max(_between(self.value, self.warn, self.fail), low), low + 1.0))
+
+
+def _between(value: float, warn: float, fail: float) -> float:
+    """Where a value is: below 1 before the limit of PASS, 2 at that of WARN, 3 far beyond it.
+
+    Which side is good is seen from the limits; of equal ones, or of one without a FAIL limit, the
+    share of the first limit counts.
+    """
+    at_most = warn <= fail
+    before, beyond = (value <= warn, value > fail) if at_most else (value >= warn, value < fail)
+    if before:
+        return _share(value, warn) if at_most else _share(warn, value)
+    if beyond:
+        return 3.0 - (_share(fail, value) if at_most else _share(value, fail))
+    if math.isinf(fail):
+        return 2.0 - _share(warn, value)
+    return 1.0 + (value - warn) / (fail - warn)
+
+
+def _share(part: float, whole: float) -> float:
+    """A ratio of two numbers of one sign, 0 to 1; else 0."""
+    return min(max(part / whole, 0.0), 1.0) if whole and math.isfinite(whole) else 0.0
 
 
 @dataclass(frozen=True)
@@ -110,13 +144,15 @@ class Threshold:
             advice: likewise.
         """
         build = at_most if self.direction == "at most" else at_least
-        return build(
+        check = build(
             name or self.name, value, self.warn, self.fail, self.unit, advice or self.advice
         )
+        return replace(check, kind=self.key)
 
     def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
         """A check whose sentence, and perhaps status, depend on more than the value."""
-        return Check(name or self.name, status, text, value, self.warn, self.fail, self.unit)
+        limits = (self.warn, self.fail, self.unit)
+        return Check(name or self.name, status, text, value, *limits, kind=self.key)
 
 
 def at_most(  # noqa: PLR0913, PLR0917 - a line of a table

@@ -6,7 +6,7 @@ check is how far the camera moves when it is set free, and with which significan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +164,8 @@ def _check_freed(freed: FreedParameter) -> Check:
     if warn:
         text += "; check the intrinsics, and that images are not undistorted twice"
     name = f"{freed.name}: {translation.name}"
-    return translation.describe(centimetres, grade(warn, fail), text, name=name)
+    check = translation.describe(centimetres, grade(warn, fail), text, name=name)
+    return replace(check, kind=f"lens_{freed.name.replace(' ', '_')}")
 
 
 def _check_sensitivity(camera: Camera, twist: Array) -> Check:
