@@ -21,7 +21,6 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Verdict
 from calibgraph.overlaps import tie_cameras
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
@@ -29,6 +28,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
 from calibgraph.trust.observability import weaknesses
+from calibgraph.trust.probability import TABLES, judge, model_of
 
 _log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def calibrate(
         checks = assess_run(evidence)
     report("done", 1, 1)
     return replace(
-        to_calibration(evidence.solution, checks),
+        to_calibration(evidence.solution, checks, model_of(run.correspondences.metadata)),
         correspondences=run.correspondences,
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
@@ -120,20 +120,26 @@ def solve(
     return replace(result, timings_s={**result.timings_s, **watch.seconds})
 
 
-def to_calibration(evidence: Evidence, checks: Checks) -> Calibration:
+def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> Calibration:
     """A solution with its error bar and its verdict.
 
     Args:
         evidence: the solution, and what its checks computed.
         checks: per camera, all of them.
+        model: by which their probability of being off is computed.
     """
     solution, cameras = evidence.solution, evidence.cameras
+    tolerance = solution.config.tolerance_deg, solution.config.tolerance_cm
+    verdicts = {
+        name: judge(checks.get(name, ()), evidence.covariance_of(name), tolerance, model)
+        for name in cameras
+    }
     result = Calibration(
         rig=solution.solved_rig,
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
-        camera_verdicts={name: Verdict(tuple(checks.get(name, ()))) for name in cameras},
+        camera_verdicts=verdicts,
         residuals=evidence.residuals,
         counts={name: dict(counts) for name, counts in solution.counts.items()},
         timings_s=dict(solution.timings_s),

@@ -146,10 +146,8 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def config_from(
-    config: Path | None, preset_name: str | None, seed: int | None, bootstrap: int | None = None
-) -> Config:
-    """The settings of a file or of a preset; ``--seed`` and ``--bootstrap`` replace theirs.
+def config_from(config: Path | None, preset_name: str | None, **given: float | None) -> Config:
+    """The settings of a file or of a preset; options that are given replace theirs.
 
     Raises:
         ValueError: if both a file and a preset are given.
@@ -159,7 +157,6 @@ def config_from(
     if config is not None and preset_name is not None:
         raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
     settings = load_config(config) if config is not None else preset(preset_name or "auto")
-    given = {"seed": seed, "bootstrap": bootstrap}
     return settings.changed(**{k: v for k, v in given.items() if v is not None})
 
 

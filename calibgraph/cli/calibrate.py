@@ -22,6 +22,8 @@ from calibgraph.cli.options import (
     RigArgument,
     SeedOption,
     TermsOption,
+    ToleratedCmOption,
+    ToleratedDegOption,
 )
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 
@@ -41,13 +43,17 @@ def calibrate(
     out: OutOption = Path("calibration"),
     seed: ConfigSeedOption = None,
     bootstrap: BootstrapOption = None,
+    tolerance_deg: ToleratedDegOption = None,
+    tolerance_cm: ToleratedCmOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
     from calibgraph.pipeline import calibrate
 
     with checked_arguments():
-        settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
+        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
+        checked_terms = terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed)
     data = matching.load_dataset(dataset)
     with progress_bar() as progress:
@@ -106,6 +112,8 @@ def solve(
     out: OutOption = Path("calibration"),
     seed: ConfigSeedOption = None,
     bootstrap: BootstrapOption = None,
+    tolerance_deg: ToleratedDegOption = None,
+    tolerance_cm: ToleratedCmOption = None,
     engine: EngineOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -117,7 +125,9 @@ def solve(
     from calibgraph.report import write_report
 
     with checked_arguments():
-        settings, checked_terms = config_from(config, preset, seed, bootstrap), terms_from(terms)
+        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
+        checked_terms = terms_from(terms)
     with progress_bar("solving") as progress, checked_arguments():
         result = solve_table(
             load_rig(rig), correspondences, settings, checked_terms, engine, progress=progress

@@ -192,6 +192,14 @@ BootstrapOption = Annotated[
         help="Check the covariance: solve N times with frames drawn with replacement.",
     ),
 ]
+ToleratedDegOption = Annotated[
+    float | None,
+    typer.Option(metavar="DEG", help="Rotation by which a PASS may be off; by default 0.5."),
+]
+ToleratedCmOption = Annotated[
+    float | None,
+    typer.Option(metavar="CM", help="Distance by which a PASS may be off; by default 10."),
+]
 _MAX_SEED = 2**31 - 1
 SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
 ConfigSeedOption = Annotated[

@@ -44,9 +44,11 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         more = len(reasons) - MAX_REASONS
         print_plain(console, f"  and {more} more: see camera_verdicts in calibration.yaml")
     console.print(result_table(result))
+    config = result.config
     console.print(
-        "moved: from the guess; median: error of all matches, in pixels; inliers, matches: within "
-        "the gate"
+        f"off: probability of an error over {config.tolerance_deg:g} deg or "
+        f"{config.tolerance_cm:g} cm; moved: from the guess; median: error of all matches, in "
+        "pixels; inliers, matches: within the gate"
     )
     console.print(error_bar_table(result))
     console.print(
@@ -86,16 +88,16 @@ def print_validation(console: Console, validation: Validation) -> None:
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, change from the guess, residuals and matches."""
     table = empty_table("Calibration", "camera", "verdict")
-    add_number_columns(
-        table, "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior"
-    )
+    numbers = ("moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior")
+    add_number_columns(table, "off", *numbers)
     for name, T in result.T_camera_lidar.items():
         moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
         residuals = result.residuals.get(name)
-        status = result.camera_verdicts[name].status
+        verdict = result.camera_verdicts[name]
         table.add_row(
             escape(name),
-            f"[{_COLOURS[status]}]{status}[/]",
+            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
+            "-" if verdict.doubt is None else verdict.doubt.percent,
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",
             "-" if residuals is None else f"{residuals.median_px:.2f}",

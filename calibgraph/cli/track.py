@@ -66,7 +66,7 @@ def track(
     from calibgraph.tracking.command import Tracking, track
 
     with checked_arguments():
-        settings = config_from(config, preset, seed)
+        settings = config_from(config, preset, seed=seed)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
     console = terminal()
     wanted = Tracking(

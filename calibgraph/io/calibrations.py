@@ -24,7 +24,7 @@ from calibgraph.model.result_files import (
     CORRESPONDENCES_FILE,
 )
 from calibgraph.model.rig import Finite, Rig
-from calibgraph.model.verdict import Check, Verdict
+from calibgraph.model.verdict import Check, Doubt, Verdict
 
 Array = NDArray[np.float64]
 Table = TypeVar("Table")
@@ -50,7 +50,7 @@ def load_calibration(path: Path | str) -> Calibration:
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
         config=checked_model(Config, parts.config, path),
-        camera_verdicts={k: Verdict(v.checks) for k, v in parts.camera_verdicts.items()},
+        camera_verdicts={k: Verdict(v.checks, v.doubt) for k, v in parts.camera_verdicts.items()},
         bootstrap=parts.bootstrap_covariance,
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
@@ -97,6 +97,7 @@ class _FrameEntry(BaseModel):
 
 class _Checks(BaseModel):
     checks: tuple[Check, ...]
+    doubt: Doubt | None = None
 
 
 class _Parts(BaseModel):

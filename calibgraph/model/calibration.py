@@ -273,4 +273,5 @@ def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
 
 
 def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
-    return {"status": verdict.status, "reasons": list(verdict.reasons)}
+    doubt = None if verdict.doubt is None else vars(verdict.doubt)
+    return {"status": verdict.status, "doubt": doubt, "reasons": list(verdict.reasons)}

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calibgraph.files import checked_model, describe, read_yaml
+from calibgraph.model.verdict import TOLERANCE
 from factors import LossName
 
 Terms = Literal["stage1", "reprojection", "priors", "full"]
@@ -69,6 +70,8 @@ class Config(BaseModel):
             aggregated; or ``rig``, the extrinsics in the rig as they are.
         aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
+        tolerance_deg: rotation by which a result may be off: the verdict is about more.
+        tolerance_cm: distance by which a camera may be off: the verdict is about more.
         bootstrap: how many times to solve again with frames drawn with replacement, as a check
             of the covariance; 0 for none.
         seed: of everything random.
@@ -93,6 +96,8 @@ class Config(BaseModel):
     stage1: Literal["pnp", "rig"] = "pnp"
     aggregate: Literal["median", "mean", "mode"] = "median"
     pnp_threshold_px: Pixels = 8.0
+    tolerance_deg: Annotated[float, Field(gt=0, le=180)] = TOLERANCE[0]
+    tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
     seed: Seed = 0
     tracking: Tracking = Tracking()

@@ -1,4 +1,4 @@
-"""Checks: a number or finding, its limits, and PASS, WARN or FAIL; the verdict is the worst."""
+"""Checks, and the verdict: a cut of the probability that a result is off, or the worst check."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ Status = Literal["PASS", "WARN", "FAIL"]
 Direction = Literal["at most", "at least"]
 
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
+PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
+"""Probabilities that a result is off by more than the tolerance, where verdicts are cut."""
+TOLERANCE = (0.5, 10.0)
+"""Rotation [deg] and distance [cm] that users tolerate if they state nothing else."""
+_SURE = 0.99
 _LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
 
 
@@ -72,37 +77,98 @@ def _share(part: float, whole: float) -> float:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """The probability that a result is off by more than what the user tolerates, two ways.
+
+    Attributes:
+        by_checks: that it is grossly wrong.
+        by_error_bar: that its error bar allows more than the tolerance.
+        tolerance_deg: of the rotation.
+        tolerance_cm: of the position.
+    """
+
+    by_checks: float
+    by_error_bar: float = 0.0
+    tolerance_deg: float = TOLERANCE[0]
+    tolerance_cm: float = TOLERANCE[1]
+
+    @property
+    def probability(self) -> float:
+        """Of either."""
+        return 1.0 - (1.0 - self.by_checks) * (1.0 - self.by_error_bar)
+
+    @property
+    def status(self) -> Status:
+        """PASS, WARN or FAIL; a wide error bar alone is no FAIL, since it shows nothing wrong."""
+        return grade(not self.probability < PASS_BELOW, not self.by_checks <= FAIL_ABOVE)
+
+    @property
+    def percent(self) -> str:
+        """The probability in percent, with its unit."""
+        if self.probability > _SURE:
+            return f"over {_SURE:.0%}"
+        return f"{100 * self.probability:.2g}%"
+
+    @property
+    def sentence(self) -> str:
+        """What it is the probability of, without the number."""
+        tolerated = f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
+        return f"off by more than {tolerated} with a probability"
+
+    @property
+    def advice(self) -> str:
+        """What to do if the data cannot tell more; empty if something seems wrong."""
+        if self.status == "PASS" or self.by_error_bar < self.by_checks:
+            return ""
+        return ": the data cannot tell, by the error bar; record more frames, at more places"
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Whether a result can be used.
 
     Attributes:
         checks: all checks, in order.
+        doubt: the probability that it is off; without it, as while driving, the checks alone
+            decide.
     """
 
     checks: tuple[Check, ...] = ()
+    doubt: Doubt | None = None
 
     @property
     def status(self) -> Status:
-        """The worst status of the checks; PASS without any."""
-        return max((check.status for check in self.checks), key=_ORDER.index, default="PASS")
+        """PASS if every check and the probability are; FAIL if the probability is.
+
+        Without a probability, the worst status of the checks; PASS without any.
+        """
+        worst = max((check.status for check in self.checks), key=_ORDER.index, default="PASS")
+        if self.doubt is None:
+            return worst
+        return "WARN" if self.doubt.status == "PASS" != worst else self.doubt.status
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """The sentences of the checks that are not PASS, the worst first."""
+        """If it is not PASS, the probability; the checks that are not PASS, the worst first."""
         failing = [check for check in self.checks if check.status != "PASS"]
-        failing.sort(key=lambda check: -_ORDER.index(check.status))
-        return tuple(check.text for check in failing)
+        failing.sort(key=lambda check: -check.severity)
+        texts = [check.text for check in failing]
+        if self.doubt is None or self.doubt.status == "PASS":
+            return tuple(texts)
+        doubt = self.doubt
+        return (f"{doubt.sentence} of {doubt.percent}{doubt.advice}", *texts)
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: the checks of all its cameras, with the cameras' names."""
-    return Verdict(
-        tuple(
-            replace(check, text=f"{name}: {check.text}")
-            for name, verdict in cameras.items()
-            for check in verdict.checks
-        )
+    """The verdict of a rig: that of its worst camera, with the checks of all, by their names."""
+    checks = tuple(
+        replace(check, text=f"{name}: {check.text}")
+        for name, verdict in cameras.items()
+        for check in verdict.checks
     )
+    doubts = [verdict.doubt for verdict in cameras.values() if verdict.doubt is not None]
+    worst = max(doubts, key=lambda doubt: (doubt.status == "FAIL", doubt.probability), default=None)
+    return Verdict(checks, worst)
 
 
 @dataclass(frozen=True)

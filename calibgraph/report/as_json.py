@@ -12,6 +12,7 @@ from typing import Any
 
 from calibgraph.errors import FileError
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.verdict import Verdict
 
 
 def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
@@ -27,6 +28,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
             "verdict": result.camera_verdicts[name].status,
+            "probability_off": _probability(result.camera_verdicts[name]),
             "reasons": list(result.camera_verdicts[name].reasons),
             **_sigmas(result, name),
             "residuals": None if residuals is None else vars(residuals),
@@ -36,12 +38,17 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         }
     return {
         "verdict": result.verdict.status,
+        "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,
         "files": [str(path) for path in written],
     }
+
+
+def _probability(verdict: Verdict) -> float | None:
+    return None if verdict.doubt is None else verdict.doubt.probability
 
 
 def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | None]:

@@ -85,7 +85,19 @@ def group_reasons(
                 alike.setdefault(key, {})[camera] = check
     reasons = [_reason(each) for each in alike.values()]
     reasons.sort(key=lambda reason: _WORST_FIRST.index(reason.status))
-    return [*reasons, *_group_sentences(weaknesses)]
+    return [*_doubts(verdicts), *reasons, *_group_sentences(weaknesses)]
+
+
+def _doubts(verdicts: Mapping[str, Verdict]) -> list[Reason]:
+    """How probable it is that cameras are off, the worst first, in one sentence."""
+    found = {n: v.doubt for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+    if not found:
+        return []
+    ordered = sorted(found.items(), key=lambda item: (item[1].status, -item[1].probability))
+    worst = ordered[0][1]
+    percents = ", ".join(doubt.percent for _, doubt in ordered)
+    text = f"{worst.sentence} of {percents}{worst.advice}"
+    return [Reason(worst.status, ", ".join(name for name, _ in ordered), text)]
 
 
 def _reason(checks: Mapping[str, Check]) -> Reason:

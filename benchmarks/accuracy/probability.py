@@ -1,0 +1,217 @@
+"""Fit and judge the probability that a result is off: ``calibgraph.trust.probability``.
+
+    python -m benchmarks.accuracy.verdicts --set tune --tables 24 --data 3 --out out/tune.jsonl
+    python -m benchmarks.accuracy.verdicts --set count --tables 24 --data 3 --out out/count.jsonl
+    python -m benchmarks.accuracy.probability --tune out/tune.jsonl --count out/count.jsonl
+
+The weights come from the first files, the tables from the others, which share no recordings (but
+for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package.
+
+A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in
+the fit; the intercept is then moved, and the tables are weighted, to where one result in ten is
+off: as if users made so many mistakes. Weights are the most probable ones under a normal prior
+about values that are the same for all checks: one that has seen too little keeps nearly those.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from benchmarks.accuracy import data_cases, ledger, table_cases
+from benchmarks.accuracy.ledger import Record
+from benchmarks.accuracy.verdicts import class_of
+from benchmarks.tables import ROOT, Table, add_record_option
+from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.trust.probability import (
+    STRUCTURE,
+    TABLES,
+    contributions,
+    probability_beyond,
+    steps,
+    worst_severities,
+)
+
+Array = np.ndarray
+
+SHARE_OFF = 0.1
+TOLERANCE = (0.5, 10.0)
+USUAL = np.array([0.3, 6.5, 3.0])
+"""Prior means: log odds by a check that goes through PASS, WARN and FAIL."""
+SPREAD = np.array([1.0, 3.0, 3.0])
+INTERCEPT, INTERCEPT_SPREAD = -6.0, 1.0
+VOTE = {"PASS": 0.005, "WARN": 0.1, "FAIL": 0.9}
+"""The probabilities that a vote stands for, to compare it with."""
+BINS = (0.0, 0.002, 0.005, 0.02, 0.1, 0.2, 0.5, 0.9, 1.0)
+FILE = ROOT / "calibgraph" / "trust" / "probability.json"
+UNCOUNTED = (*table_cases.UNDETECTABLE, *data_cases.UNDETECTABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One camera of one run.
+
+    Attributes:
+        level: "table" or "data".
+        kind: of the case.
+        severities: per kind of check.
+        by_bar: the probability that its error bar alone allows.
+        off: whether it is off.
+        right: whether it is right: well within the tolerance.
+        vote: the worst status of its checks.
+    """
+
+    level: str
+    kind: str
+    severities: dict[str, float]
+    by_bar: float
+    off: bool
+    right: bool
+    vote: str
+
+
+def samples_of(records: Iterable[Record]) -> list[Sample]:
+    """The results of cases that data can tell from right ones."""
+    return [
+        Sample(
+            record["level"], record["kind"],
+            worst_severities((kind, severity) for kind, _, _, severity in camera["checks"]),
+            probability_beyond(_matrix(camera["covariance"]), TOLERANCE),
+            class_of(camera) == "off", class_of(camera) == "right", _vote(camera["checks"]),
+        )
+        for record in records if record["kind"] not in UNCOUNTED
+        for camera in record.get("cameras", {}).values()
+    ]  # fmt: skip
+
+
+def _matrix(rows: list[list[float]] | None) -> Array | None:
+    return None if rows is None else np.array(rows)
+
+
+def _vote(checks: Sequence[Sequence[Any]]) -> str:
+    return max((status for _, status, *_ in checks), key=[*VOTE].index, default="PASS")
+
+
+def fit(samples: Sequence[Sample]) -> dict[str, Any]:
+    """The most probable intercept and weights."""
+    kinds = sorted({kind for sample in samples for kind in sample.severities})
+    rows = np.array(
+        [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
+    ).reshape(len(samples), -1)
+    off = np.array([sample.off for sample in samples])
+    by_bar = np.array([sample.by_bar for sample in samples])
+    share = off.mean()
+    counts = np.where(off, 0.5 / share, 0.5 / (1 - share))
+    mean, spread = np.tile(USUAL, len(kinds)), np.tile(SPREAD, len(kinds))
+
+    def loss(values: Array) -> tuple[float, Array]:
+        z = values[0] + rows @ values[1:]
+        right = 1 / (1 + np.exp(z))  # not grossly wrong
+        p = np.clip(1 - right * (1 - by_bar), 1e-12, 1 - 1e-12)
+        likelihood = counts * np.where(off, np.log(p), np.log(1 - p))
+        slope = counts * np.where(off, (1 - p) * (1 - right) / p, right - 1)
+        away = np.append((values[0] - INTERCEPT) / INTERCEPT_SPREAD, (values[1:] - mean) / spread)
+        gradient = -np.append(slope.sum(), slope @ rows)
+        gradient += away / np.append(INTERCEPT_SPREAD, spread)
+        return float(-likelihood.sum() + (away**2).sum() / 2), gradient
+
+    start = np.append(INTERCEPT, mean)
+    bounds = [(None, None), *[(0.0, None)] * len(mean)]
+    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B",
+                     options={"maxiter": 5000, "maxfun": 20000}).x  # fmt: skip
+    weights = found[1:].reshape(-1, 3).round(3)
+    return {
+        "intercept": round(float(found[0] + np.log(SHARE_OFF / (1 - SHARE_OFF))), 3),
+        "weights": {kind: weights[i].tolist() for i, kind in enumerate(kinds)},
+        "other": USUAL.tolist(),
+    }
+
+
+def probabilities(model: dict[str, Any], samples: Sequence[Sample]) -> Array:
+    """(n,) of every sample."""
+    return np.array([
+        1 - (1 - expit(model["intercept"] + sum(
+            contributions(s.severities, model["weights"], model["other"]).values()
+        ))) * (1 - s.by_bar)
+        for s in samples
+    ])  # fmt: skip
+
+
+def status_of(sample: Sample, p: float) -> str:
+    """The verdict, by the probability that it is off."""
+    by_checks = 1 - (1 - p) / max(1 - sample.by_bar, 1e-12)
+    checks = (Check("worst", sample.vote, ""),)  # type: ignore[arg-type]
+    return Verdict(checks, Doubt(by_checks, sample.by_bar)).status
+
+
+def judged(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[Table]:
+    """How well the probability holds, beside the vote."""
+    p, off = probabilities(model, samples), np.array([s.off for s in samples])
+    votes = np.array([VOTE[s.vote] for s in samples])
+    count = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
+    brier = [f"{np.average((values - off) ** 2, weights=count):.4f}" for values in (votes, p)]
+    reliability = []
+    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+        inside = (p >= low) & ((p < high) | (high == 1))
+        if inside.any():
+            mean, found = (np.average(v[inside], weights=count[inside]) for v in (p, off))
+            row = (inside.sum(), f"{mean:.4f}", f"{found:.4f}")
+            reliability.append((f"{low:g} to {high:g}", *map(str, row)))
+    classes = ["off" if s.off else "right" if s.right else "between" for s in samples]
+    cuts = []
+    for how, statuses in (("vote", [s.vote for s in samples]),
+                          ("probability", [*map(status_of, samples, p)])):  # fmt: skip
+        found = Counter(zip(classes, statuses, strict=True))
+        cuts.append((how, *(str(found[c, s]) for c in ("off", "between", "right") for s in VOTE)))
+    columns = ("", *(f"{c}: {s}" for c in ("off", "between", "right") for s in VOTE))
+    return [
+        Table(f"{name}: results", columns, tuple(cuts)),
+        Table(f"{name}: mean squared error of the probability", ("results", "vote", "probability"),
+              ((str(len(p)), *brier),)),
+        Table(f"{name}: how often results are off", ("probability", "results", "its mean", "off"),
+              tuple(reliability)),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Fit, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--tune", type=Path, nargs="+", required=True, help="files of verdicts")
+    parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
+    parser.add_argument("--write", action="store_true", help="the weights into the package")
+    add_record_option(parser)
+    options = parser.parse_args()
+    sets = {
+        name: [record for path in paths for record in ledger.read(path)]
+        for name, paths in (("fitted", options.tune), ("kept out", options.count))
+    }
+    models, tables, records = {}, [], [record for each in sets.values() for record in each]
+    for name, level in ((TABLES, "table"), (STRUCTURE, "data")):
+        of_level = {
+            which: samples_of(r for r in each if r["level"] == level)
+            for which, each in sets.items()
+        }
+        models[name] = fit(of_level["fitted"])
+        for which, samples in of_level.items():
+            tables += judged(f"{name}, {which}", models[name], samples)
+    ledger.publish_cases("accuracy.probability", tables, records, record=options.record)
+    if options.write:
+        text = {"format": "calibgraph-probability/1", "fitted_by": ledger.code(),
+                "results": {n: len(samples_of(each)) for n, each in sets.items()},
+                "models": models}  # fmt: skip
+        FILE.write_text(json.dumps(text, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""The probability that a result is off by more than the user's tolerance: what a verdict is cut of.
+
+Two ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check is,
+which can only grow as a check gets worse. And by the error bar itself, if it is wide beside the
+tolerance. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made
+wrong on purpose and right ones, and kept in ``probability.json`` with how they were got.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+from scipy.stats import chi
+
+from calibgraph.model.verdict import Check, Doubt, Verdict
+
+Array = NDArray[np.float64]
+
+TABLES, STRUCTURE = "tables", "structure"
+"""The models: of correspondences alone, whatever made them; of runs of the matcher."""
+
+_DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probability's logarithm
+
+
+def judge(
+    checks: Sequence[Check], covariance: Array | None, tolerance: tuple[float, float], model: str
+) -> Verdict:
+    """The verdict of one camera's result.
+
+    Args:
+        checks: of the camera.
+        covariance: (6, 6) of its error, rotation [rad] and translation [m]; None if there is none.
+        tolerance: rotation [deg] and distance [cm].
+        model: TABLES or STRUCTURE.
+    """
+    of_checks = probability_of_checks(checks, model)
+    of_error_bar = probability_beyond(covariance, tolerance)
+    return Verdict(tuple(checks), Doubt(of_checks, of_error_bar, *tolerance))
+
+
+def model_of(metadata: Mapping[str, Any]) -> str:
+    """The model for a run, by the metadata of its correspondences."""
+    return STRUCTURE if metadata.get("matcher") == STRUCTURE else TABLES
+
+
+def probability_of_checks(checks: Sequence[Check], model: str) -> float:
+    """The probability that a result is grossly wrong, by its checks."""
+    fitted = _models()[model]
+    worst = worst_severities((check.kind or check.name, check.severity) for check in checks)
+    parts = contributions(worst, fitted["weights"], fitted["other"])
+    return float(expit(fitted["intercept"] + sum(parts.values())))
+
+
+def worst_severities(checks: Any) -> dict[str, float]:
+    """Per kind of check the worst severity, of (kind, severity) pairs."""
+    worst: dict[str, float] = {}
+    for kind, severity in checks:
+        worst[kind] = max(severity, worst.get(kind, 0.0))
+    return worst
+
+
+def contributions(
+    severities: Mapping[str, float], weights: Mapping[str, Sequence[float]], other: Sequence[float]
+) -> dict[str, float]:
+    """Per kind of check, what it adds to the log odds; never negative.
+
+    Args:
+        severities: per kind.
+        weights: per kind, of each step of `steps`.
+        other: of kinds without.
+    """
+    return {
+        kind: float(np.dot(steps(severity), weights.get(kind, other)))
+        for kind, severity in severities.items()
+    }
+
+
+def steps(severity: float) -> Array:
+    """(3,) how far a severity is through PASS, WARN and FAIL, each 0 to 1."""
+    return np.clip(severity - np.arange(3.0), 0.0, 1.0)
+
+
+def probability_beyond(covariance: Array | None, tolerance: tuple[float, float]) -> float:
+    """The probability that an error of this covariance exceeds the tolerance; 0 without one.
+
+    Args:
+        covariance: (6, 6) rotation [rad] and translation [m].
+        tolerance: rotation [deg] and distance [cm].
+    """
+    if covariance is None:
+        return 0.0
+    rotation = _beyond(covariance[:3, :3], np.radians(tolerance[0]))
+    return min(rotation + _beyond(covariance[3:, 3:], tolerance[1] / 100), 1.0)
+
+
+def _beyond(covariance: Array, radius: float) -> float:
+    """P(|x| > radius) of x with (3, 3) covariance: over directions, of the chi distribution."""
+    root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
+    return float(np.mean(chi.sf(radius / np.linalg.norm(_directions() @ root.T, axis=1), 3)))
+
+
+@cache
+def _directions() -> Array:
+    """(n, 3) unit vectors, evenly over the sphere."""
+    number = np.arange(_DIRECTIONS) + 0.5
+    height = 1 - 2 * number / _DIRECTIONS
+    angle = np.pi * (1 + np.sqrt(5)) * number
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+
+
+@cache
+def _models() -> dict[str, Any]:
+    text = files(__package__).joinpath("probability.json").read_text("utf-8")
+    return dict(json.loads(text)["models"])

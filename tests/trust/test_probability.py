@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import Config, Rig, load_calibration, solve
+from calibgraph.model.verdict import (
+    FAIL_ABOVE,
+    PASS_BELOW,
+    Check,
+    Doubt,
+    Verdict,
+    rig_verdict,
+)
+from calibgraph.trust.probability import (
+    STRUCTURE,
+    TABLES,
+    judge,
+    probability_beyond,
+    probability_of_checks,
+    steps,
+)
+from calibgraph.trust.thresholds import THRESHOLDS, threshold
+from tests.trust.conftest import simulated
+
+WIDE = np.diag([0.003, 0.002, 0.004, 0.03, 0.05, 0.02]) ** 2
+
+
+@pytest.mark.parametrize("row", THRESHOLDS, ids=lambda row: row.key)
+def test_a_check_that_gets_worse_is_never_less_severe(row) -> None:  # type: ignore[no-untyped-def]
+    far = row.fail if math.isfinite(row.fail) else 10 * abs(row.warn) + 1
+    values = np.linspace(row.warn - 2 * (far - row.warn), far + 2 * (far - row.warn), 401)
+    severities = [row.check(value).severity for value in values]
+    assert (np.diff(severities) >= -1e-12).all()
+    assert row.check(row.warn).severity <= 1.0
+    assert row.check(float(np.nextafter(row.warn, far))).severity >= 1.0
+    assert max(severities) <= 3.0
+
+
+def test_severity_has_no_step_at_the_limits() -> None:
+    row = threshold("residual_spread")
+    for limit, expected in ((row.warn, 1.0), (row.fail, 2.0)):
+        for side in (1 - 1e-9, 1 + 1e-9):
+            assert row.check(limit * side).severity == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_finding_without_a_number_is_in_the_middle_of_its_status() -> None:
+    severities = [Check("x", status, "").severity for status in ("PASS", "WARN", "FAIL")]
+    assert severities == [0.0, 1.5, 2.5]
+    assert threshold("residual_spread").check(math.nan).severity == 3.0
+
+
+def test_steps_go_through_pass_warn_and_fail() -> None:
+    assert [steps(s).tolist() for s in (0.0, 0.5, 1.25, 3.0)] == [
+        [0, 0, 0], [0.5, 0, 0], [1, 0.25, 0], [1, 1, 1],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [TABLES, STRUCTURE])
+@pytest.mark.parametrize("kind", [row.key for row in THRESHOLDS])
+def test_a_worse_check_never_makes_a_result_more_probable(model: str, kind: str) -> None:
+    def of(status: str, value: float) -> float:
+        return probability_of_checks([Check(kind, status, "", value, 1.0, 2.0, kind=kind)], model)  # type: ignore[arg-type]
+
+    found = [of("PASS", 0.0), of("PASS", 1.0), of("WARN", 2.0), of("FAIL", 4.0)]
+    assert found == sorted(found)
+
+
+@pytest.mark.parametrize("model", [TABLES, STRUCTURE])
+def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(model: str) -> None:
+    assert judge([], None, (0.5, 10.0), model).status == "PASS"
+    assert judge([Check("new", "FAIL", "broken")], None, (0.5, 10.0), model).status == "FAIL"
+
+
+def test_several_doubts_are_worse_than_one() -> None:
+    one = probability_of_checks([Check("first", "WARN", "")], STRUCTURE)
+    four = [Check(f"doubt {k}", "WARN", "") for k in range(4)]
+    assert probability_of_checks(four, STRUCTURE) > max(FAIL_ABOVE, 10 * one)
+
+
+def test_a_wide_error_bar_is_as_probably_off_as_draws_from_it() -> None:
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), WIDE, 200_000)
+    turned = np.linalg.norm(draws[:, :3], axis=1) > np.radians(0.5)
+    moved = np.linalg.norm(draws[:, 3:], axis=1) > 0.1
+    expected = turned.mean() + moved.mean()
+    assert probability_beyond(WIDE, (0.5, 10.0)) == pytest.approx(expected, rel=0.02)
+    assert probability_beyond(None, (0.5, 10.0)) == 0.0
+    assert judge([], WIDE, (0.5, 10.0), TABLES).status != "PASS"
+    assert judge([], WIDE, (5.0, 100.0), TABLES).status == "PASS"
+
+
+def test_the_status_is_a_cut_of_the_probability() -> None:
+    for probability, status in (
+        (0.9 * PASS_BELOW, "PASS"), (PASS_BELOW, "WARN"), (FAIL_ABOVE, "WARN"),
+        (1.01 * FAIL_ABOVE, "FAIL"), (math.nan, "FAIL"),
+    ):  # fmt: skip
+        assert Verdict((Check("x", "PASS", ""),), Doubt(probability)).status == status
+    assert (
+        "off by more than 0.5 deg or 10 cm with a probability of 30%"
+        in Verdict((), Doubt(0.3)).reasons
+    )
+
+
+def test_a_check_beyond_its_limit_is_a_warning_and_no_more_where_the_probability_is_small() -> None:
+    for status in ("WARN", "FAIL"):
+        verdict = Verdict((Check("x", status, "a reason"),), Doubt(0.1 * PASS_BELOW))
+        assert (verdict.status, verdict.reasons) == ("WARN", ("a reason",))
+
+
+def test_a_wide_error_bar_is_no_fail_but_named() -> None:
+    verdict = Verdict((), Doubt(0.01, 0.6))
+    assert verdict.status == "WARN"
+    assert "the data cannot tell" in verdict.reasons[0]
+    assert "the data cannot tell" not in Verdict((), Doubt(0.6, 0.01)).reasons[0]
+
+
+def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:
+    rig = rig_verdict({"a": Verdict((), Doubt(0.001)), "b": Verdict((), Doubt(0.5))})
+    assert rig.doubt == Doubt(0.5)
+    assert rig.status == "FAIL"
+
+
+def test_the_tolerance_is_a_setting_and_the_probability_is_kept(pair: Rig, tmp_path: Path) -> None:
+    table = simulated(pair)
+    usual = solve(pair, table)
+    strict = solve(pair, table, Config(tolerance_deg=0.001, tolerance_cm=0.01))
+    assert usual.verdict.status == "PASS"
+    assert strict.verdict.status == "WARN"
+    assert "off by more than 0.001 deg or 0.01 cm" in strict.verdict.reasons[0]
+    strict.save(tmp_path / "out")
+    assert load_calibration(tmp_path / "out").camera_verdicts == strict.camera_verdicts
