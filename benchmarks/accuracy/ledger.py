@@ -168,7 +168,8 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
         "sigma_cm": None if sigmas is None else sigmas[1].tolist(),
         "normalised_squared": squared,
         "checks": [
-            [c.kind or c.name, c.status, _number(c.value), c.severity] for c in verdict.checks
+            [c.kind or c.name, c.status, _number(c.value), c.severity, c.decisive]
+            for c in verdict.checks
         ],
     }
 

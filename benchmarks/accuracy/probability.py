@@ -80,16 +80,17 @@ class Sample:
 
 
 def samples_of(records: Iterable[Record]) -> list[Sample]:
-    """The results of cases that data can tell from right ones."""
+    """The results of cases that data can tell from right ones, without those decided anyway."""
     return [
         Sample(
             record["level"], record["kind"],
-            worst_severities((kind, severity) for kind, _, _, severity in camera["checks"]),
+            worst_severities((kind, severity) for kind, _, _, severity, _ in camera["checks"]),
             probability_beyond(_matrix(camera["covariance"]), TOLERANCE),
             class_of(camera) == "off", class_of(camera) == "right", _vote(camera["checks"]),
         )
         for record in records if record["kind"] not in UNCOUNTED
         for camera in record.get("cameras", {}).values()
+        if not any(decisive for *_, decisive in camera["checks"])
     ]  # fmt: skip
 
 

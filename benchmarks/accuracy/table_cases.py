@@ -53,6 +53,14 @@ def swapped(world: World, rng: Rng) -> Case:
     return with_stereo(world.guess(), world.truth, a, b), renamed, {"swapped": [a, b]}
 
 
+def tied(world: World, rng: Rng) -> Case:
+    """One camera has no matches: a right relative pose ties it to another."""
+    names = list(world.truth.cameras)
+    without, other = (names[k] for k in rng.permutation(len(names))[:2])
+    table = concatenate([world.table().of_camera(name) for name in names if name != without])
+    return with_stereo(world.guess(), world.truth, without, other), table, {"without": without}
+
+
 def shuffled(world: World, rng: Rng) -> Case:
     """Clouds are paired with images of other frames; the vehicle moves 1 to 2 m per frame."""
     order, how = _shuffle(world.frames, rng)
@@ -231,6 +239,7 @@ def axes_guess(world: World, rng: Rng) -> Case:
 
 KINDS: dict[str, Callable[[World, Rng], Case]] = {
     "good": good,
+    "tied": tied,
     "random": random,
     "swapped": swapped,
     "shuffled": shuffled,

@@ -44,6 +44,11 @@ class Check:
     kind: str = ""
 
     @property
+    def decisive(self) -> bool:
+        """Whether it is a FAIL without limits: nothing was measured, or something did not work."""
+        return self.status == "FAIL" and self.warn is None
+
+    @property
     def severity(self) -> float:
         """How bad it is: 0 to 1 is PASS, 1 to 2 WARN, 2 to 3 FAIL, without steps at the limits."""
         low = float(_ORDER.index(self.status))

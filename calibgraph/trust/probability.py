@@ -51,7 +51,9 @@ def model_of(metadata: Mapping[str, Any]) -> str:
 
 
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:
-    """The probability that a result is grossly wrong, by its checks."""
+    """The probability that a result is grossly wrong, by its checks; 1 if one is decisive."""
+    if any(check.decisive for check in checks):
+        return 1.0
     fitted = _models()[model]
     worst = worst_severities((check.kind or check.name, check.severity) for check in checks)
     parts = contributions(worst, fitted["weights"], fitted["other"])
@@ -102,7 +104,8 @@ def probability_beyond(covariance: Array | None, tolerance: tuple[float, float])
 
 def _beyond(covariance: Array, radius: float) -> float:
     """P(|x| > radius) of x with (3, 3) covariance: over directions, of the chi distribution."""
-    root = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
+    variances, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(variances, 1e-24))  # zero, or below by rounding
     return float(np.mean(chi.sf(radius / np.linalg.norm(_directions() @ root.T, axis=1), 3)))
 
 

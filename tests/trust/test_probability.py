@@ -72,7 +72,9 @@ def test_a_worse_check_never_makes_a_result_more_probable(model: str, kind: str)
 @pytest.mark.parametrize("model", [TABLES, STRUCTURE])
 def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(model: str) -> None:
     assert judge([], None, (0.5, 10.0), model).status == "PASS"
-    assert judge([Check("new", "FAIL", "broken")], None, (0.5, 10.0), model).status == "FAIL"
+    new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
+    assert judge([new], None, (0.5, 10.0), model).status == "FAIL"
+    assert judge([Check("search", "FAIL", "not found")], None, (0.5, 10.0), model).doubt == Doubt(1)
 
 
 def test_several_doubts_are_worse_than_one() -> None:
