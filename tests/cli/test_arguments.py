@@ -23,13 +23,13 @@ def config(tmp_path: Path) -> Path:
 def test_a_given_seed_replaces_the_seed_of_the_file(
     option: int | None, seed: int, config: Path
 ) -> None:
-    settings = config_from(config, None, option)
+    settings = config_from(config, None, seed=option)
     assert (settings.seed, settings.preset) == (seed, "kitti")
 
 
 @pytest.mark.parametrize(("option", "seed"), [(None, 0), (3, 3)])
 def test_presets_have_seed_0(option: int | None, seed: int) -> None:
-    assert config_from(None, "walkley", option).seed == seed
+    assert config_from(None, "walkley", seed=option).seed == seed
 
 
 def test_seed_0_on_the_command_line_replaces_the_seed_of_the_file(

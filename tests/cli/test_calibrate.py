@@ -78,8 +78,11 @@ def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
     assert code == 0
     assert stderr == ""
     summary = json.loads(stdout)
-    assert set(summary) == {"verdict", "reasons", "cameras", "pairs", "timings_s", "files"}
+    keys = {"verdict", "probability_off", "reasons", "cameras", "pairs", "timings_s", "files"}
+    assert set(summary) == keys
     assert summary["verdict"] == "PASS"
+    each = [camera["probability_off"] for camera in summary["cameras"].values()]
+    assert 0 < summary["probability_off"] == max(each) < 0.005
     assert np.array(summary["cameras"]["left"]["T_camera_lidar"]).shape == (4, 4)
     assert len(summary["cameras"]["left"]["rotation_sigma_deg"]) == 3
 
