@@ -112,6 +112,8 @@ class Doubt:
         """The probability in percent, with its unit."""
         if self.probability > _SURE:
             return f"over {_SURE:.0%}"
+        if self.probability < 1 - _SURE:
+            return f"{100 * self.probability:.1f}%"
         return f"{100 * self.probability:.2g}%"
 
     @property

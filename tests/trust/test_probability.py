@@ -119,6 +119,11 @@ def test_a_wide_error_bar_is_no_fail_but_named() -> None:
     assert "the data cannot tell" not in Verdict((), Doubt(0.6, 0.01)).reasons[0]
 
 
+def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:
+    printed = [Doubt(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
+    assert printed == ["0.0%", "0.2%", "4.6%", "50%", "over 99%"]
+
+
 def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:
     rig = rig_verdict({"a": Verdict((), Doubt(0.001)), "b": Verdict((), Doubt(0.5))})
     assert rig.doubt == Doubt(0.5)
