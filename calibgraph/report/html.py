@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
-    "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, and "
-    "look at the pictures.",
+    "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
+    "and look at the pictures.",
     "FAIL": "No. Do not use this result; the reasons below name what to correct.",
 }
 
