@@ -152,7 +152,9 @@ class Verdict:
         worst = max((check.status for check in self.checks), key=_ORDER.index, default="PASS")
         if self.doubt is None:
             return worst
-        return "WARN" if self.doubt.status == "PASS" != worst else self.doubt.status
+        if self.doubt.status == "PASS" and worst != "PASS":
+            return "WARN"
+        return self.doubt.status
 
     @property
     def reasons(self) -> tuple[str, ...]:
