@@ -149,7 +149,9 @@ class Verdict:
 
         Without a probability, the worst status of the checks; PASS without any.
         """
-        worst = max((check.status for check in self.checks), key=_ORDER.index, default="PASS")
+        worst: Status = max(
+            (check.status for check in self.checks), key=_ORDER.index, default="PASS"
+        )
         if self.doubt is None:
             return worst
         if self.doubt.status == "PASS" and worst != "PASS":
