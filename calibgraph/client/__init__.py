@@ -1,0 +1,1 @@
+"""Calibrations by a server, from Python."""

@@ -1,0 +1,121 @@
+"""Errors as answers: problem+json (RFC 9457), with one line of what to do."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import secrets
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from calibgraph.errors import CalibrationError
+
+log = logging.getLogger("calibgraph.service")
+
+MEDIA_TYPE = "application/problem+json"
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class ProblemDetails(BaseModel):
+    """What an answer with a problem holds.
+
+    Attributes:
+        type: ``about:blank``: the status names the kind of problem.
+        title: of the status.
+        status: of the answer.
+        detail: what is wrong, and what to do, in one line.
+    """
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+
+
+class Problem(Exception):
+    """An answer that refuses a request.
+
+    Args:
+        status: of HTTP.
+        detail: what is wrong, and what to do, in one line.
+        headers: of the answer.
+    """
+
+    def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.status, self.detail, self.headers = status, detail, dict(headers or {})
+
+
+def problem_response(
+    status: int, detail: str, headers: Mapping[str, str] | None = None
+) -> Response:
+    """An answer with a problem."""
+    line = str(CalibrationError(detail))
+    details = ProblemDetails(title=HTTPStatus(status).phrase, status=status, detail=line)
+    return JSONResponse(details.model_dump(), status, dict(headers or {}), MEDIA_TYPE)
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The problems that a route may answer with, for OpenAPI."""
+    content = {MEDIA_TYPE: {"schema": ProblemDetails.model_json_schema()}}
+    return {
+        status: {"description": HTTPStatus(status).phrase, "content": content}
+        for status in sorted({400, 401, 403, 500, 503, *statuses})
+    }
+
+
+def add_problem_handlers(app: FastAPI) -> None:
+    """Answer every error of an app with a problem."""
+
+    @app.exception_handler(Problem)
+    async def _problem(_: Request, error: Problem) -> Response:
+        return problem_response(error.status, error.detail, error.headers)
+
+    @app.exception_handler(CalibrationError)
+    async def _bad_data(_: Request, error: CalibrationError) -> Response:
+        return problem_response(422, str(error))
+
+    @app.exception_handler(RequestValidationError)
+    async def _bad_request(_: Request, error: RequestValidationError) -> Response:
+        return problem_response(422, _first_problem(error))
+
+    @app.exception_handler(HTTPException)
+    async def _http(_: Request, error: HTTPException) -> Response:
+        return problem_response(error.status_code, str(error.detail), error.headers)
+
+    @app.exception_handler(OSError)
+    async def _disk(request: Request, error: OSError) -> Response:
+        if error.errno in _DISK_FULL:
+            return problem_response(507, "the server's disk is full; try again later")
+        return _unexpected(request, error)
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(_: Request, error: ClientDisconnect) -> Response:
+        return problem_response(400, "the request broke off")
+
+    @app.exception_handler(Exception)
+    async def _other(request: Request, error: Exception) -> Response:
+        return _unexpected(request, error)
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    """An error that no one foresaw: the answer names the line of the log that has it."""
+    number = secrets.token_hex(4)
+    log.error("error %s in %s %s", number, request.method, request.url.path, exc_info=error)
+    return problem_response(500, f"internal error {number}; the server's log has more")
+
+
+def _first_problem(error: RequestValidationError) -> str:
+    """The first thing that is wrong with a request."""
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if part != "body")
+    message = str(first["msg"]).removeprefix("Value error, ")
+    return f"{place}: {message}" if place else message
