@@ -49,6 +49,7 @@ def calibrate(
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
     from calibgraph.pipeline import calibrate
+    from calibgraph.report.result_files import write_result
 
     with checked_arguments():
         given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
@@ -65,7 +66,7 @@ def calibrate(
             time_limit_s=matching.limit_s,
             progress=progress,
         )
-        written = _write_result(result, data, out)
+        written = write_result(result, out, data)
     _print_frames_used(len(result.frames), data)
     _print_and_exit(result, written, as_json=as_json)
 
@@ -121,8 +122,7 @@ def solve(
     from calibgraph.files import sha256
     from calibgraph.fleet.sharded.solve import solve_table, table_files
     from calibgraph.io.rigs import load_rig
-    from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report import write_report
+    from calibgraph.report.result_files import write_result
 
     with checked_arguments():
         given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
@@ -134,29 +134,8 @@ def solve(
         )
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
-        written = [result.save(out), write_report(result, out / REPORT_FILE)]
+        written = write_result(result, out)
     _print_and_exit(result, written, as_json=as_json)
-
-
-def _write_result(result: Calibration, data: Dataset, folder: Path) -> list[Path]:
-    """Write the result, an overlay picture per camera and the report."""
-    from calibgraph.model.result_files import (
-        CAMERA_MATCHES_FILE,
-        CORRESPONDENCES_FILE,
-        REPORT_FILE,
-    )
-    from calibgraph.report import write_report
-    from calibgraph.report.point_overlay import write_overlays
-
-    middle = data.frames[len(data.frames) // 2]
-    mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
-    return [
-        result.save(folder),
-        folder / CORRESPONDENCES_FILE,
-        *([] if result.camera_matches is None else [folder / CAMERA_MATCHES_FILE]),
-        *write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark),
-        write_report(result, folder / REPORT_FILE),
-    ]
 
 
 def _print_frames_used(used: int, data: Dataset) -> None:

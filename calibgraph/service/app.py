@@ -8,12 +8,15 @@ from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
+from starlette.concurrency import run_in_threadpool
 
+from calibgraph.service import routes_jobs, routes_results, routes_service, routes_trackers
 from calibgraph.service.access import Gate, load_tokens
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.problems import add_problem_handlers
 from calibgraph.service.settings import Settings
 from calibgraph.service.shield import LOCAL_NAMES, Shield
+from calibgraph.service.state import Service, open_service
 
 STATIC_FOLDER = Path(__file__).parent / "static"
 
@@ -24,10 +27,12 @@ def create_app(settings: Settings) -> FastAPI:
     Further routers can be included. Their routes take :data:`calibgraph.service.access.Reader`,
     ``Submitter`` or ``Admin`` as a parameter to know who calls, and raise
     :class:`calibgraph.service.problems.Problem` or a ``CalibrationError`` to refuse. In
-    ``app.state``: ``settings``, ``gate``, ``metrics``. Files of ``static/`` are at ``/static``.
+    ``app.state``: ``settings``, ``gate``, ``metrics``, ``service``. Files of ``static/`` are at
+    ``/static``.
 
     Raises:
-        FileError: if the token file or the data folder cannot be used.
+        CalibrationError: if the token file, the data folder, the database or a root cannot be
+            used.
     """
     app = FastAPI(
         title="calibgraph",
@@ -39,8 +44,11 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.settings = settings
     app.state.gate = Gate(None if settings.tokens is None else load_tokens(settings.tokens))
     app.state.metrics = metrics = Metrics()
+    app.state.service = open_service(settings, metrics)
     app.add_middleware(Shield, hosts=_hosts(settings), observe=metrics.observe_request)
     app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
+    for router in (routes_jobs, routes_results, routes_trackers, routes_service):
+        app.include_router(router.router)
     add_problem_handlers(app)
     return app
 
@@ -54,4 +62,9 @@ def _hosts(settings: Settings) -> tuple[str, ...]:
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    yield
+    service: Service = app.state.service
+    service.start()
+    try:
+        yield
+    finally:
+        await run_in_threadpool(service.stop)

@@ -100,7 +100,14 @@ class DurableCalibrator:
         try:
             self._snapshot()
         finally:
-            self._database.close()
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Release the folder without a last snapshot: the journal has every update that returned.
+
+        For a tracker that may be in the middle of an update, as after an error.
+        """
+        self._database.close()
 
     def _snapshot(self) -> None:
         self._write_snapshot(self.tracker.to_bytes(), self._database.number)
@@ -121,8 +128,8 @@ class DurableCalibrator:
     ) -> None:
         if kind is None:
             self.close()
-        else:  # the journal has every update that returned; the tracker may be in the middle of one
-            self._database.close()
+        else:
+            self.abandon()
 
 
 def _encode_input(table: Correspondences, frame: int | None, rig: Rig) -> bytes:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections import deque
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import gtsam
 import numpy as np
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibgraph.files import write_atomically
 from calibgraph.model.geometry import twist_between
-from calibgraph.tracking.events import Event
+from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.history_figure import DPI, Curve, history_figure, text_figure
 from calibgraph.tracking.update import Update
 
@@ -132,9 +135,58 @@ class History:
             warnings.filterwarnings("ignore", "Glyph", UserWarning)
             write_atomically(path, lambda part: figure.savefig(part, format="png", dpi=DPI))
 
+    def save(self, path: Path) -> None:
+        """Write the history to a file, atomically; see :meth:`load`."""
+        arrays = {"frames": self._frames[: self._held], "entries": self._entries[: self._held]}
+        content = {
+            "most": self._most,
+            "stride": self._stride,
+            "updates": self._updates,
+            "origins": {name: T.tolist() for name, T in self._origins.items()},
+            "begun": sorted(self._begun),
+            "events": [asdict(event) for event in self._events],
+        }
+        write_atomically(path, lambda part: _save(part, json.dumps(content), arrays))
+
+    @staticmethod
+    def load(path: Path) -> History:
+        """The history of a file that :meth:`save` wrote; an empty one if there is none.
+
+        A file that cannot be read gives an empty history too: it is for the eye alone.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as held:
+                content, frames, entries = (
+                    json.loads(held["json"].item()),
+                    held["frames"],
+                    held["entries"],
+                )
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            return History()
+        history = History(content["most"])
+        history._stride, history._updates = content["stride"], content["updates"]
+        history._origins = {name: np.array(T) for name, T in content["origins"].items()}
+        history._begun = set(content["begun"])
+        history._events.extend(_event(each) for each in content["events"])
+        history._held = len(frames)
+        history._frames = np.empty(history._most, dtype=np.int64)
+        history._entries = np.full((history._most, *entries.shape[1:]), np.nan)
+        history._frames[: len(frames)], history._entries[: len(frames)] = frames, entries
+        return history
+
     def figure(self) -> Figure:
         """Make the picture, to be changed or shown by the caller."""
         if len(self) < 2:  # noqa: PLR2004 - a curve has two ends
             return text_figure(f"Nothing to draw: {len(self)} frames so far.")
         first, newest = int(self._frames[0]), int(self._frames[self._held - 1])
         return history_figure(self.curves(), self.events, first, newest)
+
+
+def _save(path: Path, text: str, arrays: dict[str, NDArray[np.generic]]) -> None:
+    with path.open("wb") as file:
+        np.savez(file, json=np.array(text), **arrays)  # type: ignore[arg-type]
+
+
+def _event(content: dict[str, Any]) -> Event:
+    size = content.pop("size")
+    return Event(**content, size=None if size is None else Size(**size))

@@ -1,0 +1,127 @@
+"""The commands of the service: serve, token."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibgraph.cli.terminal import print_plain, terminal
+
+_GB = 10**9
+
+
+def serve(
+    data: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for jobs, results and trackers.")
+    ] = Path("calibgraph-service"),
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on.")] = 8080,
+    tokens: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Who may call, see calibgraph token. (default: anyone on this machine)",
+        ),
+    ] = None,
+    host_name: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Name the server is called by; may be repeated."),
+    ] = None,
+    root: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URI", help="Folder that jobs may read from; may be repeated."),
+    ] = None,
+    database: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="postgresql+psycopg://... (default: SQLite in DIR)"),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=0, help="Jobs at once. (default: one per core)")
+    ] = None,
+    queue: Annotated[int, typer.Option(min=0, help="Most jobs that wait.")] = 1000,
+    timeout_s: Annotated[
+        float, typer.Option(min=0.001, metavar="SECONDS", help="Longest time of a job.")
+    ] = 3600.0,
+    memory_gb: Annotated[
+        float, typer.Option(min=0.1, metavar="GB", help="Most memory of a job.")
+    ] = 8.0,
+    upload_gb: Annotated[
+        float, typer.Option(min=0.001, metavar="GB", help="Largest upload, unpacked too.")
+    ] = 20.0,
+    fetch_gb: Annotated[
+        float, typer.Option(min=0.001, metavar="GB", help="Most bytes of a remote recording.")
+    ] = 50.0,
+    free_gb: Annotated[
+        float, typer.Option(min=0.0, metavar="GB", help="With less on the disk, refuse jobs.")
+    ] = 1.0,
+    keep_days: Annotated[
+        float, typer.Option(min=0.001, metavar="DAYS", help="How long results are kept.")
+    ] = 30.0,
+    tracker_processes: Annotated[
+        int, typer.Option(min=0, help="Processes that hold the trackers.")
+    ] = 2,
+    grace_s: Annotated[
+        float, typer.Option(min=0.001, metavar="SECONDS", help="For running jobs, at the end.")
+    ] = 10.0,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TLS certificate chain, PEM.")
+    ] = None,
+    key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its private key.")] = None,
+) -> None:
+    """Calibrate, check and track for others, over HTTP, until stopped.
+
+    Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
+    """
+    from calibgraph.service.app import create_app
+    from calibgraph.service.serve import Address, require_safe
+    from calibgraph.service.serve import serve as serve_app
+    from calibgraph.service.settings import Settings
+
+    address = Address(host, port, certificate, key)
+    require_safe(address, has_tokens=tokens is not None)
+    counted = {} if jobs is None else {"jobs_at_once": jobs}
+    settings = Settings(
+        data=data,
+        database=database,
+        tokens=tokens,
+        hosts=tuple(host_name or ()),
+        roots=tuple(root or ()),
+        most_queued=queue,
+        job_timeout_s=timeout_s,
+        job_memory_bytes=int(memory_gb * _GB),
+        upload_bytes=int(upload_gb * _GB),
+        fetch_bytes=int(fetch_gb * _GB),
+        free_bytes=int(free_gb * _GB),
+        keep_s=keep_days * 86400,
+        tracker_processes=tracker_processes,
+        grace_s=grace_s,
+        **counted,
+    )
+    serve_app(create_app(settings), address)
+
+
+def token(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Token file; made if it is not there.")
+    ],
+    tenant: Annotated[str, typer.Option(metavar="NAME", help="Whose jobs the token sees.")],
+    scope: Annotated[
+        str,
+        typer.Option(
+            metavar="read|submit|admin",
+            help="Look; ask and cancel too; or all of it, of all tenants.",
+        ),
+    ] = "submit",
+) -> None:
+    """Make a token for the service and print it: the file keeps its hash only."""
+    from calibgraph.errors import CalibrationError
+    from calibgraph.service.access import SCOPES, add_token
+
+    for known in SCOPES:
+        if scope == known:
+            print(add_token(file, tenant, known))
+            print_plain(terminal(), f"{file}: a token of {tenant} with scope {scope} was added")
+            return
+    raise CalibrationError(f"--scope {scope}: known are {', '.join(SCOPES)}")

@@ -1,0 +1,95 @@
+"""What the routes of jobs and trackers answer."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from pydantic import BaseModel
+
+from calibgraph.service.jobs import JobRecord, JobState
+from calibgraph.service.requests import JobKind
+from calibgraph.service.runner import Step
+
+
+class Progress(BaseModel):
+    """How far a job is.
+
+    Attributes:
+        stage: what it does.
+        done, total: steps of the stage.
+    """
+
+    stage: str
+    done: int
+    total: int
+
+
+class JobError(BaseModel):
+    """Why a job failed.
+
+    Attributes:
+        kind: bad input, io, out of memory, timeout, worker died or internal error.
+        detail: what is wrong, and what to do, in one line.
+    """
+
+    kind: str
+    detail: str
+
+
+class JobAnswer(BaseModel):
+    """A job.
+
+    Attributes:
+        id: of the job.
+        kind: calibration, solve or check.
+        state: queued, running, succeeded, failed or cancelled.
+        created, started, finished: times (UTC); null if not yet.
+        progress: of a running job.
+        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        error: of a failed job.
+    """
+
+    id: str
+    kind: JobKind
+    state: JobState
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    progress: Progress | None
+    verdict: str | None
+    error: JobError | None
+
+
+class JobList(BaseModel):
+    """Jobs, the newest first.
+
+    Attributes:
+        jobs: of this page.
+        next: ``before`` of the next page; null on the last.
+    """
+
+    jobs: list[JobAnswer]
+    next: int | None
+
+
+def job_answer(record: JobRecord, step: Step | None) -> JobAnswer:
+    """A job as an answer."""
+    is_running = record.state == "running" and step is not None
+    return JobAnswer(
+        id=record.id,
+        kind=record.kind,
+        state=record.state,
+        created=utc(record.created_s),
+        started=None if record.started_s is None else utc(record.started_s),
+        finished=None if record.finished_s is None else utc(record.finished_s),
+        progress=Progress(**vars(step)) if is_running and step else None,
+        verdict=record.verdict,
+        error=JobError(kind=record.error_kind or "internal error", detail=record.error)
+        if record.error is not None
+        else None,
+    )
+
+
+def utc(time_s: float) -> datetime:
+    """A time since 1970."""
+    return datetime.fromtimestamp(time_s, UTC)

@@ -1,0 +1,281 @@
+"""A job in its process: its input is made ready, one library call made, its result written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calibgraph.child_process import Note, answer_requests, memory_limit, output_to
+from calibgraph.errors import CalibrationError
+from calibgraph.files import write_text
+from calibgraph.fleet.task import ErrorKind
+from calibgraph.fleet.uris import fetch
+from calibgraph.service.archives import open_upload, table_suffix
+from calibgraph.service.places import Root, require_inside
+from calibgraph.service.requests import RIG, TABLE, Job, recording_name
+
+if TYPE_CHECKING:
+    from calibgraph.model.calibration import Calibration
+    from calibgraph.progress import Progress
+
+INPUT, WORK, RESULT, LOG = "input", "work", "result", "log.txt"
+"""In a job's folder: its input, its result while it is written, its result, its log."""
+FILES, SUMMARY = "files", "summary.json"
+"""In the result: the files that the command writes, and the summary that it prints."""
+
+_NOTE_EVERY_S = 0.1
+_KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
+
+
+@dataclass(frozen=True)
+class JobTask:
+    """A job for a process.
+
+    Attributes:
+        job: what is asked for.
+        folder: of the job.
+        roots: from which it may read.
+        memory_bytes: that it may allocate.
+        fetch_bytes: of remote recordings.
+        unpacked_bytes: of uploaded archives.
+        timeout_s: after which it is ended.
+    """
+
+    job: Job
+    folder: Path
+    roots: tuple[Root, ...]
+    memory_bytes: int
+    fetch_bytes: int
+    unpacked_bytes: int
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """How a job ended.
+
+    Attributes:
+        verdict: of the result; None if it failed.
+        error_kind, error: why it failed, in one line.
+    """
+
+    verdict: str | None = None
+    error_kind: ErrorKind | None = None
+    error: str | None = None
+
+
+def run_job(task: JobTask, note: Note) -> JobOutcome:
+    """Run a job; what is wrong with its data is part of the outcome.
+
+    Its paths are relative, so that no answer has one of the server's.
+    """
+    shutil.rmtree(task.folder / WORK, ignore_errors=True)
+    (task.folder / WORK / FILES).mkdir(parents=True)
+    os.chdir(task.folder / INPUT)
+    try:
+        return JobOutcome(verdict=_run(task, _progress(note)))
+    except MemoryError:
+        kind: ErrorKind = "out of memory"
+        text = "not enough memory; give fewer frames, or smaller files"
+    except (CalibrationError, ValueError) as error:
+        kind, text = "bad input", str(error)
+    except OSError as error:
+        traceback.print_exc()
+        kind, text = "io", error.strerror or type(error).__name__
+    except Exception as error:
+        traceback.print_exc()
+        kind, text = "internal error", f"{type(error).__name__}: {error}"
+    text = text.replace(f"{task.folder}/{INPUT}/", "").replace(str(task.folder), "")
+    return JobOutcome(error_kind=kind, error=str(CalibrationError(text)))
+
+
+def _run(task: JobTask, progress: Progress) -> str:
+    """Make the result; its verdict."""
+    job = task.job
+    rig = _found(task, RIG)
+    table = _found(task, TABLE)
+    recordings = [
+        path for i in range(job.recordings) if (path := _found(task, recording_name(i))) is not None
+    ]
+    run: Callable[[JobTask, Path | None, Path | None, list[Path], Progress], str]
+    run = {"solve": _solve, "calibration": _calibrate, "check": _check}[job.kind]
+    return run(task, rig, table, recordings, progress)
+
+
+def _found(task: JobTask, name: str) -> Path | None:
+    """The input of a name, made ready once: a job that is run again finds it."""
+    ready = [path for path in Path().glob(f"{name}.*") if path.suffix in _KNOWN_SUFFIXES]
+    if ready:
+        return ready[0]
+    path, uri = Path(name), task.job.uris.get(name)
+    if uri is not None:
+        return path if path.exists() else _link(task, uri, name)
+    if not path.exists():
+        return None
+    if name == RIG:
+        return path.rename(path.with_suffix(".yaml"))
+    if name == TABLE:
+        return path.rename(path.with_suffix(table_suffix(path)))
+    return (
+        path
+        if path.is_dir() and not _is_partial(path)
+        else open_upload(_restored(path), task.unpacked_bytes)
+    )
+
+
+def _is_partial(folder: Path) -> bool:
+    """Whether an archive is half unpacked: it is removed at the end."""
+    return folder.with_name(folder.name + ".packed").exists()
+
+
+def _restored(path: Path) -> Path:
+    """The upload, in place of a folder that is half of it."""
+    packed = path.with_name(path.name + ".packed")
+    if packed.exists():
+        shutil.rmtree(path, ignore_errors=True)
+        packed.rename(path)
+    return path
+
+
+def _link(task: JobTask, uri: str, name: str) -> Path:
+    """A link to what is at a URI, or to the copy of what is remote."""
+    require_inside(uri, task.roots)
+    copies = Path(f"{name}_copy")
+    shutil.rmtree(copies, ignore_errors=True)
+    copies.mkdir()
+    try:
+        found = fetch(uri, copies, task.fetch_bytes)
+    except (CalibrationError, OSError, MemoryError):
+        raise
+    except Exception as error:  # of any store's client
+        raise OSError(0, f"{uri}: cannot be fetched ({type(error).__name__})") from error
+    suffix = found.suffix if found.suffix in _KNOWN_SUFFIXES else ""
+    link = Path(f"{name}{suffix}")
+    link.symlink_to(found)
+    return link
+
+
+def _solve(
+    task: JobTask, rig: Path | None, table: Path | None, _: list[Path], progress: Progress
+) -> str:
+    from calibgraph.files import sha256
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.pipeline import solve
+
+    settings = task.job.solve_settings()
+    if rig is None or table is None:
+        raise ValueError("a solve needs a rig and correspondences")
+    progress("solving", 0, 1)
+    result = solve(load_rig(rig), table, settings.config, settings.terms)
+    result = result.with_inputs({str(table): sha256(table)})
+    return _write(task, result, None, with_report=settings.report)
+
+
+def _calibrate(
+    task: JobTask, rig: Path | None, table: Path | None, recordings: list[Path], progress: Progress
+) -> str:
+    from calibgraph.io.dataset import load_dataset
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.matching.structure import StructureMatcher
+    from calibgraph.pipeline import calibrate
+
+    settings = task.job.calibration_settings()
+    data = load_dataset(recordings, load_rig(rig) if rig else None, frames=settings.frames)
+    options: dict[str, Any] = {"search_deg": settings.search_deg, "search_m": settings.search_m}
+    if settings.search:
+        options = {name: value for name, value in options.items() if value is not None}
+    if settings.frames is not None:
+        options["most_frames"] = None
+    matcher = StructureMatcher(seed=settings.config.seed, **options) if table is None else table
+    most_s = task.timeout_s / 2  # the rest is for the checks and the report
+    result = calibrate(
+        data,
+        matcher=matcher,
+        config=settings.config,
+        terms=settings.terms,
+        time_limit_s=min(settings.time_limit_s or most_s, most_s),
+        progress=progress,
+    )
+    progress("writing", 0, 1)
+    return _write(task, result, data, with_report=settings.report)
+
+
+def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> str:
+    from calibgraph.report.as_json import result_summary
+    from calibgraph.report.result_files import write_result
+
+    written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
+    _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
+    return result.verdict.status
+
+
+def _check(
+    task: JobTask, rig: Path | None, _: Path | None, recordings: list[Path], progress: Progress
+) -> str:
+    from calibgraph.audit import audit_summary, check
+    from calibgraph.io.dataset import load_dataset
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.matching.structure import StructureMatcher
+
+    settings = task.job.check_settings()
+    if rig is None:
+        raise ValueError("a check needs the deployed rig")
+    deployed = load_rig(rig)
+    options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
+    audit = check(
+        deployed,
+        load_dataset(recordings, deployed, frames=settings.frames),
+        tolerance_deg=settings.tolerance_deg,
+        tolerance_cm=settings.tolerance_cm,
+        matcher=StructureMatcher(seed=settings.seed, **options),
+        seed=settings.seed,
+        progress=progress,
+    )
+    _write_summary(task, audit_summary(audit))
+    return audit.status
+
+
+def _write_summary(task: JobTask, summary: dict[str, Any]) -> None:
+    from calibgraph.report.as_json import finite
+
+    text = json.dumps(finite(summary), allow_nan=False)
+    write_text(task.folder / WORK / SUMMARY, text)
+
+
+def _progress(note: Note) -> Progress:
+    """A callback that prints each stage, and sends some of the steps to the server."""
+    start, last_s, stage = time.perf_counter(), [0.0], [""]
+
+    def progress(what: str, done: int, total: int) -> None:
+        now = time.perf_counter()
+        if what != stage[0]:
+            print(f"{now - start:8.1f} s  {what}", flush=True)
+        elif now - last_s[0] < _NOTE_EVERY_S:
+            return
+        stage[0], last_s[0] = what, now
+        note((what, done, total))
+
+    return progress
+
+
+def main() -> None:
+    """The process: one job at a time."""
+    import calibgraph.pipeline  # noqa: F401 - it takes seconds, which are not the first job's
+    import calibgraph.report.result_files  # noqa: F401
+
+    def answer(task: JobTask, note: Note) -> JobOutcome:
+        with output_to(task.folder / LOG), memory_limit(task.memory_bytes):
+            return run_job(task, note)
+
+    answer_requests(answer)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""The table of jobs: nothing that was acknowledged is lost, whatever ends the server."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import ColumnElement, Engine, RowMapping, func, select
+from sqlalchemy.exc import IntegrityError
+
+from calibgraph.fleet.task import ErrorKind
+from calibgraph.service.access import Caller
+from calibgraph.service.database import jobs
+from calibgraph.service.requests import Job, JobKind
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")
+MOST_STARTS = 20
+"""A job during which the process or the server ended so often is not started again."""
+
+_SHORT = [c for c in jobs.c if c.name not in ("request", "digest")]
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """A job, as the table holds it.
+
+    Attributes:
+        number: in the order of submission.
+        id: random; who knows it still needs a token of the tenant.
+        tenant: whose it is.
+        kind: of the job.
+        state: queued, running, succeeded, failed or cancelled.
+        created_s, started_s, finished_s: times since 1970; None if not yet.
+        starts: how often it was started.
+        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        error_kind, error: why it failed, in one line.
+        idempotency_key: that the request had.
+    """
+
+    number: int
+    id: str
+    tenant: str
+    kind: JobKind
+    state: JobState
+    created_s: float
+    started_s: float | None
+    finished_s: float | None
+    starts: int
+    verdict: str | None
+    error_kind: ErrorKind | None
+    error: str | None
+    idempotency_key: str | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether its state is final."""
+        return self.state in FINISHED
+
+
+def _record(row: RowMapping) -> JobRecord:
+    return JobRecord(**{name: row[name] for name in JobRecord.__dataclass_fields__})
+
+
+def new_id() -> str:
+    """128 random bits."""
+    return secrets.token_hex(16)
+
+
+class OtherRequestError(Exception):
+    """An idempotency key that was given with another request before."""
+
+
+class JobTable:
+    """The jobs of a server.
+
+    Args:
+        engine: of the database.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def add(self, id: str, tenant: str, job: Job, digest: str, key: str | None) -> JobRecord:
+        """Add a job; it is durable when this returns.
+
+        Args:
+            id: of the job, whose input is in its folder.
+            tenant: whose it is.
+            job: what is asked for.
+            digest: of all that is asked for, with uploads.
+            key: idempotency key: with one that is known, the job of it is returned.
+
+        Raises:
+            OtherRequestError: if the key was given with another request.
+        """
+        values = {
+            "id": id, "tenant": tenant, "kind": job.kind, "state": "queued",
+            "request": job.model_dump_json(), "digest": digest, "idempotency_key": key,
+            "created_s": time.time(), "starts": 0,
+        }  # fmt: skip
+        try:
+            with self._engine.begin() as connection:
+                connection.execute(jobs.insert().values(values))
+        except IntegrityError:
+            known = self.known(tenant, key, digest)
+            if known is None:
+                raise
+            return known
+        found = self.get(id)
+        assert found is not None
+        return found
+
+    def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
+        """The job that a request with an idempotency key made before.
+
+        Raises:
+            OtherRequestError: if it has another digest than the one given.
+        """
+        if key is None:
+            return None
+        where = (jobs.c.tenant == tenant) & (jobs.c.idempotency_key == key)
+        with self._engine.connect() as connection:
+            row = connection.execute(select(jobs).where(where)).mappings().first()
+        if row is not None and digest is not None and row["digest"] != digest:
+            raise OtherRequestError
+        return None if row is None else _record(row)
+
+    def get(self, id: str, caller: Caller | None = None) -> JobRecord | None:
+        """A job; None if there is none that the caller sees."""
+        with self._engine.connect() as connection:
+            row = connection.execute(select(*_SHORT).where(jobs.c.id == id)).mappings().first()
+        if row is None or (caller is not None and not caller.sees(row["tenant"])):
+            return None
+        return _record(row)
+
+    def request(self, id: str) -> Job:
+        """What a job was asked for."""
+        with self._engine.connect() as connection:
+            text = connection.execute(select(jobs.c.request).where(jobs.c.id == id)).scalar_one()
+        return Job.model_validate_json(text)
+
+    def list(self, caller: Caller, most: int, before: int | None = None) -> list[JobRecord]:
+        """The newest jobs that a caller sees, before a number."""
+        query = select(*_SHORT).order_by(jobs.c.number.desc()).limit(most)
+        if caller.scope != "admin":
+            query = query.where(jobs.c.tenant == caller.tenant)
+        if before is not None:
+            query = query.where(jobs.c.number < before)
+        with self._engine.connect() as connection:
+            return [_record(row) for row in connection.execute(query).mappings()]
+
+    def count(self, state: JobState) -> int:
+        """How many jobs are in a state."""
+        query = select(func.count()).select_from(jobs).where(jobs.c.state == state)
+        with self._engine.connect() as connection:
+            return int(connection.execute(query).scalar_one())
+
+    def start_next(self) -> JobRecord | None:
+        """Take the job that has waited longest; None if none waits. One thread at a time."""
+        waits = select(jobs.c.id).where(jobs.c.state == "queued").order_by(jobs.c.number).limit(1)
+        with self._engine.begin() as connection:
+            id = connection.execute(waits).scalar()
+            if id is None:
+                return None
+            started = {"state": "running", "started_s": time.time(), "starts": jobs.c.starts + 1}
+            connection.execute(jobs.update().where(_is(id, "queued")).values(started))
+        found = self.get(id)
+        return found if found is not None and found.state == "running" else None
+
+    def finish(
+        self,
+        id: str,
+        state: JobState,
+        *,
+        verdict: str | None = None,
+        error_kind: ErrorKind | None = None,
+        error: str | None = None,
+    ) -> bool:
+        """Give a running job its final state; False if it has one."""
+        values = {
+            "state": state, "verdict": verdict, "error_kind": error_kind, "error": error,
+            "finished_s": time.time(),
+        }  # fmt: skip
+        return self._change(_is(id, "running"), values) > 0
+
+    def cancel(self, id: str) -> bool:
+        """Cancel a job; False if it is finished."""
+        values = {"state": "cancelled", "finished_s": time.time()}
+        return self._change(_is(id, "queued", "running"), values) > 0
+
+    def put_back(self, id: str | None = None) -> int:
+        """Let a running job, or all of them, wait again; those started too often fail.
+
+        Returns:
+            How many wait again.
+        """
+        which = jobs.c.state == "running" if id is None else _is(id, "running")
+        text = f"its process or the server ended {MOST_STARTS} times while it ran"
+        self._change(
+            which & (jobs.c.starts >= MOST_STARTS),
+            {"state": "failed", "error_kind": "worker died", "error": text,
+             "finished_s": time.time()},
+        )  # fmt: skip
+        return self._change(which, {"state": "queued", "started_s": None})
+
+    def finished_before(self, time_s: float) -> list[str]:
+        """Ids of the jobs that ended before a time."""
+        where = jobs.c.state.in_(FINISHED) & (jobs.c.finished_s < time_s)
+        with self._engine.connect() as connection:
+            return list(connection.execute(select(jobs.c.id).where(where)).scalars())
+
+    def remove(self, ids: Iterable[str]) -> None:
+        """Forget jobs."""
+        with self._engine.begin() as connection:
+            for id in ids:
+                connection.execute(jobs.delete().where(jobs.c.id == id))
+
+    def ids(self) -> set[str]:
+        """Ids of all jobs."""
+        with self._engine.connect() as connection:
+            return set(connection.execute(select(jobs.c.id)).scalars())
+
+    def _change(self, where: ColumnElement[bool], values: dict[str, Any]) -> int:
+        with self._engine.begin() as connection:
+            return connection.execute(jobs.update().where(where).values(values)).rowcount
+
+
+def _is(id: str, *states: JobState) -> ColumnElement[bool]:
+    return (jobs.c.id == id) & jobs.c.state.in_(states)

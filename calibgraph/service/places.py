@@ -1,0 +1,71 @@
+"""Where jobs may read: URIs inside roots that the server's owner allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+from calibgraph.errors import FileError
+from calibgraph.fleet.uris import is_local, locate
+
+_SHOWN = 200
+
+
+@dataclass(frozen=True)
+class Root:
+    """A folder from which jobs may read.
+
+    Attributes:
+        protocol: of fsspec.
+        path: in it, without a slash at the end; of a local folder without links.
+    """
+
+    protocol: str
+    path: str
+
+    def holds(self, protocol: str, path: str) -> bool:
+        """Whether a path is this folder, or in it."""
+        same = protocol == self.protocol
+        return same and (path == self.path or path.startswith(f"{self.path.rstrip('/')}/"))
+
+
+def open_roots(uris: tuple[str, ...]) -> tuple[Root, ...]:
+    """The roots of these URIs.
+
+    Raises:
+        FileError: if one is no URI that can be read, or a local folder that is not there.
+    """
+    return tuple(Root(*_place(uri)) for uri in uris)
+
+
+def require_inside(uri: str, roots: tuple[Root, ...]) -> None:
+    """Check that a URI is inside the roots; links of local folders are followed first.
+
+    Raises:
+        FileError: if not. The message is the same whether or not anything is there.
+    """
+    shown = uri[:_SHOWN]
+    outside = FileError(shown, "is not inside the folders that this server reads from")
+    if "::" in uri or not uri.isprintable() or ".." in unquote(uri).split("/"):
+        raise outside
+    if not any(uri.startswith(f"{root.protocol}:") for root in roots) and "://" in uri:
+        raise outside  # before a store's client is loaded
+    try:
+        place = _place(uri)
+    except (FileError, ValueError):
+        raise outside from None
+    if not any(root.holds(*place) for root in roots):
+        raise outside
+
+
+def _place(uri: str) -> tuple[str, str]:
+    """The protocol and the path of a URI."""
+    filesystem, path = locate(uri)
+    if is_local(filesystem):
+        try:
+            return "file", str(Path(path).resolve(strict=True))
+        except (OSError, RuntimeError) as error:
+            raise FileError(uri, "no such file or folder; check the path") from error
+    protocol = uri.partition("://")[0]
+    return protocol, path.rstrip("/")

@@ -1,0 +1,196 @@
+"""What jobs are asked for: the bodies of requests, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
+
+from calibgraph.model.config import Config, Terms, config_from
+
+JobKind = Literal["calibration", "solve", "check"]
+KINDS: tuple[JobKind, ...] = ("calibration", "solve", "check")
+
+MAX_RECORDINGS = 100
+Uri = Annotated[str, StringConstraints(min_length=1, max_length=2000)]
+Tolerance = Annotated[float, Field(gt=0, le=180)]
+
+
+def _checked_config(content: object) -> object:
+    """Settings from a mapping, whose preset gives those that it leaves out."""
+    return config_from(content, "config") if isinstance(content, Mapping) else content
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SolveSettings(_Strict):
+    """How correspondences are solved.
+
+    Attributes:
+        config: settings of the solve, as in a ``--config`` file.
+        terms: of the objective.
+        report: whether to write ``report.html``, which takes longer than a small solve.
+    """
+
+    config: Annotated[Config, BeforeValidator(_checked_config)] = Config()
+    terms: Terms = "full"
+    report: bool = True
+
+
+class CalibrationSettings(SolveSettings):
+    """How a recording is calibrated.
+
+    Attributes:
+        frames: which, as ``--frames``: ``0:90:10`` or ``0,5,7``.
+        search: whether the guess may be far off.
+        search_deg, search_m: how far, per axis; the matcher's default if None.
+        time_limit_s: when to stop matching; at most half of the server's limit for a job.
+    """
+
+    frames: Annotated[str, StringConstraints(max_length=10_000)] | None = None
+    search: bool = True
+    search_deg: Annotated[float, Field(gt=0, le=45)] | None = None
+    search_m: Annotated[float, Field(gt=0, le=5)] | None = None
+    time_limit_s: Annotated[float, Field(gt=0)] | None = None
+
+
+class CheckSettings(_Strict):
+    """How a deployed calibration is checked.
+
+    Attributes:
+        tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
+        frames: which, as ``--frames``.
+        seed: of everything random.
+    """
+
+    tolerance_deg: Tolerance = 0.5
+    tolerance_cm: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    frames: Annotated[str, StringConstraints(max_length=10_000)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+
+
+Recordings = Annotated[tuple[Uri, ...], Field(min_length=1, max_length=MAX_RECORDINGS)]
+
+
+class CalibrationRequest(_Strict):
+    """A calibration of recordings that the server can read.
+
+    Attributes:
+        recordings: URIs of dataset folders, KITTI sequences or bags of one rig.
+        rig: URI of the guess; None: the one that lies with the data.
+        correspondences: URI of a table to take in place of matching.
+        settings: see there.
+    """
+
+    recordings: Recordings
+    rig: Uri | None = None
+    correspondences: Uri | None = None
+    settings: CalibrationSettings = CalibrationSettings()
+
+
+class SolveRequest(_Strict):
+    """A solve of a table that the server can read.
+
+    Attributes:
+        rig: URI of the guess.
+        correspondences: URI of the table.
+        settings: see there.
+    """
+
+    rig: Uri
+    correspondences: Uri
+    settings: SolveSettings = SolveSettings()
+
+
+class CheckRequest(_Strict):
+    """A check of a deployed calibration with recordings that the server can read.
+
+    Attributes:
+        rig: URI of the deployed calibration.
+        recordings: URIs of recent recordings.
+        settings: see there.
+    """
+
+    rig: Uri
+    recordings: Recordings
+    settings: CheckSettings = CheckSettings()
+
+
+AnyRequest = CalibrationRequest | SolveRequest | CheckRequest
+REQUESTS: Mapping[JobKind, type[AnyRequest]] = {
+    "calibration": CalibrationRequest,
+    "solve": SolveRequest,
+    "check": CheckRequest,
+}
+
+
+class Job(_Strict):
+    """A job as it is kept.
+
+    Attributes:
+        kind: of the job.
+        uris: what is read from where, by the name of the input; uploads are in the job's folder.
+        recordings: how many there are.
+        settings: of the kind, as JSON.
+    """
+
+    kind: JobKind
+    uris: dict[str, str] = {}
+    recordings: int = 0
+    settings: dict[str, Any] = {}
+
+    def calibration_settings(self) -> CalibrationSettings:
+        """The settings of a calibration."""
+        return CalibrationSettings.model_validate(self.settings)
+
+    def solve_settings(self) -> SolveSettings:
+        """The settings of a solve."""
+        return SolveSettings.model_validate(self.settings)
+
+    def check_settings(self) -> CheckSettings:
+        """The settings of a check."""
+        return CheckSettings.model_validate(self.settings)
+
+
+RIG, TABLE, RECORDING = "rig", "correspondences", "recording"
+"""Names of inputs: the files of an upload, and in the job's folder."""
+
+ALLOWED: Mapping[JobKind, tuple[str, ...]] = {
+    "calibration": (RECORDING, RIG, TABLE),
+    "solve": (RIG, TABLE),
+    "check": (RIG, RECORDING),
+}
+REQUIRED: Mapping[JobKind, tuple[str, ...]] = {
+    "calibration": (RECORDING,),
+    "solve": (RIG, TABLE),
+    "check": (RIG, RECORDING),
+}
+
+
+def settings_of(kind: JobKind) -> type[SolveSettings] | type[CheckSettings]:
+    """The model of the settings of a kind."""
+    return {
+        "calibration": CalibrationSettings,
+        "solve": SolveSettings,
+        "check": CheckSettings,
+    }[kind]
+
+
+def job_of(request: AnyRequest, kind: JobKind) -> Job:
+    """The job that a JSON body asks for."""
+    uris: dict[str, str] = {}
+    recordings: tuple[str, ...] = getattr(request, "recordings", ())
+    for name in (RIG, TABLE):
+        if uri := getattr(request, name, None):
+            uris[name] = uri
+    uris |= {recording_name(i): uri for i, uri in enumerate(recordings)}
+    settings = request.settings.model_dump(mode="json")
+    return Job(kind=kind, uris=uris, recordings=len(recordings), settings=settings)
+
+
+def recording_name(index: int) -> str:
+    """The name of a recording in a job's folder."""
+    return f"{RECORDING}_{index}" if index else RECORDING

@@ -1,0 +1,181 @@
+"""Routes of jobs: ask for one, follow it, cancel it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from calibgraph.service.access import Reader, Submitter
+from calibgraph.service.answers import JobAnswer, JobList, job_answer
+from calibgraph.service.bell import wait_for
+from calibgraph.service.job_process import LOG
+from calibgraph.service.jobs import JobRecord
+from calibgraph.service.problems import Problem, documented
+from calibgraph.service.requests import ALLOWED, KINDS, REQUESTS, REQUIRED, JobKind, settings_of
+from calibgraph.service.state import Service, State
+from calibgraph.service.submission import SETTINGS, submit
+
+router = APIRouter(prefix="/v1")
+
+_PATHS: dict[JobKind, str] = {
+    "calibration": "/calibrations", "solve": "/solves", "check": "/checks",
+}  # fmt: skip
+_LONGEST_WAIT_S = 60.0
+_MOST_LOG = 2**20
+_KEEP_ALIVE_S = 15.0
+_NO_CACHE = {"X-Accel-Buffering": "no"}
+
+JobId = Annotated[str, "id of a job"]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(description="A repeated request with the same key gives the job of the first."),
+]
+
+
+def _body(kind: JobKind) -> dict[str, Any]:
+    """The bodies that a kind takes, for OpenAPI."""
+    files: dict[str, Any] = {name: {"type": "string", "format": "binary"} for name in ALLOWED[kind]}
+    if "recording" in files:
+        files["recording"] = {"type": "array", "items": files["recording"]}
+    form = {
+        "type": "object",
+        "properties": {**files, SETTINGS: settings_of(kind).model_json_schema()},
+        "required": list(REQUIRED[kind]),
+    }
+    content = {
+        "application/json": {"schema": REQUESTS[kind].model_json_schema()},
+        "multipart/form-data": {"schema": form},
+    }
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def _submit_route(kind: JobKind) -> Callable[..., Awaitable[Response]]:
+    async def route(
+        request: Request, state: State, caller: Submitter, idempotency_key: IdempotencyKey = None
+    ) -> Response:
+        record, _ = await submit(state, request, caller, kind, idempotency_key)
+        answer = job_answer(record, state.runner.step(record.id))
+        headers = {"Location": f"/v1/jobs/{record.id}"}
+        return JSONResponse(answer.model_dump(mode="json"), 202, headers)
+
+    route.__doc__ = f"Ask for a {kind}: JSON with URIs, or a form with files (or URIs as fields)."
+    route.__name__ = f"submit_{kind}"
+    return route
+
+
+for _kind in KINDS:
+    router.post(
+        _PATHS[_kind],
+        status_code=202,
+        response_model=JobAnswer,
+        responses=documented(413, 415, 422, 429, 507),
+        openapi_extra=_body(_kind),
+    )(_submit_route(_kind))
+
+
+def find_job(state: Service, caller: Reader, id: str) -> JobRecord:
+    """The job of an id.
+
+    Raises:
+        Problem: if there is none that the caller sees.
+    """
+    record = state.jobs.get(id, caller)
+    if record is None:
+        raise Problem(404, "no such job; finished jobs are removed after some time")
+    return record
+
+
+@router.get("/jobs", responses=documented(422))
+def list_jobs(
+    state: State,
+    caller: Reader,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    before: Annotated[int | None, Query(ge=0, le=2**62)] = None,
+) -> JobList:
+    """The jobs of the tenant, the newest first."""
+    records = state.jobs.list(caller, limit, before)
+    following = records[-1].number if len(records) == limit else None
+    return JobList(jobs=[job_answer(r, state.runner.step(r.id)) for r in records], next=following)
+
+
+@router.get("/jobs/{id}", responses=documented(404, 422))
+async def get_job(
+    id: JobId,
+    state: State,
+    caller: Reader,
+    wait_s: Annotated[float, Query(ge=0, le=_LONGEST_WAIT_S)] = 0.0,
+) -> JobAnswer:
+    """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
+    end = time.monotonic() + wait_s
+    with state.bell.listen(id) as heard:
+        while True:
+            record = await run_in_threadpool(find_job, state, caller, id)
+            left_s = end - time.monotonic()
+            if record.is_finished or left_s <= 0 or state.is_stopping:
+                return job_answer(record, state.runner.step(id))
+            await wait_for(heard, left_s)
+
+
+@router.get(
+    "/jobs/{id}/events",
+    response_class=StreamingResponse,
+    responses={**documented(404, 422), 200: {"content": {"text/event-stream": {}}}},
+)
+async def job_events(id: JobId, state: State, caller: Reader) -> Response:
+    """The job, as server-sent events: now, on every change, and when it is finished."""
+    await run_in_threadpool(find_job, state, caller, id)
+    return StreamingResponse(
+        _events(state, caller, id), media_type="text/event-stream", headers=_NO_CACHE
+    )
+
+
+async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]:
+    sent, last_s = "", time.monotonic()
+    with state.bell.listen(id) as heard:
+        while not state.is_stopping:
+            record = await run_in_threadpool(state.jobs.get, id, caller)
+            if record is None:
+                return
+            text = json.dumps(job_answer(record, state.runner.step(id)).model_dump(mode="json"))
+            if text != sent:
+                yield f"event: {record.state}\ndata: {text}\n\n"
+                sent, last_s = text, time.monotonic()
+            elif time.monotonic() - last_s > _KEEP_ALIVE_S:
+                yield ": still here\n\n"
+                last_s = time.monotonic()
+            if record.is_finished:
+                return
+            await wait_for(heard, _KEEP_ALIVE_S)
+            await asyncio.sleep(0.05)  # steps come faster than anyone reads them
+
+
+@router.get(
+    "/jobs/{id}/log",
+    response_class=PlainTextResponse,
+    responses={**documented(404, 422), 200: {"content": {"text/plain": {}}}},
+)
+def job_log(id: JobId, state: State, caller: Reader) -> Response:
+    """What the job printed: its last part."""
+    find_job(state, caller, id)
+    folder = state.folder.of_job(id)
+    try:
+        text = (folder / LOG).read_bytes()[-_MOST_LOG:].decode(errors="replace")
+    except FileNotFoundError:
+        text = ""
+    return PlainTextResponse(text.replace(str(folder), "").replace(str(state.folder.path), ""))
+
+
+@router.delete("/jobs/{id}", responses=documented(404, 409, 422))
+def cancel_job(id: JobId, state: State, caller: Submitter) -> JobAnswer:
+    """Cancel a job that waits or runs."""
+    find_job(state, caller, id)
+    if not state.runner.cancel(id):
+        raise Problem(409, "the job is finished")
+    return job_answer(find_job(state, caller, id), None)

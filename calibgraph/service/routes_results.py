@@ -1,0 +1,137 @@
+"""Routes of results: the summary, the report, the files, other programs' formats."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import FileResponse, StreamingResponse
+
+from calibgraph.io.formats.export import export_calibration
+from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.model.result_files import REPORT_FILE
+from calibgraph.service.access import Reader
+from calibgraph.service.job_process import FILES, RESULT, SUMMARY
+from calibgraph.service.problems import Problem, documented
+from calibgraph.service.routes_jobs import JobId, find_job
+from calibgraph.service.state import Service, State
+
+router = APIRouter(prefix="/v1/jobs/{id}")
+
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; img-src data:; "
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
+"""The report is one file with its own styles: it may do nothing else, and is of no origin."""
+
+_SUFFIXES = {
+    "kalibr": ".yaml", "ros1": ".txt", "ros2": ".txt", "ros2-launch": ".launch.xml",
+    "tf2": ".yaml", "urdf": ".urdf", "autoware": ".yaml", "nuscenes": ".json", "koide": ".json",
+    "opencv": ".yaml", "npz": ".npz", "json": ".json",
+}  # fmt: skip
+
+
+def _result_folder(state: Service, caller: Reader, id: str) -> Path:
+    """The folder of a result.
+
+    Raises:
+        Problem: if there is no such job, or it has none.
+    """
+    record = find_job(state, caller, id)
+    if record.state != "succeeded":
+        why = f" ({record.error})" if record.error else ""
+        raise Problem(409, f"the job has no result: it is {record.state}{why}")
+    return state.folder.of_job(id) / RESULT
+
+
+@router.get(
+    "/result",
+    responses={**documented(404, 409, 422), 200: {"content": {"application/json": {}}}},
+)
+def result(id: JobId, state: State, caller: Reader) -> Response:
+    """The result, as ``--json`` prints it: verdict, extrinsics, error bars, units in the keys."""
+    folder = _result_folder(state, caller, id)
+    return _file(folder / SUMMARY, "application/json")
+
+
+@router.get(
+    "/files.zip",
+    response_class=FileResponse,
+    responses={**documented(404, 409, 422), 200: {"content": {"application/zip": {}}}},
+)
+def files(id: JobId, state: State, caller: Reader) -> Response:
+    """The files that the command writes, in an archive."""
+    folder = _result_folder(state, caller, id) / FILES
+    paths = sorted(path for path in folder.iterdir() if path.is_file())
+    if not paths:
+        raise Problem(404, "a check writes no files")
+    held = tempfile.TemporaryFile()  # noqa: SIM115 - the answer closes it
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as archive:
+        for path in paths:
+            archive.write(path, path.name)
+    size = held.tell()
+    headers = {"Content-Length": str(size), **_attachment(f"{id}.zip")}
+    return StreamingResponse(_chunks(held), media_type="application/zip", headers=headers)
+
+
+def _chunks(file: Any) -> Iterator[bytes]:
+    with file:
+        file.seek(0)
+        while chunk := file.read(2**18):
+            yield chunk
+
+
+@router.get(
+    "/report.html",
+    response_class=FileResponse,
+    responses={**documented(404, 409, 422), 200: {"content": {"text/html": {}}}},
+)
+def report(id: JobId, state: State, caller: Reader) -> Response:
+    """The report: one page that explains the result."""
+    path = _result_folder(state, caller, id) / FILES / REPORT_FILE
+    if not path.exists():
+        raise Problem(404, "no report was asked for, or the job is a check")
+    return _file(path, "text/html", {"Content-Security-Policy": REPORT_POLICY})
+
+
+@router.get(
+    "/exports/{format}",
+    response_class=FileResponse,
+    responses={**documented(404, 409, 422), 200: {"content": {"application/octet-stream": {}}}},
+)
+def export(
+    id: JobId,
+    format: str,
+    state: State,
+    caller: Reader,
+    even_if_failed: Annotated[bool, Query()] = False,
+) -> Response:
+    """The calibration in the format of another program."""
+    folder = _result_folder(state, caller, id) / FILES
+    if format not in EXPORT_FORMATS:
+        raise Problem(404, f"no such format; known are {', '.join(EXPORT_FORMATS)}")
+    if not any(folder.iterdir()):
+        raise Problem(404, "a check has no calibration to export")
+    suffix = _SUFFIXES.get(format, ".txt")
+    with tempfile.TemporaryDirectory() as temporary:
+        # The format kitti has one name for its file.
+        name = "calib.txt" if format == "kitti" else f"calibration{suffix}"
+        written = export_calibration(
+            folder, Path(temporary) / name, format, even_if_failed=even_if_failed
+        )
+        content = written[0].read_bytes()
+    return Response(content, media_type="application/octet-stream", headers=_attachment(name))
+
+
+def _attachment(name: str) -> dict[str, str]:
+    return {"Content-Disposition": f'attachment; filename="{name}"'}
+
+
+def _file(path: Path, media_type: str, headers: dict[str, str] | None = None) -> Response:
+    if not path.exists():  # it has expired meanwhile
+        raise Problem(404, "no such job; finished jobs are removed after some time")
+    return FileResponse(path, media_type=media_type, headers=headers)

@@ -1,0 +1,56 @@
+"""Routes of the service itself: is it alive, can it work, its numbers, its API in words."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+from fastapi.responses import PlainTextResponse
+from pydantic import BaseModel
+from sqlalchemy.exc import SQLAlchemyError
+
+from calibgraph.service.access import Admin
+from calibgraph.service.metrics import CONTENT_TYPE
+from calibgraph.service.problems import Problem, documented
+from calibgraph.service.state import State
+
+router = APIRouter()
+
+
+class Status(BaseModel):
+    """That the server is well.
+
+    Attributes:
+        status: ok.
+    """
+
+    status: str = "ok"
+
+
+@router.get("/healthz", responses=documented())
+async def healthz() -> Status:
+    """Whether the process answers."""
+    return Status()
+
+
+@router.get("/readyz", responses=documented(507))
+def readyz(state: State) -> Status:
+    """Whether jobs can be taken in: the database, the disk, the threads that run them."""
+    state.require_room()
+    try:
+        state.jobs.count("queued")
+    except SQLAlchemyError as error:
+        raise Problem(503, "the database cannot be read") from error
+    if not state.runner.is_alive():
+        raise Problem(503, "no jobs are run; restart the server")
+    return Status()
+
+
+@router.get(
+    "/metrics",
+    response_class=PlainTextResponse,
+    responses={**documented(), 200: {"content": {"text/plain": {}}}},
+)
+def metrics(state: State, caller: Admin) -> Response:
+    """Numbers for Prometheus."""
+    state.metrics.queued.set(state.jobs.count("queued"))
+    state.metrics.running.set(state.jobs.count("running"))
+    return Response(state.metrics.text(), media_type=CONTENT_TYPE)

@@ -1,0 +1,210 @@
+"""Routes of trackers: one per rig, frames in, estimates out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict
+from starlette.concurrency import run_in_threadpool
+
+from calibgraph.files import checked_model, yaml_text
+from calibgraph.model.config import config_from
+from calibgraph.service.access import Caller, Name, Reader, Submitter
+from calibgraph.service.answers import utc
+from calibgraph.service.jobs import new_id
+from calibgraph.service.problems import Problem, documented
+from calibgraph.service.settings import MAX_JSON_BYTES
+from calibgraph.service.state import Service, State
+from calibgraph.service.submission import parse_json
+from calibgraph.service.tracker_process import ARROW, TrackerRequest
+from calibgraph.service.tracker_table import TrackerRecord
+from calibgraph.service.uploads import read_whole
+
+router = APIRouter(prefix="/v1/trackers")
+
+TrackerId = Annotated[str, "id of a tracker"]
+_LINES = ("application/x-ndjson", "application/jsonl", "application/json")
+_FRAMES_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/x-ndjson": {"schema": {"type": "string", "format": "binary"}},
+            ARROW: {"schema": {"type": "string", "format": "binary"}},
+        },
+    }
+}
+
+
+class TrackerBody(BaseModel):
+    """A tracker that is asked for.
+
+    Attributes:
+        rig: the guess, as in a rig file.
+        config: settings, as in a ``--config`` file.
+        name: for people.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rig: dict[str, Any]
+    config: dict[str, Any] = {}
+    name: Name = "tracker"
+
+
+class TrackerAnswer(BaseModel):
+    """A tracker.
+
+    Attributes:
+        id: of the tracker.
+        name: that it was given.
+        created: time (UTC), ISO 8601.
+    """
+
+    id: str
+    name: str
+    created: str
+
+
+class FramesAnswer(BaseModel):
+    """What became of frames.
+
+    Attributes:
+        updates: per frame that was taken in, and is on disk, what ``track`` prints.
+        known: frames that were taken in before, or are older than the last.
+        refused: what was left out, and why.
+    """
+
+    updates: list[dict[str, Any]]
+    known: int
+    refused: list[str]
+
+
+class TrackerState(BaseModel):
+    """The last estimate of a tracker.
+
+    Attributes:
+        frame: last frame that was taken in; null if none.
+        verdict: of the estimate: PASS, WARN or FAIL.
+        reasons: of the verdict.
+        cameras: per camera, as in a result.
+        events: the last ones.
+    """
+
+    frame: int | None
+    verdict: str
+    reasons: list[str]
+    cameras: dict[str, Any]
+    events: list[dict[str, Any]]
+
+
+def tracker_answer(record: TrackerRecord) -> TrackerAnswer:
+    """A tracker as an answer."""
+    return TrackerAnswer(id=record.id, name=record.name, created=utc(record.created_s).isoformat())
+
+
+def _find(state: Service, caller: Caller, id: str) -> TrackerRecord:
+    record = state.tracker_table.get(id, caller)
+    if record is None:
+        raise Problem(404, "no such tracker")
+    return record
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_model=TrackerAnswer,
+    responses=documented(413, 415, 422, 429, 507),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": TrackerBody.model_json_schema()}},
+        }
+    },
+)
+async def create_tracker(request: Request, state: State, caller: Submitter) -> Response:
+    """Begin to track a rig."""
+    if not request.headers.get("content-type", "").startswith("application/json"):
+        raise Problem(415, "send application/json")
+    content = parse_json(await read_whole(request.stream(), MAX_JSON_BYTES))
+    if not isinstance(content, dict):
+        raise Problem(422, "expected a JSON object")
+    body = checked_model(TrackerBody, content, "tracker")
+    config_from(body.config, "config")
+    record = await run_in_threadpool(_create, state, caller, body)
+    headers = {"Location": f"/v1/trackers/{record.id}"}
+    return JSONResponse(tracker_answer(record).model_dump(), 201, headers)
+
+
+def _create(state: Service, caller: Caller, body: TrackerBody) -> TrackerRecord:
+    state.require_room()
+    if state.tracker_table.count() >= state.settings.most_trackers:
+        raise Problem(429, "no more trackers; remove one", {"Retry-After": "60"})
+    id = new_id()
+    folder = state.folder.of_tracker(id)
+    folder.mkdir(mode=0o700)
+    try:
+        config = json.dumps(body.config)
+        rig = yaml_text(body.rig).encode()
+        state.trackers.ask(id, TrackerRequest("create", str(folder), rig, config=config))
+        return state.tracker_table.add(id, caller.tenant, body.name)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+@router.get("", responses=documented())
+def list_trackers(state: State, caller: Reader) -> list[TrackerAnswer]:
+    """The trackers of the tenant, the newest first."""
+    return [tracker_answer(record) for record in state.tracker_table.list(caller)]
+
+
+@router.post(
+    "/{id}/frames",
+    response_model=FramesAnswer,
+    responses=documented(404, 413, 415, 422, 507),
+    openapi_extra=_FRAMES_BODY,
+)
+async def add_frames(id: TrackerId, request: Request, state: State, caller: Submitter) -> Response:
+    """Take in frames: JSON lines, or an Arrow IPC stream. What is answered is on disk."""
+    await run_in_threadpool(_find, state, caller, id)
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media not in (*_LINES, ARROW):
+        raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
+    body = await read_whole(request.stream(), state.settings.frames_bytes)
+    asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
+    answer = await run_in_threadpool(state.trackers.ask, id, asked)
+    state.metrics.frames.inc(len(answer["updates"]))
+    return JSONResponse(answer)
+
+
+@router.get("/{id}/state", responses=documented(404, 422))
+def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
+    """The last estimate, with its error bars, verdicts and events."""
+    _find(state, caller, id)
+    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
+    return TrackerState(**state.trackers.ask(id, asked))
+
+
+@router.get(
+    "/{id}/drift.png",
+    response_class=Response,
+    responses={**documented(404, 422), 200: {"content": {"image/png": {}}}},
+)
+def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
+    """The extrinsics over time, with their error bars and events."""
+    _find(state, caller, id)
+    asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
+    return Response(state.trackers.ask(id, asked), media_type="image/png")
+
+
+@router.delete("/{id}", status_code=204, responses=documented(404, 422))
+def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
+    """Remove a tracker and its state."""
+    _find(state, caller, id)
+    state.tracker_table.remove(id)
+    state.trackers.ask(id, TrackerRequest("remove", str(state.folder.of_tracker(id))))
+    return Response(status_code=204)

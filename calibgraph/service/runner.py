@@ -1,0 +1,277 @@
+"""Runs the jobs of the table, each in a child process, and keeps the table in order."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
+from calibgraph.service.folders import DataFolder
+from calibgraph.service.job_process import RESULT, WORK, JobOutcome, JobTask
+from calibgraph.service.jobs import MOST_STARTS, JobRecord, JobTable
+from calibgraph.service.metrics import Metrics
+from calibgraph.service.places import Root
+from calibgraph.service.settings import Settings
+
+log = logging.getLogger("calibgraph.service")
+
+_CHILD = "calibgraph.service.job_process"
+_JOBS_PER_CHILD = 200
+"""Then a new process takes its place: leaks of libraries do not add up."""
+_LOOK_EVERY_S = 1.0
+_EXPIRE_EVERY_S = 60.0
+_RETRY_AFTER_S = 2.0  # when the table cannot be used
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a job is.
+
+    Attributes:
+        stage: what it does.
+        done, total: steps of the stage.
+    """
+
+    stage: str
+    done: int
+    total: int
+
+
+@dataclass
+class _Slot:
+    """A thread's child process, and the job in it."""
+
+    child: ChildProcess = field(default_factory=lambda: ChildProcess(_CHILD))
+    job: str | None = None
+    jobs: int = 0
+
+
+class Runner:
+    """The threads that run jobs.
+
+    Args:
+        table: of the jobs.
+        folder: of the server.
+        settings: of the server.
+        roots: from which jobs may read.
+        metrics: that count them.
+        ring: called with the id of a job that has changed.
+    """
+
+    def __init__(
+        self,
+        table: JobTable,
+        folder: DataFolder,
+        settings: Settings,
+        roots: tuple[Root, ...],
+        metrics: Metrics,
+        ring: Callable[[str], None],
+    ) -> None:
+        self._table, self._folder, self._settings = table, folder, settings
+        self._roots, self._metrics, self._ring = roots, metrics, ring
+        self._steps: dict[str, Step] = {}
+        self._slots = [_Slot() for _ in range(settings.jobs_at_once)]
+        self._threads: list[threading.Thread] = []
+        self._wake, self._taking = threading.Condition(), threading.Lock()
+        self._waiting = 0
+        self._is_stopping = False
+
+    def start(self) -> None:
+        """Put back what an earlier server left running, and begin."""
+        again = self._table.put_back()
+        if again:
+            log.info("%d jobs that an earlier server had begun are run again", again)
+        self._remove_leftovers()
+        targets = [lambda slot=slot: self._work(slot) for slot in self._slots]
+        for target in (*targets, self._expire):
+            thread = threading.Thread(target=target, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def wake(self) -> None:
+        """Look for jobs: one was added."""
+        with self._wake:
+            self._waiting += 1
+            self._wake.notify()
+
+    def step(self, id: str) -> Step | None:
+        """How far a running job is."""
+        return self._steps.get(id)
+
+    def is_alive(self) -> bool:
+        """Whether all threads run."""
+        return all(thread.is_alive() for thread in self._threads)
+
+    def cancel(self, id: str) -> bool:
+        """Cancel a job; False if it is finished."""
+        changed = self._table.cancel(id)
+        with self._taking:
+            for slot in self._slots:
+                if changed and slot.job == id:
+                    slot.child.kill()
+        if changed:
+            self._ring(id)
+        return changed
+
+    def begin_stop(self) -> None:
+        """Start no more jobs."""
+        with self._wake:
+            self._is_stopping = True
+            self._wake.notify_all()
+
+    def stop(self, grace_s: float) -> None:
+        """Give running jobs some time to end, then let them wait for the next server."""
+        self.begin_stop()
+        end = time.monotonic() + grace_s
+        for thread in self._threads:
+            thread.join(max(0.0, end - time.monotonic()))
+        for slot in self._slots:
+            slot.child.interrupt()
+        for thread in self._threads:
+            thread.join()
+        for slot in self._slots:
+            slot.child.close()
+
+    def _work(self, slot: _Slot) -> None:
+        """A thread: one job after the other."""
+        while not self._is_stopping:
+            try:
+                record = self._take(slot)
+                if record is None:
+                    self._wait()
+                else:
+                    self._run(slot, record)
+            except (SQLAlchemyError, OSError):
+                log.exception("the table of jobs or the data folder cannot be used")
+                time.sleep(_RETRY_AFTER_S)
+            except Exception:
+                log.exception("a job could not be run")
+                time.sleep(_RETRY_AFTER_S)
+
+    def _wait(self) -> None:
+        with self._wake:
+            if not self._waiting and not self._is_stopping:
+                self._wake.wait(_LOOK_EVERY_S)
+            self._waiting = max(0, self._waiting - 1)
+
+    def _take(self, slot: _Slot) -> JobRecord | None:
+        with self._taking:
+            slot.job = None
+            record = self._table.start_next()
+            slot.job = None if record is None else record.id
+        return record
+
+    def _run(self, slot: _Slot, record: JobRecord) -> None:
+        """Run a job and write down how it ended."""
+        start = time.perf_counter()
+        self._ring(record.id)
+        outcome = self._ask(slot, record)
+        if outcome is None:  # the server stops, or the process died: it waits again
+            self._table.put_back(record.id)
+        elif outcome.error_kind is None and outcome.verdict is not None:
+            self._keep_result(record.id)
+            self._table.finish(record.id, "succeeded", verdict=outcome.verdict)
+        else:
+            self._table.finish(
+                record.id, "failed", error_kind=outcome.error_kind, error=outcome.error
+            )
+        with self._taking:
+            slot.job = None
+        self._steps.pop(record.id, None)
+        state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
+        self._metrics.jobs.labels(record.kind, state).inc()
+        self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
+        self._ring(record.id)
+
+    def _ask(self, slot: _Slot, record: JobRecord) -> JobOutcome | None:
+        """What the child answers; None if the job is to wait again."""
+        limit_s = self._settings.job_timeout_s
+        try:
+            slot.child.start()
+            current = self._table.get(record.id)
+            if current is None or current.state != "running":  # cancelled meanwhile
+                return JobOutcome(error_kind="bad input", error="cancelled")
+            outcome: JobOutcome = slot.child.ask(
+                self._task(record.id), limit_s, lambda note: self._note(record.id, note)
+            )
+            self._renew(slot, failed=outcome.error_kind is not None)
+            return outcome
+        except ChildTimeoutError as error:
+            return JobOutcome(error_kind="timeout", error=f"{error}; give fewer frames")
+        except ChildEndedError as error:
+            slot.child.stop()
+            if self._is_stopping:
+                return None
+            log.warning("job %s: %s", record.id, error)
+            if record.starts >= _MOST_DEATHS or "no process" in str(error):
+                return JobOutcome(error_kind="worker died", error=str(error))
+            return None
+
+    def _task(self, id: str) -> JobTask:
+        settings = self._settings
+        return JobTask(
+            job=self._table.request(id),
+            folder=self._folder.of_job(id),
+            roots=self._roots,
+            memory_bytes=settings.job_memory_bytes,
+            fetch_bytes=settings.fetch_bytes,
+            unpacked_bytes=settings.upload_bytes,
+            timeout_s=settings.job_timeout_s,
+        )
+
+    def _note(self, id: str, note: tuple[str, int, int]) -> None:
+        self._steps[id] = Step(*note)
+        self._ring(id)
+
+    def _renew(self, slot: _Slot, *, failed: bool) -> None:
+        """End a process that has run many jobs, or one that failed: it may be in disorder."""
+        slot.jobs += 1
+        if failed or slot.jobs >= _JOBS_PER_CHILD:
+            slot.child.stop()
+            slot.jobs = 0
+
+    def _keep_result(self, id: str) -> None:
+        folder = self._folder.of_job(id)
+        shutil.rmtree(folder / RESULT, ignore_errors=True)
+        (folder / WORK).rename(folder / RESULT)
+
+    def _expire(self) -> None:
+        """A thread: remove the jobs whose results have been kept for long enough."""
+        while not self._is_stopping:
+            try:
+                self.remove_expired()
+            except (SQLAlchemyError, OSError):
+                log.exception("expired jobs cannot be removed")
+            end = time.monotonic() + _EXPIRE_EVERY_S
+            while not self._is_stopping and time.monotonic() < end:
+                time.sleep(0.1)
+
+    def remove_expired(self) -> None:
+        """Remove the jobs whose results have been kept for long enough, and their folders."""
+        ids = self._table.finished_before(time.time() - self._settings.keep_s)
+        self._table.remove(ids)
+        for id in ids:
+            remove_folder(self._folder.of_job(id))
+
+    def _remove_leftovers(self) -> None:
+        """Remove the folders of jobs that were not acknowledged, or are forgotten."""
+        known = self._table.ids()
+        for folder in self._folder.jobs.iterdir():
+            if folder.name not in known:
+                remove_folder(folder)
+
+
+_MOST_DEATHS = min(5, MOST_STARTS)
+"""Starts of a job after which the death of its process is its own fault."""
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder and all that is in it."""
+    shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,97 @@
+"""Run a server until it is told to stop."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from calibgraph.errors import CalibrationError
+from calibgraph.service.state import Service
+
+_CLOSE_S = 5
+"""Connections that are open when the server stops are closed after this."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a server listens.
+
+    Attributes:
+        host: name or address.
+        port: number.
+        certificate, key: files for TLS; None for plain HTTP.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    certificate: Path | None = None
+    key: Path | None = None
+
+
+def require_safe(address: Address, *, has_tokens: bool) -> None:
+    """Check that a server without tokens is for this machine alone.
+
+    Raises:
+        CalibrationError: if not.
+    """
+    if not has_tokens and not _is_loopback(address.host):
+        raise CalibrationError(
+            f"--host {address.host}: others could call; give --tokens FILE (see calibgraph token), "
+            "or listen on 127.0.0.1"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def serve(app: FastAPI, address: Address) -> None:
+    """Serve an application of :func:`calibgraph.service.app.create_app` until SIGTERM or Ctrl-C.
+
+    Raises:
+        CalibrationError: if the address cannot be used.
+    """
+    service: Service = app.state.service
+    require_safe(address, has_tokens=service.settings.tokens is not None)
+    config = uvicorn.Config(
+        app,
+        host=address.host,
+        port=address.port,
+        ssl_certfile=address.certificate,
+        ssl_keyfile=address.key,
+        server_header=False,
+        access_log=False,
+        log_level="info",
+        timeout_graceful_shutdown=_CLOSE_S,
+    )
+    server = _Server(config, service)
+    try:
+        server.run()
+    except SystemExit as error:  # of uvicorn, after a line in its log
+        if error.code:
+            where = f"{address.host}:{address.port}"
+            raise CalibrationError(f"{where}: cannot be listened on; see the line above") from error
+    finally:
+        if not service.is_stopping:  # it did not come to its start
+            service.stop()
+
+
+class _Server(uvicorn.Server):
+    """Wakes requests that wait as soon as a signal comes: uvicorn would wait for them."""
+
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+        super().__init__(config)
+        self._service = service
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        self._service.is_stopping = True
+        self._service.bell.ring_all()
+        super().handle_exit(sig, frame)

@@ -1,0 +1,126 @@
+"""What the routes of a server share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Request
+from sqlalchemy import Engine
+
+from calibgraph.errors import CalibrationError
+from calibgraph.service.bell import Bell
+from calibgraph.service.database import open_database
+from calibgraph.service.folders import DataFolder
+from calibgraph.service.jobs import JobTable
+from calibgraph.service.metrics import Metrics
+from calibgraph.service.places import Root, open_roots
+from calibgraph.service.problems import Problem
+from calibgraph.service.runner import Runner
+from calibgraph.service.settings import Settings
+from calibgraph.service.tracker_table import TrackerTable
+from calibgraph.service.trackers import Trackers
+
+_RETRY_AFTER = {"Retry-After": "5"}
+
+
+@dataclass
+class Service:
+    """The parts of a server.
+
+    Attributes:
+        settings: of the server.
+        folder: its data.
+        engine: its database.
+        jobs: their table.
+        runner: runs them.
+        tracker_table: the trackers' table.
+        trackers: the processes that hold them.
+        roots: from which jobs may read.
+        metrics: numbers for Prometheus.
+        bell: wakes requests that wait.
+        is_stopping: whether the server was told to stop.
+    """
+
+    settings: Settings
+    folder: DataFolder
+    engine: Engine
+    jobs: JobTable
+    runner: Runner
+    tracker_table: TrackerTable
+    trackers: Trackers
+    roots: tuple[Root, ...]
+    metrics: Metrics
+    bell: Bell
+    is_stopping: bool = field(default=False)
+
+    def start(self) -> None:
+        """Begin to run jobs, in the event loop."""
+        self.bell.open()
+        self.runner.start()
+
+    def begin_stop(self) -> None:
+        """Accept nothing more, and let those go who wait."""
+        self.is_stopping = True
+        self.runner.begin_stop()
+        self.bell.ring_all()
+
+    def stop(self) -> None:
+        """End the jobs and trackers, and release the data folder."""
+        self.begin_stop()
+        self.runner.stop(self.settings.grace_s)
+        self.trackers.close()
+        self.engine.dispose()
+        self.folder.close()
+
+    def require_room(self) -> None:
+        """Check that something new can be taken in.
+
+        Raises:
+            Problem: if the server stops, its disk is full, or its queue is.
+        """
+        if self.is_stopping:
+            raise Problem(503, "the server is being stopped; try again soon", _RETRY_AFTER)
+        if self.folder.free_bytes() < self.settings.free_bytes:
+            raise Problem(507, "the server's disk is almost full; try again later")
+
+
+def open_service(settings: Settings, metrics: Metrics) -> Service:
+    """The parts of a server with these settings.
+
+    Raises:
+        CalibrationError: if the data folder, the database or a root cannot be used.
+    """
+    roots = open_roots(settings.roots)
+    folder = DataFolder(settings.data)
+    try:
+        engine = open_database(folder.path, settings.database, folder.owner)
+    except CalibrationError:
+        folder.close()
+        raise
+    table, bell = JobTable(engine), Bell()
+    return Service(
+        settings=settings,
+        folder=folder,
+        engine=engine,
+        jobs=table,
+        runner=Runner(table, folder, settings, roots, metrics, bell.ring),
+        tracker_table=TrackerTable(engine),
+        trackers=Trackers(folder, settings),
+        roots=roots,
+        metrics=metrics,
+        bell=bell,
+    )
+
+
+def _service_of(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+async def _service(request: Request) -> Service:
+    return _service_of(request)
+
+
+State = Annotated[Service, Depends(_service)]
+"""A parameter of routes: the parts of the server."""

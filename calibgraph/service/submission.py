@@ -1,0 +1,195 @@
+"""A request for a job: read, checked, put on disk, and only then acknowledged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+
+from calibgraph.files import describe
+from calibgraph.service.access import Caller
+from calibgraph.service.folders import sync_tree
+from calibgraph.service.job_process import INPUT, LOG
+from calibgraph.service.jobs import JobRecord, OtherRequestError, new_id
+from calibgraph.service.places import require_inside
+from calibgraph.service.problems import Problem
+from calibgraph.service.requests import (
+    ALLOWED,
+    MAX_RECORDINGS,
+    RECORDING,
+    REQUESTS,
+    REQUIRED,
+    Job,
+    JobKind,
+    job_of,
+    recording_name,
+    settings_of,
+)
+from calibgraph.service.settings import MAX_JSON_BYTES
+from calibgraph.service.state import Service
+from calibgraph.service.uploads import FormReader, Upload, read_whole
+
+SETTINGS = "settings"
+_MOST_KEY = 255
+_RETRY_AFTER_S = 5
+
+
+async def submit(
+    service: Service, request: Request, caller: Caller, kind: JobKind, key: str | None
+) -> tuple[JobRecord, bool]:
+    """Take in a job; it is durable when this returns.
+
+    Args:
+        service: of the server.
+        request: its body is JSON with URIs, or a form with files.
+        caller: whose the job will be.
+        kind: of the job.
+        key: idempotency key; None if there is none.
+
+    Returns:
+        The job, and whether it was known before.
+
+    Raises:
+        Problem: if the request is malformed or too large, or there is no room.
+    """
+    _require_key(key)
+    service.require_room()
+    known = await run_in_threadpool(service.jobs.known, caller.tenant, key)
+    if known is None:
+        await run_in_threadpool(_require_place_in_queue, service)
+    id = new_id()
+    arriving = service.folder.arriving / id
+    (arriving / INPUT).mkdir(parents=True, mode=0o700)
+    try:
+        job, digest = await _read(service, request, kind, arriving / INPUT)
+        return await run_in_threadpool(_keep, service, arriving, caller.tenant, job, digest, key)
+    except OtherRequestError:
+        raise Problem(422, "this Idempotency-Key was given with another request") from None
+    finally:
+        await run_in_threadpool(shutil.rmtree, arriving, ignore_errors=True)
+
+
+def _require_key(key: str | None) -> None:
+    if key is not None and not (0 < len(key) <= _MOST_KEY and key.isprintable()):
+        raise Problem(422, f"Idempotency-Key: expected 1 to {_MOST_KEY} printable characters")
+
+
+def _require_place_in_queue(service: Service) -> None:
+    waiting = service.jobs.count("queued")
+    if waiting >= service.settings.most_queued:
+        raise Problem(
+            429, f"{waiting} jobs wait already; try again", {"Retry-After": str(_RETRY_AFTER_S)}
+        )
+
+
+async def _read(service: Service, request: Request, kind: JobKind, folder: Path) -> tuple[Job, str]:
+    """The job that a request asks for, its uploads in a folder; and the digest of all."""
+    content_type = request.headers.get("content-type", "")
+    media = content_type.partition(";")[0].strip().lower()
+    if media == "multipart/form-data":
+        allowed = {name: 1 for name in ALLOWED[kind]} | (
+            {RECORDING: MAX_RECORDINGS} if RECORDING in ALLOWED[kind] else {}
+        )
+        reader = FormReader(folder, allowed, service.settings.upload_bytes)
+        upload = await reader.read(content_type, request.stream())
+        job, digest = _job_of_form(upload, kind), f"{kind} {upload.digest}"
+    elif media == "application/json":
+        body = await read_whole(request.stream(), MAX_JSON_BYTES)
+        job = job_of(_checked(REQUESTS[kind], parse_json(body)), kind)
+        digest = f"{kind} {job.model_dump_json()}"
+    else:
+        raise Problem(415, "send application/json with URIs, or multipart/form-data with files")
+    for uri in job.uris.values():
+        await run_in_threadpool(require_inside, uri, service.roots)
+    return job, hashlib.sha256(digest.encode()).hexdigest()
+
+
+def _job_of_form(upload: Upload, kind: JobKind) -> Job:
+    """The job of a form: fields are URIs or the settings, files are in the folder already."""
+    settings, uris = "{}", dict[str, str]()
+    files = {*upload.files}
+    for name, text in upload.texts:
+        if name == SETTINGS:
+            settings = text
+        elif name in ALLOWED[kind]:
+            uris[_free_name(name, files | uris.keys())] = text
+        else:
+            known = ", ".join((*ALLOWED[kind], SETTINGS))
+            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
+    given = files | uris.keys()
+    for name in REQUIRED[kind]:
+        if name not in given:
+            raise Problem(422, f"{name!r} is missing; add it as a file, or a field with its URI")
+    checked = _checked(settings_of(kind), parse_json(settings.encode()))
+    return Job(
+        kind=kind,
+        uris=uris,
+        recordings=sum(name.startswith(RECORDING) for name in given),
+        settings=checked.model_dump(mode="json"),
+    )
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """The name of a further input: several recordings are numbered."""
+    if name != RECORDING:
+        if name in taken:
+            raise Problem(422, f"{name!r} is given twice")
+        return name
+    count = sum(other.startswith(RECORDING) for other in taken)
+    if count >= MAX_RECORDINGS:
+        raise Problem(422, f"over {MAX_RECORDINGS} recordings")
+    return recording_name(count)
+
+
+def _keep(
+    service: Service, arriving: Path, tenant: str, job: Job, digest: str, key: str | None
+) -> tuple[JobRecord, bool]:
+    """Put the input in its place, then the job into the table."""
+    (arriving / LOG).touch()
+    known = service.jobs.known(tenant, key, digest)
+    if known is not None:
+        return known, True
+    _require_place_in_queue(service)
+    sync_tree(arriving)
+    folder = service.folder.of_job(arriving.name)
+    service.folder.keep(arriving, folder)
+    try:
+        record = service.jobs.add(folder.name, tenant, job, digest, key)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    if record.id != folder.name:  # another request with the key was faster
+        shutil.rmtree(folder, ignore_errors=True)
+        return record, True
+    service.runner.wake()
+    return record, False
+
+
+def parse_json(body: bytes) -> Any:
+    """The content of a JSON body.
+
+    Raises:
+        Problem: if it is none.
+    """
+    try:
+        return json.loads(body)
+    except RecursionError:
+        raise Problem(400, "the JSON is nested too deeply") from None
+    except ValueError as error:
+        raise Problem(400, f"the body is not JSON ({error})") from error
+
+
+def _checked(model: Any, content: object) -> Any:
+    if not isinstance(content, Mapping):
+        raise Problem(422, "expected a JSON object")
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise Problem(422, describe(error)) from error

@@ -1,0 +1,301 @@
+"""Trackers in their process: frames in, durable updates out."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import sys
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from calibgraph.child_process import Note, answer_requests, memory_limit
+from calibgraph.errors import CalibrationError, CorrespondenceError
+from calibgraph.files import checked_model, parse_yaml, write_text
+
+if TYPE_CHECKING:
+    from calibgraph.tracking.durable import DurableCalibrator
+    from calibgraph.tracking.history import History
+    from calibgraph.tracking.streams import Item
+
+Action = Literal["create", "frames", "state", "plot", "remove", "close all"]
+RIG, CONFIG, STATE, HISTORY, EVENTS = (
+    "rig.yaml", "config.json", "state", "history.npz", "events.jsonl",
+)  # fmt: skip
+ARROW = "application/vnd.apache.arrow.stream"
+
+_MOST_OPEN = 256
+_SAVE_EVERY = 50  # updates: after a kill, the plot lacks up to so many
+_MOST_EVENTS = 200
+_THREADS = 8  # most of an update's time it waits for the disk
+
+
+@dataclass(frozen=True)
+class TrackerRequest:
+    """A request to a tracker.
+
+    Attributes:
+        action: what to do.
+        folder: of the tracker.
+        body: of the request: the rig, or frames.
+        content_type: of frames.
+        config: settings, as JSON.
+    """
+
+    action: Action
+    folder: str
+    body: bytes = b""
+    content_type: str = ""
+    config: str = "{}"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An answer that refuses.
+
+    Attributes:
+        status: of HTTP.
+        detail: what is wrong, in one line.
+    """
+
+    status: int
+    detail: str
+
+
+@dataclass
+class _Open:
+    """A tracker that is in memory."""
+
+    folder: Path
+    calibrator: DurableCalibrator
+    history: History
+    unsaved: int = 0
+
+    def close(self) -> None:
+        self.save_history()
+        self.calibrator.close()
+
+    def save_history(self) -> None:
+        if self.unsaved:
+            self.history.save(self.folder / HISTORY)
+            self.unsaved = 0
+
+
+@dataclass
+class _Trackers:
+    """The trackers of this process; those used last are in memory."""
+
+    held: OrderedDict[str, _Open] = field(default_factory=OrderedDict)
+    locks: dict[str, threading.Lock] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def answer(self, request: TrackerRequest) -> Any:
+        with self.lock:
+            lock = self.locks.setdefault(request.folder, threading.Lock())
+        with lock:
+            try:
+                return self._act(request)
+            except MemoryError:
+                self._drop(request.folder)
+                return Refusal(413, "not enough memory; send fewer frames at once")
+            except (CalibrationError, ValueError) as error:
+                return Refusal(422, _without_path(str(error), request.folder))
+            except OSError as error:  # a write failed: the state on disk is what counts
+                self._drop(request.folder)
+                return Refusal(507, f"the state cannot be written ({error.strerror or 'disk'})")
+
+    def _act(self, request: TrackerRequest) -> Any:
+        if request.action == "create":
+            _create(request)
+            return _state(self._opened(request.folder))
+        if request.action == "frames":
+            return _take_frames(self._opened(request.folder), request)
+        if request.action == "state":
+            return _state(self._opened(request.folder))
+        if request.action == "plot":
+            return _plot(self._opened(request.folder))
+        if request.action == "remove":
+            self._drop(request.folder)
+            shutil.rmtree(request.folder, ignore_errors=True)
+        return None
+
+    def _opened(self, folder: str) -> _Open:
+        with self.lock:
+            tracker = self.held.get(folder)
+            if tracker is not None:
+                self.held.move_to_end(folder)
+                return tracker
+        tracker = _open(Path(folder))
+        with self.lock:
+            self.held[folder] = tracker
+            oldest = next(iter(self.held)) if len(self.held) > _MOST_OPEN else None
+            # One that is in use now is left for the next time.
+            if oldest is not None and self.locks[oldest].acquire(blocking=False):
+                self.held.pop(oldest).close()
+                self.locks[oldest].release()
+        return tracker
+
+    def _drop(self, folder: str) -> None:
+        with self.lock:
+            tracker = self.held.pop(folder, None)
+        if tracker is not None:
+            tracker.calibrator.abandon()
+
+    def close(self) -> None:
+        for tracker in self.held.values():
+            tracker.close()
+        self.held.clear()
+
+
+def _without_path(text: str, folder: str) -> str:
+    return text.replace(f"{folder}/", "").replace(folder, "the tracker")
+
+
+def _create(request: TrackerRequest) -> None:
+    """Check the rig and the settings, and write them down."""
+    from calibgraph.files import read_text
+    from calibgraph.model.config import config_from
+    from calibgraph.model.rig import Rig
+
+    folder = Path(request.folder)
+    text = request.body.decode("utf-8")
+    checked_model(Rig, parse_yaml(text, RIG), RIG)
+    config_from(json.loads(request.config), "config")
+    write_text(folder / CONFIG, request.config)
+    write_text(folder / RIG, text)
+    read_text(folder / RIG)
+
+
+def _open(folder: Path) -> _Open:
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.model.config import config_from
+    from calibgraph.tracking.durable import DurableCalibrator
+    from calibgraph.tracking.history import History
+
+    config = config_from(json.loads((folder / CONFIG).read_text("utf-8")), "config")
+    calibrator = DurableCalibrator(folder / STATE, load_rig(folder / RIG), config)
+    tracker = _Open(folder, calibrator, History.load(folder / HISTORY))
+    if calibrator.repeated is not None:  # the process ended before it may have been noted
+        known = {json.dumps(event) for event in _events(folder)}
+        _note_events(folder, calibrator.repeated, known)
+    return tracker
+
+
+def _take_frames(tracker: _Open, request: TrackerRequest) -> dict[str, Any]:
+    """Take in frames; each update is on disk before it is in the answer."""
+    from calibgraph.tracking.report import json_line
+    from calibgraph.tracking.streams import Refused
+
+    updates: list[Any] = []
+    refused: list[str] = []
+    known, last = 0, tracker.calibrator.tracker.frame
+    for item in _items(request, refused):
+        if isinstance(item, Refused):
+            refused.append(item.message)
+        elif last is not None and item.frame <= last:
+            known += 1
+        else:
+            try:
+                update = tracker.calibrator.update(item.table, frame=item.frame)
+            except CorrespondenceError as error:
+                refused.append(str(error))
+                continue
+            last = update.frame
+            tracker.history.add(update)
+            tracker.unsaved += 1
+            _note_events(tracker.folder, update, set())
+            updates.append(json.loads(json_line(update)))
+    if tracker.unsaved >= _SAVE_EVERY:
+        tracker.save_history()
+    return {"updates": updates, "known": known, "refused": refused}
+
+
+def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
+    """The frames of a body; a stream that breaks off is refused after its whole frames."""
+    from calibgraph.errors import FileError
+    from calibgraph.tracking.stream_lines import frames_of_lines
+    from calibgraph.tracking.stream_tables import frames_of_batches
+
+    try:
+        if request.content_type == ARROW:
+            yield from frames_of_batches(io.BytesIO(request.body), "frames")
+        else:
+            yield from frames_of_lines([request.body], "frames")
+    except FileError as error:
+        refused.append(str(error))
+
+
+def _note_events(folder: Path, update: Any, known: set[str]) -> None:
+    """Add an update's events to the list."""
+    from calibgraph.tracking.report import json_line
+
+    if not update.events:
+        return
+    lines = [json.dumps(event) for event in json.loads(json_line(update))["events"]]
+    with (folder / EVENTS).open("a", encoding="utf-8") as file:
+        file.writelines(f"{line}\n" for line in lines if line not in known)
+
+
+def _events(folder: Path) -> list[dict[str, Any]]:
+    path = folder / EVENTS
+    if not path.exists():
+        return []
+    lines = path.read_text("utf-8", errors="replace").splitlines()[-_MOST_EVENTS:]
+    return [event for line in lines if isinstance(event := _json(line), dict)]
+
+
+def _json(line: str) -> object:
+    try:
+        return json.loads(line)
+    except ValueError:  # the process ended while it was written
+        return None
+
+
+def _state(tracker: _Open) -> dict[str, Any]:
+    """The last estimate, as ``--json`` prints results, and the last events."""
+    from calibgraph.report.as_json import finite, result_summary
+
+    summary = result_summary(tracker.calibrator.tracker.calibration(), [])
+    return {
+        "frame": tracker.calibrator.tracker.frame,
+        "verdict": summary["verdict"],
+        "reasons": summary["reasons"],
+        "cameras": finite(summary["cameras"]),
+        "events": _events(tracker.folder),
+    }
+
+
+def _plot(tracker: _Open) -> bytes:
+    """The extrinsics against time, PNG."""
+    from calibgraph.tracking.history_figure import DPI
+
+    held = io.BytesIO()
+    tracker.history.figure().savefig(held, format="png", dpi=DPI)
+    return held.getvalue()
+
+
+def main() -> None:
+    """The process: lists of requests to trackers, each list at once."""
+    from calibgraph.tracking.preload import warm_up_tracker
+
+    warm_up_tracker()
+    trackers, pool = _Trackers(), ThreadPoolExecutor(_THREADS)
+
+    def answer(requests: list[TrackerRequest], _: Note) -> list[Any]:
+        if any(request.action == "close all" for request in requests):
+            answers = list(pool.map(trackers.answer, requests))
+            trackers.close()
+            return answers
+        return list(pool.map(trackers.answer, requests))
+
+    with memory_limit(int(sys.argv[2])):
+        answer_requests(answer)
+
+
+if __name__ == "__main__":
+    main()
