@@ -136,3 +136,41 @@ def _by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
         f"{name}_deg": None if twist is None else np.degrees(twist[:3]).tolist(),
         f"{name}_cm": None if twist is None else (100.0 * twist[3:]).tolist(),
     }
+
+
+def audit_of(summary: Mapping[str, Any]) -> Audit:
+    """The audit of a summary, see :func:`audit_summary`."""
+    lidar = summary["lidar"]
+    return Audit(
+        cameras={
+            name: CameraAudit(
+                status=camera["status"],
+                reason=camera["reason"],
+                deviation=_from_units("deviation", camera),
+                sigma=_from_units("sigma", camera),
+                detectable=_from_units("detectable", camera),
+                z_score=camera["z_score"],
+            )
+            for name, camera in summary["cameras"].items()
+        },
+        lidar=None if lidar is None else _lidar_of(lidar),
+        tolerance_deg=summary["tolerance_deg"],
+        tolerance_cm=summary["tolerance_cm"],
+        frames=summary["frames"],
+        timings_s=summary["timings_s"],
+    )
+
+
+def _lidar_of(summary: Mapping[str, Any]) -> LidarAudit:
+    motion, sigma = _from_units("motion", summary), _from_units("sigma", summary)
+    if motion is None or sigma is None:
+        raise ValueError("the motion of the LiDAR has no numbers")
+    return LidarAudit(summary["reason"], motion, sigma)
+
+
+def _from_units(name: str, summary: Mapping[str, Any]) -> Array | None:
+    """The inverse of :func:`_by_unit`."""
+    degrees, centimetres = summary[f"{name}_deg"], summary[f"{name}_cm"]
+    if degrees is None:
+        return None
+    return np.concatenate([np.radians(degrees), np.array(centimetres) / 100.0])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import remote
 from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
 from calibgraph.cli.options import (
@@ -57,16 +58,19 @@ def calibrate(
         checked_terms = terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed)
     data = matching.load_dataset(dataset)
-    with progress_bar() as progress:
-        result = calibrate(
-            data,
-            matcher=chosen,
-            config=settings,
-            terms=checked_terms,
-            time_limit_s=matching.limit_s,
-            progress=progress,
-        )
-        written = write_result(result, out, data)
+    if remote.SERVER.get() is not None:
+        result, written = remote.calibrate(data, matching, settings, checked_terms, out)
+    else:
+        with progress_bar() as progress:
+            result = calibrate(
+                data,
+                matcher=chosen,
+                config=settings,
+                terms=checked_terms,
+                time_limit_s=matching.limit_s,
+                progress=progress,
+            )
+            written = write_result(result, out, data)
     _print_frames_used(len(result.frames), data)
     _print_and_exit(result, written, as_json=as_json)
 
@@ -128,6 +132,10 @@ def solve(
         given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
+    if remote.SERVER.get() is not None:
+        remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
+        _print_and_exit(*remote_result, as_json=as_json)
+        return
     with progress_bar("solving") as progress, checked_arguments():
         result = solve_table(
             load_rig(rig), correspondences, settings, checked_terms, engine, progress=progress

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from calibgraph.cli import remote
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
 from calibgraph.cli.terminal import progress_bar, terminal
@@ -35,22 +36,27 @@ def check(
     """
     from calibgraph.audit import check
     from calibgraph.audit.judgement import Tolerance
+    from calibgraph.audit.result import audit_of
     from calibgraph.io.rigs import load_rig
 
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
     data = dataset_from(dataset, rig, frames)
-    with progress_bar() as progress:
-        audit = check(
-            load_rig(rig),
-            data,
-            tolerance_deg=tolerance_deg,
-            tolerance_cm=tolerance_cm,
-            matcher=matcher,
-            seed=seed,
-            progress=progress,
-        )
+    if remote.SERVER.get() is not None:
+        wanted = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "seed": seed}
+        audit = audit_of(remote.check(rig, data, frames, wanted))
+    else:
+        with progress_bar() as progress:
+            audit = check(
+                load_rig(rig),
+                data,
+                tolerance_deg=tolerance_deg,
+                tolerance_cm=tolerance_cm,
+                matcher=matcher,
+                seed=seed,
+                progress=progress,
+            )
     if as_json:
         from calibgraph.audit import audit_summary
         from calibgraph.report.as_json import print_json

@@ -1,1 +1,7 @@
-"""Calibrations by a server, from Python."""
+"""Calibrations by a server, from Python; needs the extra ``client``."""
+
+from calibgraph.client.answers import RemoteJob, ServerError
+from calibgraph.client.asynchronous import AsyncClient
+from calibgraph.client.client import Client
+
+__all__ = ["AsyncClient", "Client", "RemoteJob", "ServerError"]

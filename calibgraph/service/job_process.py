@@ -8,7 +8,6 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,57 +17,16 @@ from calibgraph.files import write_text
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.fleet.uris import fetch
 from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.places import Root, require_inside
-from calibgraph.service.requests import RIG, TABLE, Job, recording_name
+from calibgraph.service.job_task import FILES, INPUT, LOG, SUMMARY, WORK, JobOutcome, JobTask
+from calibgraph.service.places import require_inside
+from calibgraph.service.requests import RIG, TABLE, recording_name
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
     from calibgraph.progress import Progress
 
-INPUT, WORK, RESULT, LOG = "input", "work", "result", "log.txt"
-"""In a job's folder: its input, its result while it is written, its result, its log."""
-FILES, SUMMARY = "files", "summary.json"
-"""In the result: the files that the command writes, and the summary that it prints."""
-
 _NOTE_EVERY_S = 0.1
 _KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
-
-
-@dataclass(frozen=True)
-class JobTask:
-    """A job for a process.
-
-    Attributes:
-        job: what is asked for.
-        folder: of the job.
-        roots: from which it may read.
-        memory_bytes: that it may allocate.
-        fetch_bytes: of remote recordings.
-        unpacked_bytes: of uploaded archives.
-        timeout_s: after which it is ended.
-    """
-
-    job: Job
-    folder: Path
-    roots: tuple[Root, ...]
-    memory_bytes: int
-    fetch_bytes: int
-    unpacked_bytes: int
-    timeout_s: float
-
-
-@dataclass(frozen=True)
-class JobOutcome:
-    """How a job ended.
-
-    Attributes:
-        verdict: of the result; None if it failed.
-        error_kind, error: why it failed, in one line.
-    """
-
-    verdict: str | None = None
-    error_kind: ErrorKind | None = None
-    error: str | None = None
 
 
 def run_job(task: JobTask, note: Note) -> JobOutcome:

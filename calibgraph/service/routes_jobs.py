@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.service.access import Reader, Submitter
 from calibgraph.service.answers import JobAnswer, JobList, job_answer
 from calibgraph.service.bell import wait_for
-from calibgraph.service.job_process import LOG
+from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem, documented
 from calibgraph.service.requests import ALLOWED, KINDS, REQUESTS, REQUIRED, JobKind, settings_of

@@ -20,7 +20,7 @@ from calibgraph.service.problems import Problem, documented
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
-from calibgraph.service.tracker_process import ARROW, TrackerRequest
+from calibgraph.service.tracker_request import ARROW, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.service.uploads import read_whole
 

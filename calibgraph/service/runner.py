@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.folders import DataFolder
-from calibgraph.service.job_process import RESULT, WORK, JobOutcome, JobTask
+from calibgraph.service.job_task import RESULT, WORK, JobOutcome, JobTask
 from calibgraph.service.jobs import MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
@@ -141,6 +142,8 @@ class Runner:
 
     def _work(self, slot: _Slot) -> None:
         """A thread: one job after the other."""
+        with suppress(ChildEndedError):  # the first job does not wait for libraries to load
+            slot.child.start()
         while not self._is_stopping:
             try:
                 record = self._take(slot)
@@ -148,12 +151,20 @@ class Runner:
                     self._wait()
                 else:
                     self._run(slot, record)
-            except (SQLAlchemyError, OSError):
+            except Exception:  # of the database, of the disk
                 log.exception("the table of jobs or the data folder cannot be used")
-                time.sleep(_RETRY_AFTER_S)
-            except Exception:
-                log.exception("a job could not be run")
-                time.sleep(_RETRY_AFTER_S)
+                self._recover(slot)
+
+    def _recover(self, slot: _Slot) -> None:
+        """After an error: let the slot's job wait again, as soon as the table can be used."""
+        slot.child.stop()
+        while slot.job is not None:
+            time.sleep(_RETRY_AFTER_S)
+            with suppress(SQLAlchemyError), self._taking:
+                self._table.put_back(slot.job)
+                slot.job = None
+            if self._is_stopping:
+                break
 
     def _wait(self) -> None:
         with self._wake:

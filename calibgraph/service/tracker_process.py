@@ -12,59 +12,26 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from calibgraph.child_process import Note, answer_requests, memory_limit
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.files import checked_model, parse_yaml, write_text
+from calibgraph.service.tracker_request import ARROW, Refusal, TrackerRequest
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
     from calibgraph.tracking.history import History
     from calibgraph.tracking.streams import Item
 
-Action = Literal["create", "frames", "state", "plot", "remove", "close all"]
 RIG, CONFIG, STATE, HISTORY, EVENTS = (
     "rig.yaml", "config.json", "state", "history.npz", "events.jsonl",
 )  # fmt: skip
-ARROW = "application/vnd.apache.arrow.stream"
 
 _MOST_OPEN = 256
 _SAVE_EVERY = 50  # updates: after a kill, the plot lacks up to so many
 _MOST_EVENTS = 200
 _THREADS = 8  # most of an update's time it waits for the disk
-
-
-@dataclass(frozen=True)
-class TrackerRequest:
-    """A request to a tracker.
-
-    Attributes:
-        action: what to do.
-        folder: of the tracker.
-        body: of the request: the rig, or frames.
-        content_type: of frames.
-        config: settings, as JSON.
-    """
-
-    action: Action
-    folder: str
-    body: bytes = b""
-    content_type: str = ""
-    config: str = "{}"
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """An answer that refuses.
-
-    Attributes:
-        status: of HTTP.
-        detail: what is wrong, in one line.
-    """
-
-    status: int
-    detail: str
 
 
 @dataclass

@@ -12,7 +12,7 @@ from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeout
 from calibgraph.service.folders import DataFolder
 from calibgraph.service.problems import Problem
 from calibgraph.service.settings import Settings
-from calibgraph.service.tracker_process import Refusal, TrackerRequest
+from calibgraph.service.tracker_request import Refusal, TrackerRequest
 
 _CHILD = "calibgraph.service.tracker_process"
 _TIMEOUT_S = 120.0

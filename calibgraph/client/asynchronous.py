@@ -1,0 +1,144 @@
+"""A server's calibrations from Python, in coroutines."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from calibgraph.client.answers import RemoteJob, ServerError, job_of, refusal, require_success
+from calibgraph.client.client import TIMEOUT, headers_of, lines_of, path_of, unpack
+from calibgraph.client.inputs import Source, form_of
+
+
+class AsyncClient:
+    """A server of ``calibgraph serve``; see :class:`calibgraph.client.Client`.
+
+    Args:
+        url: of the server.
+        token: of ``calibgraph token``; the variable CALIBGRAPH_TOKEN if None.
+    """
+
+    def __init__(self, url: str, token: str | None = None) -> None:
+        self._url = url.rstrip("/")
+        limits = httpx.Limits(max_connections=None)
+        self._http = httpx.AsyncClient(
+            base_url=self._url, headers=headers_of(token), timeout=TIMEOUT, limits=limits
+        )
+
+    async def submit(
+        self,
+        kind: str,
+        inputs: Mapping[str, Sequence[Source]],
+        settings: Mapping[str, Any] | None = None,
+        *,
+        key: str | None = None,
+    ) -> RemoteJob:
+        """Ask for a job."""
+        with form_of(inputs, json.dumps(dict(settings or {}))) as fields:
+            headers = {} if key is None else {"Idempotency-Key": key}
+            return job_of(await self._json("POST", path_of(kind), files=fields, headers=headers))
+
+    async def job(self, id: str, wait_s: float = 0.0) -> RemoteJob:
+        """A job; waits until it is finished, not longer than this."""
+        return job_of(await self._json("GET", f"/v1/jobs/{id}", params={"wait_s": wait_s}))
+
+    async def follow(self, id: str) -> AsyncIterator[RemoteJob]:
+        """The job now, on every change, and when it is finished."""
+        try:
+            async with self._http.stream("GET", f"/v1/jobs/{id}/events") as answer:
+                if answer.is_error:
+                    await answer.aread()
+                    self._raise_for(answer)
+                async for line in answer.aiter_lines():
+                    if line.startswith("data: "):
+                        yield job_of(json.loads(line.removeprefix("data: ")))
+        except httpx.HTTPError as error:
+            raise ServerError(f"{self._url}: does not answer ({error})") from error
+
+    async def wait(self, id: str) -> RemoteJob:
+        """A job, once it has a result.
+
+        Raises:
+            CalibrationError: if it failed or was cancelled.
+        """
+        while not (job := await self.job(id, wait_s=20.0)).is_finished:
+            pass
+        return require_success(job)
+
+    async def cancel(self, id: str) -> RemoteJob:
+        """Cancel a job."""
+        return job_of(await self._json("DELETE", f"/v1/jobs/{id}"))
+
+    async def result(self, id: str) -> dict[str, Any]:
+        """The result, as ``--json`` prints it."""
+        found: dict[str, Any] = await self._json("GET", f"/v1/jobs/{id}/result")
+        return found
+
+    async def download(self, id: str, folder: Path) -> list[Path]:
+        """Write the files of a result into a folder; their paths."""
+        with tempfile.TemporaryFile() as file:
+            try:
+                async with self._http.stream("GET", f"/v1/jobs/{id}/files.zip") as answer:
+                    if answer.is_error:
+                        await answer.aread()
+                        self._raise_for(answer)
+                    async for chunk in answer.aiter_bytes():
+                        file.write(chunk)
+            except httpx.HTTPError as error:
+                raise ServerError(f"{self._url}: does not answer ({error})") from error
+            return unpack(file, folder)
+
+    async def create_tracker(
+        self, rig: Mapping[str, Any], config: Mapping[str, Any] | None = None, name: str = "tracker"
+    ) -> str:
+        """Begin to track a rig, given as in a rig file; the tracker's id."""
+        body = {"rig": rig, "config": config or {}, "name": name}
+        return str((await self._json("POST", "/v1/trackers", json=body))["id"])
+
+    async def add_frames(
+        self,
+        tracker: str,
+        frames: Iterable[Mapping[str, Any]] | bytes,
+        media: str = "application/x-ndjson",
+    ) -> dict[str, Any]:
+        """Take in frames: mappings as ``track`` reads them, or a body with its media type."""
+        content = frames if isinstance(frames, bytes) else lines_of(frames)
+        headers = {"Content-Type": media}
+        path = f"/v1/trackers/{tracker}/frames"
+        found: dict[str, Any] = await self._json("POST", path, content=content, headers=headers)
+        return found
+
+    async def tracker_state(self, tracker: str) -> dict[str, Any]:
+        """The last estimate of a tracker."""
+        found: dict[str, Any] = await self._json("GET", f"/v1/trackers/{tracker}/state")
+        return found
+
+    async def _json(self, method: str, path: str, **options: Any) -> Any:
+        try:
+            answer = await self._http.request(method, path, **options)
+        except httpx.HTTPError as error:
+            raise ServerError(f"{self._url}: does not answer ({error})") from error
+        self._raise_for(answer)
+        return answer.json()
+
+    def _raise_for(self, answer: httpx.Response) -> None:
+        if not answer.is_success:
+            retry_after = answer.headers.get("retry-after")
+            raise refusal(self._url, answer.status_code, answer.content, retry_after)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self._http.aclose()

@@ -1,0 +1,208 @@
+"""A server's calibrations from Python, in blocking calls."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from calibgraph.client.answers import RemoteJob, ServerError, job_of, refusal, require_success
+from calibgraph.client.inputs import Source, form_of
+from calibgraph.progress import Progress, no_progress
+
+TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
+"""In the environment: the token, if none is given."""
+
+WAIT_S = 20.0
+TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
+_PATHS = {"calibration": "calibrations", "solve": "solves", "check": "checks"}
+_LINES = "application/x-ndjson"
+
+
+def headers_of(token: str | None, key: str | None = None) -> dict[str, str]:
+    """The headers of a request."""
+    given = token or os.environ.get(TOKEN_VARIABLE)
+    headers = {} if given is None else {"Authorization": f"Bearer {given}"}
+    return headers if key is None else {**headers, "Idempotency-Key": key}
+
+
+def path_of(kind: str) -> str:
+    """Where jobs of a kind are asked for."""
+    return f"/v1/{_PATHS[kind]}"
+
+
+class Client:
+    """A server of ``calibgraph serve``.
+
+    Args:
+        url: of the server.
+        token: of ``calibgraph token``; the variable CALIBGRAPH_TOKEN if None.
+
+    Every method raises :class:`ServerError` if the server refuses, or does not answer.
+    """
+
+    def __init__(self, url: str, token: str | None = None) -> None:
+        self._url = url.rstrip("/")
+        self._http = httpx.Client(base_url=self._url, headers=headers_of(token), timeout=TIMEOUT)
+
+    def submit(
+        self,
+        kind: str,
+        inputs: Mapping[str, Sequence[Source]],
+        settings: Mapping[str, Any] | None = None,
+        *,
+        key: str | None = None,
+    ) -> RemoteJob:
+        """Ask for a job.
+
+        Args:
+            kind: calibration, solve or check.
+            inputs: paths, which are sent, or URIs, which the server reads: ``rig``,
+                ``correspondences``, ``recording``.
+            settings: of the kind.
+            key: a repeated request with it gives the job of the first.
+        """
+        with form_of(inputs, json.dumps(dict(settings or {}))) as fields:
+            headers = {} if key is None else {"Idempotency-Key": key}
+            return job_of(self._json("POST", path_of(kind), files=fields, headers=headers))
+
+    def job(self, id: str, wait_s: float = 0.0) -> RemoteJob:
+        """A job; waits until it is finished, not longer than this."""
+        return job_of(self._json("GET", f"/v1/jobs/{id}", params={"wait_s": wait_s}))
+
+    def jobs(self, most: int = 50) -> list[RemoteJob]:
+        """The newest jobs."""
+        answer = self._json("GET", "/v1/jobs", params={"limit": most})
+        return [job_of(each) for each in answer["jobs"]]
+
+    def follow(self, id: str) -> Iterator[RemoteJob]:
+        """The job now, on every change, and when it is finished."""
+        try:
+            with self._http.stream("GET", f"/v1/jobs/{id}/events") as answer:
+                if answer.is_error:
+                    answer.read()
+                    self._raise_for(answer)
+                yield from map(job_of, events(answer.iter_lines()))
+        except httpx.HTTPError as error:
+            raise ServerError(f"{self._url}: does not answer ({error})") from error
+
+    def wait(self, id: str, progress: Progress | None = None) -> RemoteJob:
+        """A job, once it has a result.
+
+        Raises:
+            CalibrationError: if it failed or was cancelled.
+        """
+        report = progress or no_progress
+        while True:
+            for job in self.follow(id):
+                report(job.stage or job.state, job.done, job.total)
+                if job.is_finished:
+                    return require_success(job)
+
+    def cancel(self, id: str) -> RemoteJob:
+        """Cancel a job."""
+        return job_of(self._json("DELETE", f"/v1/jobs/{id}"))
+
+    def result(self, id: str) -> dict[str, Any]:
+        """The result, as ``--json`` prints it."""
+        found: dict[str, Any] = self._json("GET", f"/v1/jobs/{id}/result")
+        return found
+
+    def download(self, id: str, folder: Path) -> list[Path]:
+        """Write the files of a result into a folder; their paths."""
+        with tempfile.TemporaryFile() as file:
+            try:
+                with self._http.stream("GET", f"/v1/jobs/{id}/files.zip") as answer:
+                    if answer.is_error:
+                        answer.read()
+                        self._raise_for(answer)
+                    for chunk in answer.iter_bytes():
+                        file.write(chunk)
+            except httpx.HTTPError as error:
+                raise ServerError(f"{self._url}: does not answer ({error})") from error
+            return unpack(file, folder)
+
+    def create_tracker(
+        self, rig: Mapping[str, Any], config: Mapping[str, Any] | None = None, name: str = "tracker"
+    ) -> str:
+        """Begin to track a rig, given as in a rig file; the tracker's id."""
+        body = {"rig": rig, "config": config or {}, "name": name}
+        return str(self._json("POST", "/v1/trackers", json=body)["id"])
+
+    def add_frames(
+        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = _LINES
+    ) -> dict[str, Any]:
+        """Take in frames: mappings as ``track`` reads them, or a body with its media type."""
+        content = frames if isinstance(frames, bytes) else lines_of(frames)
+        headers = {"Content-Type": media}
+        path = f"/v1/trackers/{tracker}/frames"
+        found: dict[str, Any] = self._json("POST", path, content=content, headers=headers)
+        return found
+
+    def tracker_state(self, tracker: str) -> dict[str, Any]:
+        """The last estimate of a tracker."""
+        found: dict[str, Any] = self._json("GET", f"/v1/trackers/{tracker}/state")
+        return found
+
+    def _json(self, method: str, path: str, **options: Any) -> Any:
+        try:
+            answer = self._http.request(method, path, **options)
+        except httpx.HTTPError as error:
+            raise ServerError(f"{self._url}: does not answer ({error})") from error
+        self._raise_for(answer)
+        return answer.json()
+
+    def _raise_for(self, answer: httpx.Response) -> None:
+        if not answer.is_success:
+            retry_after = answer.headers.get("retry-after")
+            raise refusal(self._url, answer.status_code, answer.content, retry_after)
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def lines_of(frames: Iterable[Mapping[str, Any]]) -> bytes:
+    """Frames as JSON lines."""
+    return b"".join(json.dumps(frame).encode() + b"\n" for frame in frames)
+
+
+def events(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """The content of server-sent events."""
+    for line in lines:
+        if line.startswith("data: "):
+            yield json.loads(line.removeprefix("data: "))
+
+
+def unpack(file: Any, folder: Path) -> list[Path]:
+    """Write the files of a result's archive into a folder.
+
+    Raises:
+        ServerError: if it holds anything else.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file.seek(0)
+    with zipfile.ZipFile(file) as archive:
+        for name in archive.namelist():
+            if Path(name).name != name:
+                raise ServerError(f"the server's archive holds {name!r}, expected plain names")
+        archive.extractall(folder)
+        return [folder / name for name in archive.namelist()]

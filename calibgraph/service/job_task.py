@@ -1,0 +1,52 @@
+"""What a job's process gets and what it returns; and the names in a job's folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibgraph.fleet.task import ErrorKind
+from calibgraph.service.places import Root
+from calibgraph.service.requests import Job
+
+INPUT, WORK, RESULT, LOG = "input", "work", "result", "log.txt"
+"""In a job's folder: its input, its result while it is written, its result, its log."""
+FILES, SUMMARY = "files", "summary.json"
+"""In the result: the files that the command writes, and the summary that it prints."""
+
+
+@dataclass(frozen=True)
+class JobTask:
+    """A job for a process.
+
+    Attributes:
+        job: what is asked for.
+        folder: of the job.
+        roots: from which it may read.
+        memory_bytes: that it may allocate.
+        fetch_bytes: of remote recordings.
+        unpacked_bytes: of uploaded archives.
+        timeout_s: after which it is ended.
+    """
+
+    job: Job
+    folder: Path
+    roots: tuple[Root, ...]
+    memory_bytes: int
+    fetch_bytes: int
+    unpacked_bytes: int
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """How a job ended.
+
+    Attributes:
+        verdict: of the result; None if it failed.
+        error_kind, error: why it failed, in one line.
+    """
+
+    verdict: str | None = None
+    error_kind: ErrorKind | None = None
+    error: str | None = None
