@@ -18,7 +18,7 @@ $(VENV)/base: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/base
-	$(INSTALL) --editable '.[test,pointcloud,learned,ros,motion,ray,dask,view]'
+	$(INSTALL) --editable '.[test,pointcloud,learned,ros,motion,ray,dask,view,service]'
 	@touch $@
 
 install: $(VENV)/base ## Install into .venv

@@ -10,7 +10,13 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
-from calibgraph.service import routes_jobs, routes_results, routes_service, routes_trackers
+from calibgraph.service import (
+    routes_jobs,
+    routes_pages,
+    routes_results,
+    routes_service,
+    routes_trackers,
+)
 from calibgraph.service.access import Gate, load_tokens
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.problems import add_problem_handlers
@@ -47,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.service = open_service(settings, metrics)
     app.add_middleware(Shield, hosts=_hosts(settings), observe=metrics.observe_request)
     app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
-    for router in (routes_jobs, routes_results, routes_trackers, routes_service):
+    for router in (routes_jobs, routes_results, routes_trackers, routes_service, routes_pages):
         app.include_router(router.router)
     add_problem_handlers(app)
     return app

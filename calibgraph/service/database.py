@@ -112,7 +112,7 @@ def _engine(folder: Path, url: str | None) -> Engine:
 
 def _require_ours(engine: Engine, where: str, owner: str) -> None:
     with engine.begin() as connection:
-        found = dict(connection.execute(select(about.c.name, about.c.value)).tuples().all())
+        found = {row.name: row.value for row in connection.execute(select(about))}
         if not found:
             rows = [{"name": "layout", "value": LAYOUT}, {"name": "owner", "value": owner}]
             connection.execute(about.insert(), rows)

@@ -143,7 +143,7 @@ class JobTable:
             text = connection.execute(select(jobs.c.request).where(jobs.c.id == id)).scalar_one()
         return Job.model_validate_json(text)
 
-    def list(self, caller: Caller, most: int, before: int | None = None) -> list[JobRecord]:
+    def newest(self, caller: Caller, most: int, before: int | None = None) -> list[JobRecord]:
         """The newest jobs that a caller sees, before a number."""
         query = select(*_SHORT).order_by(jobs.c.number.desc()).limit(most)
         if caller.scope != "admin":

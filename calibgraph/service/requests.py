@@ -170,13 +170,12 @@ REQUIRED: Mapping[JobKind, tuple[str, ...]] = {
 }
 
 
-def settings_of(kind: JobKind) -> type[SolveSettings] | type[CheckSettings]:
-    """The model of the settings of a kind."""
-    return {
-        "calibration": CalibrationSettings,
-        "solve": SolveSettings,
-        "check": CheckSettings,
-    }[kind]
+SETTINGS_OF: Mapping[JobKind, type[SolveSettings] | type[CheckSettings]] = {
+    "calibration": CalibrationSettings,
+    "solve": SolveSettings,
+    "check": CheckSettings,
+}
+"""The models of the settings."""
 
 
 def job_of(request: AnyRequest, kind: JobKind) -> Job:

@@ -18,7 +18,7 @@ from calibgraph.service.bell import wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem, documented
-from calibgraph.service.requests import ALLOWED, KINDS, REQUESTS, REQUIRED, JobKind, settings_of
+from calibgraph.service.requests import ALLOWED, KINDS, REQUESTS, REQUIRED, SETTINGS_OF, JobKind
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import SETTINGS, submit
 
@@ -46,7 +46,7 @@ def _body(kind: JobKind) -> dict[str, Any]:
         files["recording"] = {"type": "array", "items": files["recording"]}
     form = {
         "type": "object",
-        "properties": {**files, SETTINGS: settings_of(kind).model_json_schema()},
+        "properties": {**files, SETTINGS: SETTINGS_OF[kind].model_json_schema()},
         "required": list(REQUIRED[kind]),
     }
     content = {
@@ -100,7 +100,7 @@ def list_jobs(
     before: Annotated[int | None, Query(ge=0, le=2**62)] = None,
 ) -> JobList:
     """The jobs of the tenant, the newest first."""
-    records = state.jobs.list(caller, limit, before)
+    records = state.jobs.newest(caller, limit, before)
     following = records[-1].number if len(records) == limit else None
     return JobList(jobs=[job_answer(r, state.runner.step(r.id)) for r in records], next=following)
 

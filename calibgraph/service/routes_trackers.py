@@ -106,7 +106,12 @@ def tracker_answer(record: TrackerRecord) -> TrackerAnswer:
     return TrackerAnswer(id=record.id, name=record.name, created=utc(record.created_s).isoformat())
 
 
-def _find(state: Service, caller: Caller, id: str) -> TrackerRecord:
+def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
+    """The tracker of an id.
+
+    Raises:
+        Problem: if there is none that the caller sees.
+    """
     record = state.tracker_table.get(id, caller)
     if record is None:
         raise Problem(404, "no such tracker")
@@ -170,7 +175,7 @@ def list_trackers(state: State, caller: Reader) -> list[TrackerAnswer]:
 )
 async def add_frames(id: TrackerId, request: Request, state: State, caller: Submitter) -> Response:
     """Take in frames: JSON lines, or an Arrow IPC stream. What is answered is on disk."""
-    await run_in_threadpool(_find, state, caller, id)
+    await run_in_threadpool(find_tracker, state, caller, id)
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
@@ -184,7 +189,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
 @router.get("/{id}/state", responses=documented(404, 422))
 def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
     """The last estimate, with its error bars, verdicts and events."""
-    _find(state, caller, id)
+    find_tracker(state, caller, id)
     asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
     return TrackerState(**state.trackers.ask(id, asked))
 
@@ -196,7 +201,7 @@ def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
 )
 def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
     """The extrinsics over time, with their error bars and events."""
-    _find(state, caller, id)
+    find_tracker(state, caller, id)
     asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
     return Response(state.trackers.ask(id, asked), media_type="image/png")
 
@@ -204,7 +209,7 @@ def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
 @router.delete("/{id}", status_code=204, responses=documented(404, 422))
 def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
     """Remove a tracker and its state."""
-    _find(state, caller, id)
+    find_tracker(state, caller, id)
     state.tracker_table.remove(id)
     state.trackers.ask(id, TrackerRequest("remove", str(state.folder.of_tracker(id))))
     return Response(status_code=204)

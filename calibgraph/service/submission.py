@@ -26,11 +26,11 @@ from calibgraph.service.requests import (
     RECORDING,
     REQUESTS,
     REQUIRED,
+    SETTINGS_OF,
     Job,
     JobKind,
     job_of,
     recording_name,
-    settings_of,
 )
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service
@@ -127,7 +127,7 @@ def _job_of_form(upload: Upload, kind: JobKind) -> Job:
     for name in REQUIRED[kind]:
         if name not in given:
             raise Problem(422, f"{name!r} is missing; add it as a file, or a field with its URI")
-    checked = _checked(settings_of(kind), parse_json(settings.encode()))
+    checked = _checked(SETTINGS_OF[kind], parse_json(settings.encode()))
     return Job(
         kind=kind,
         uris=uris,

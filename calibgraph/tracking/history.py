@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,7 +183,7 @@ class History:
         return history_figure(self.curves(), self.events, first, newest)
 
 
-def _save(path: Path, text: str, arrays: dict[str, NDArray[np.generic]]) -> None:
+def _save(path: Path, text: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     with path.open("wb") as file:
         np.savez(file, json=np.array(text), **arrays)  # type: ignore[arg-type]
 

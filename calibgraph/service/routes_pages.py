@@ -1,0 +1,183 @@
+"""Pages for people: jobs with their verdicts, a job, trackers with their drift; sign in."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+from urllib.parse import parse_qs
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
+
+from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.model.result_files import REPORT_FILE
+from calibgraph.service.access import COOKIE, Caller, Gate
+from calibgraph.service.api_page import operations
+from calibgraph.service.job_task import FILES, RESULT, SUMMARY
+from calibgraph.service.jobs import JobRecord
+from calibgraph.service.pages import (
+    camera_table,
+    job_view,
+    mark_of,
+    minute_of,
+    read_summary,
+    reasons_of,
+    render,
+)
+from calibgraph.service.problems import Problem
+from calibgraph.service.routes_jobs import find_job
+from calibgraph.service.routes_trackers import find_tracker
+from calibgraph.service.state import Service, State
+from calibgraph.service.tracker_request import TrackerRequest
+from calibgraph.service.uploads import read_whole
+
+router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+_PER_PAGE = 50
+_MOST_FORM_BYTES = 4096
+
+
+async def _visitor(request: Request) -> Caller:
+    """Who visits; the browser is sent to the page for tokens if it has none."""
+    gate: Gate = request.app.state.gate
+    caller = gate.caller(request.cookies.get(COOKIE))
+    if caller is None:
+        raise Problem(303, "sign in first", {"Location": "/sign-in"})
+    return caller
+
+
+Visitor = Annotated[Caller, Depends(_visitor)]
+
+
+def _page(request: Request, template: str, status: int = 200, **content: object) -> Response:
+    gate: Gate = request.app.state.gate
+    can_sign_out = not gate.is_open and COOKIE in request.cookies
+    return HTMLResponse(render(template, can_sign_out=can_sign_out, **content), status)
+
+
+@router.get("/")
+def jobs_page(
+    request: Request,
+    state: State,
+    caller: Visitor,
+    before: Annotated[int | None, Query(ge=0, le=2**62)] = None,
+) -> Response:
+    """The jobs, with their verdicts."""
+    records = state.jobs.newest(caller, _PER_PAGE, before)
+    following = records[-1].number if len(records) == _PER_PAGE else None
+    views = [job_view(record, state.runner.step(record.id)) for record in records]
+    return _page(request, "jobs.html.j2", jobs=views, next=following, is_later=before is not None)
+
+
+@router.get("/jobs/{id}")
+def job_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
+    """A job: how far it is, or its verdict, its cameras and its files."""
+    record = find_job(state, caller, id)
+    folder = state.folder.of_job(id) / RESULT
+    summary = read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
+    columns, cameras = camera_table(summary.get("cameras", {}))
+    return _page(
+        request,
+        "job.html.j2",
+        job=job_view(record, state.runner.step(id)),
+        reasons=reasons_of(summary),
+        columns=columns,
+        cameras=cameras,
+        links=_links(state, record),
+    )
+
+
+def _links(state: Service, record: JobRecord) -> list[dict[str, str]]:
+    """What can be fetched of a job."""
+    at = f"/v1/jobs/{record.id}"
+    log = {"name": "Log", "path": f"{at}/log"}
+    if record.state != "succeeded":
+        return [log]
+    result = {"name": "Result (JSON)", "path": f"{at}/result"}
+    files = state.folder.of_job(record.id) / RESULT / FILES
+    if record.kind == "check":
+        return [result, log]
+    report = {"name": "Report", "path": f"{at}/report.html"}
+    exports = [
+        {"name": f"For {name}", "path": f"{at}/exports/{name}"}
+        for name in EXPORT_FORMATS
+        if record.verdict != "FAIL"
+    ]
+    whole = {"name": "All files (zip)", "path": f"{at}/files.zip"}
+    return [*([report] if (files / REPORT_FILE).exists() else []), result, whole, log, *exports]
+
+
+@router.get("/trackers")
+def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
+    """The trackers."""
+    trackers = [
+        {"id": record.id, "name": record.name, "created": minute_of(record.created_s)}
+        for record in state.tracker_table.list(caller)
+    ]
+    return _page(request, "trackers.html.j2", trackers=trackers)
+
+
+@router.get("/trackers/{id}")
+def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
+    """A tracker: its verdict, its alarms, its extrinsics over time."""
+    record = find_tracker(state, caller, id)
+    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
+    found: dict[str, Any] = state.trackers.ask(id, asked)
+    columns, cameras = camera_table(found["cameras"])
+    return _page(
+        request,
+        "tracker.html.j2",
+        tracker={"name": record.name, "created": minute_of(record.created_s)},
+        verdict=found["verdict"],
+        mark=mark_of(found["verdict"]),
+        frame=found["frame"],
+        reasons=found["reasons"],
+        events=[event["text"] for event in reversed(found["events"])],
+        plot=f"/v1/trackers/{id}/drift.png",
+        columns=columns,
+        cameras=cameras,
+    )
+
+
+@router.get("/docs")
+def api_page(request: Request) -> Response:
+    """The API in words."""
+    gate: Gate = request.app.state.gate
+    return _page(
+        request,
+        "docs.html.j2",
+        operations=operations(request.app.openapi()),
+        url=str(request.base_url).rstrip("/"),
+        is_open=gate.is_open,
+    )
+
+
+@router.get("/sign-in")
+def sign_in_page(request: Request) -> Response:
+    """Where a browser gives its token."""
+    return _page(request, "sign_in.html.j2", problem=None)
+
+
+@router.post("/sign-in")
+async def sign_in(request: Request) -> Response:
+    """Keep a token in the browser, where no script can read it."""
+    body = await read_whole(request.stream(), _MOST_FORM_BYTES)
+    fields = parse_qs(body.decode("utf-8", errors="replace"))
+    secret = fields.get("token", [""])[0].strip()
+    gate: Gate = request.app.state.gate
+    if gate.caller(secret) is None:
+        text = "No such token. Make one with calibgraph token, and give what it prints."
+        return await run_in_threadpool(_page, request, "sign_in.html.j2", status=403, problem=text)
+    answer = RedirectResponse("/", 303)
+    answer.set_cookie(
+        COOKIE, secret, httponly=True, samesite="strict", secure=request.url.scheme == "https"
+    )
+    return answer
+
+
+@router.post("/sign-out")
+async def sign_out() -> Response:
+    """Forget the browser's token."""
+    answer = RedirectResponse("/sign-in", 303)
+    answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    return answer
