@@ -22,6 +22,7 @@ from tests.conftest import ROOT
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
 READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
 PLACEHOLDER = re.compile(r"<!-- generated: (.*) -->")
+SERVER = "--server http://127.0.0.1:8080 "  # an option of the program, before the command
 VALUES = ("--help", "--version", "--debug")
 
 
@@ -63,7 +64,7 @@ def command_lines(page: Path) -> Iterator[list[str]]:
         found = re.search(r"(?:^|\| )calibgraph (.*)", line)
         if found:
             shell = re.split(r" [|<>] ", found[1].split("  #")[0])[0]
-            yield shlex.split(shell)
+            yield shlex.split(shell.removeprefix(SERVER))
 
 
 @pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)
