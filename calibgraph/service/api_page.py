@@ -14,6 +14,12 @@ def operations(description: Mapping[str, Any]) -> list[dict[str, Any]]:
     return list(_operations(description))
 
 
+def schemas(description: Mapping[str, Any]) -> dict[str, str]:
+    """The schemas that bodies and answers refer to, by their name."""
+    found = description["components"]["schemas"]
+    return {name: json.dumps(schema, indent=1) for name, schema in sorted(found.items())}
+
+
 def _operations(description: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     for path, item in description["paths"].items():
         for method in _METHODS:

@@ -18,8 +18,10 @@ from calibgraph.service import (
     routes_trackers,
 )
 from calibgraph.service.access import Gate, load_tokens
+from calibgraph.service.api_schema import add_schemas
 from calibgraph.service.metrics import Metrics
-from calibgraph.service.problems import add_problem_handlers
+from calibgraph.service.problems import ProblemDetails, add_problem_handlers
+from calibgraph.service.requests import REQUESTS, SETTINGS_OF
 from calibgraph.service.settings import Settings
 from calibgraph.service.shield import LOCAL_NAMES, Shield
 from calibgraph.service.state import Service, open_service
@@ -56,6 +58,8 @@ def create_app(settings: Settings) -> FastAPI:
     for router in (routes_jobs, routes_results, routes_trackers, routes_service, routes_pages):
         app.include_router(router.router)
     add_problem_handlers(app)
+    bodies = (*REQUESTS.values(), *SETTINGS_OF.values(), routes_trackers.TrackerBody)
+    add_schemas(app, (*bodies, ProblemDetails))
     return app
 
 

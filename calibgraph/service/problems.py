@@ -17,6 +17,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from calibgraph.errors import CalibrationError
+from calibgraph.service.api_schema import reference
 
 log = logging.getLogger("calibgraph.service")
 
@@ -65,7 +66,7 @@ def problem_response(
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """The problems that a route may answer with, for OpenAPI."""
-    content = {MEDIA_TYPE: {"schema": ProblemDetails.model_json_schema()}}
+    content = {MEDIA_TYPE: {"schema": reference(ProblemDetails)}}
     return {
         status: {"description": HTTPStatus(status).phrase, "content": content}
         for status in sorted({400, 401, 403, 500, 503, *statuses})

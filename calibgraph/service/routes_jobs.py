@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from calibgraph.service.access import Reader, Submitter
 from calibgraph.service.answers import JobAnswer, JobList, job_answer
+from calibgraph.service.api_schema import reference
 from calibgraph.service.bell import wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
@@ -46,11 +47,11 @@ def _body(kind: JobKind) -> dict[str, Any]:
         files["recording"] = {"type": "array", "items": files["recording"]}
     form = {
         "type": "object",
-        "properties": {**files, SETTINGS: SETTINGS_OF[kind].model_json_schema()},
+        "properties": {**files, SETTINGS: reference(SETTINGS_OF[kind])},
         "required": list(REQUIRED[kind]),
     }
     content = {
-        "application/json": {"schema": REQUESTS[kind].model_json_schema()},
+        "application/json": {"schema": reference(REQUESTS[kind])},
         "multipart/form-data": {"schema": form},
     }
     return {"requestBody": {"required": True, "content": content}}

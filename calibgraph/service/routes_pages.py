@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.api_page import operations
+from calibgraph.service.api_page import operations, schemas
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.pages import (
@@ -147,6 +147,7 @@ def api_page(request: Request) -> Response:
         request,
         "docs.html.j2",
         operations=operations(request.app.openapi()),
+        schemas=schemas(request.app.openapi()),
         url=str(request.base_url).rstrip("/"),
         is_open=gate.is_open,
     )

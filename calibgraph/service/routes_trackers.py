@@ -15,6 +15,7 @@ from calibgraph.files import checked_model, yaml_text
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
 from calibgraph.service.answers import utc
+from calibgraph.service.api_schema import reference
 from calibgraph.service.jobs import new_id
 from calibgraph.service.problems import Problem, documented
 from calibgraph.service.settings import MAX_JSON_BYTES
@@ -126,7 +127,7 @@ def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/json": {"schema": TrackerBody.model_json_schema()}},
+            "content": {"application/json": {"schema": reference(TrackerBody)}},
         }
     },
 )

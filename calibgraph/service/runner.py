@@ -210,7 +210,7 @@ class Runner:
             if current is None or current.state != "running":  # cancelled meanwhile
                 return JobOutcome(error_kind="bad input", error="cancelled")
             outcome: JobOutcome = slot.child.ask(
-                self._task(record.id), limit_s, lambda note: self._note(record.id, note)
+                self.task(record.id), limit_s, lambda note: self._note(record.id, note)
             )
             self._renew(slot, failed=outcome.error_kind is not None)
             return outcome
@@ -225,7 +225,8 @@ class Runner:
                 return JobOutcome(error_kind="worker died", error=str(error))
             return None
 
-    def _task(self, id: str) -> JobTask:
+    def task(self, id: str) -> JobTask:
+        """What the process of a job gets."""
         settings = self._settings
         return JobTask(
             job=self._table.request(id),

@@ -1,0 +1,141 @@
+"""Frames to many trackers at a rate."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from dataclasses import dataclass, field
+
+import httpx
+import numpy as np
+
+from benchmarks.service.server import Server
+from benchmarks.tables import Table
+from calibgraph import Correspondences, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph.simulation.rigs import rig_of
+
+_FRAMES = 20
+_MATCHES = 20
+_LINES = {"Content-Type": "application/x-ndjson"}
+
+
+@dataclass
+class Counts:
+    """What was acknowledged.
+
+    Attributes:
+        seconds: of each request.
+        frames: acknowledged ones.
+        refused: answers that were none.
+        memory_mb: of the server and the largest worker, over time.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    frames: int = 0
+    refused: int = 0
+    memory_mb: list[tuple[float, float]] = field(default_factory=list)
+
+
+def track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
+    """Send frames to trackers for some time; a frame that is late does not delay the others."""
+    return asyncio.run(_track(server, trackers, hz, seconds))
+
+
+async def _track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
+    truth = rig_of("kitti")
+    guess = perturb(truth, rotation_deg=0.5, translation_m=0.05, seed=1)
+    bodies = frame_bodies(truth)
+    limits = httpx.Limits(max_connections=None, max_keepalive_connections=trackers)
+    async with httpx.AsyncClient(base_url=server.url, timeout=120, limits=limits) as http:
+        places = [await _begin(http, guess) for _ in range(trackers)]
+        counts, start = Counts(), time.monotonic()
+        watching = asyncio.create_task(_watch(server, counts))
+        tasks = (
+            _drive(http, place, bodies, start + index / trackers / hz, hz, seconds, counts)
+            for index, place in enumerate(places)
+        )
+        await asyncio.gather(*tasks)
+        watching.cancel()
+        lasts = [await _last_frame(http, place) for place in places]
+    return _table(counts, lasts, trackers, hz, time.monotonic() - start)
+
+
+def frame_bodies(truth: Rig) -> list[dict[str, object]]:
+    """``cameras`` of some frames of a rig, as a line of JSON has them."""
+    table = simulate_correspondences(
+        truth, frames=_FRAMES, matches=_MATCHES, errors=MatcherErrors(noise_px=1.0), seed=1
+    )
+    return [_cameras(table, frame) for frame in range(_FRAMES)]
+
+
+def _cameras(table: Correspondences, frame: int) -> dict[str, object]:
+    cameras: dict[str, object] = {}
+    rows = table.to_arrow().to_pylist()
+    for row in rows:
+        if row["frame"] == frame:
+            columns = cameras.setdefault(row["camera"], {n: [] for n in _COLUMNS})
+            assert isinstance(columns, dict)
+            for name in _COLUMNS:
+                columns[name].append(row[name])
+    return cameras
+
+
+_COLUMNS = ("u_px", "v_px", "x_m", "y_m", "z_m")
+
+
+async def _begin(http: httpx.AsyncClient, rig: Rig) -> str:
+    answer = await http.post("/v1/trackers", json={"rig": rig.model_dump(mode="json")})
+    return str(answer.raise_for_status().headers["location"])
+
+
+async def _drive(
+    http: httpx.AsyncClient, place: str, bodies: list[dict[str, object]], start: float,
+    hz: float, seconds: float, counts: Counts,
+) -> None:  # fmt: skip
+    """Send what has come up since the last answer, as a robot does that has to wait."""
+    frame = 0
+    while time.monotonic() < start + seconds:
+        due = int((time.monotonic() - start) * hz) + 1
+        if due <= frame:
+            await asyncio.sleep(max(0.0, start + frame / hz - time.monotonic()))
+            continue
+        lines = [
+            json.dumps({"frame": i, "cameras": bodies[i % _FRAMES]}) for i in range(frame, due)
+        ]
+        begun = time.perf_counter()
+        answer = await http.post(f"{place}/frames", content="\n".join(lines), headers=_LINES)
+        if answer.is_success:
+            counts.seconds.append(time.perf_counter() - begun)
+            counts.frames += len(answer.json()["updates"])
+            frame = due
+        else:
+            counts.refused += 1
+            await asyncio.sleep(1)
+
+
+async def _watch(server: Server, counts: Counts) -> None:
+    while True:
+        counts.memory_mb.append(server.memory_mb())
+        await asyncio.sleep(5)
+
+
+async def _last_frame(http: httpx.AsyncClient, place: str) -> int:
+    answer = await http.get(f"{place}/state")
+    return int(answer.raise_for_status().json()["frame"])
+
+
+def _table(counts: Counts, lasts: list[int], trackers: int, hz: float, wall_s: float) -> Table:
+    p50, p99 = np.percentile(counts.seconds, [50, 99])
+    first, last = counts.memory_mb[len(counts.memory_mb) // 4], counts.memory_mb[-1]
+    rows = (
+        ("frames per second wanted", f"{trackers * hz:.0f}"),
+        ("frames per second acknowledged", f"{counts.frames / wall_s:.0f}"),
+        ("frames acknowledged, and in the states", f"{counts.frames}, {sum(lasts) + trackers}"),
+        ("requests, refused", f"{len(counts.seconds)}, {counts.refused}"),
+        ("frame to acknowledgement, p50 s", f"{p50:.3f}"),
+        ("frame to acknowledgement, p99 s", f"{p99:.3f}"),
+        ("server MB, at a quarter and at the end", f"{first[0]:.0f}, {last[0]:.0f}"),
+        ("largest worker MB, the same", f"{first[1]:.0f}, {last[1]:.0f}"),
+    )
+    return Table(f"{trackers} trackers at {hz:g} Hz, {wall_s:.0f} s", ("what", "found"), rows)

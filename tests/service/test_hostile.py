@@ -1,0 +1,122 @@
+"""Hostile uploads: refused in one line, or the job fails so; nothing lies where it should not."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from calibgraph.child_process import memory_limit
+from calibgraph.service.job_process import run_job
+from calibgraph.service.job_task import JobOutcome
+from tests.conftest import SAMPLE
+from tests.service.conftest import Make, Problem, make_tokens, service_folder
+from tests.service.hostile import Hostile, as_form, hostile_uploads
+
+MOST_LETTERS = 2000
+MOST_S = 30.0
+MEMORY_BYTES = 2 * 10**9
+UNPACKED_BYTES = 100_000_000
+REFUSED = {400, 413, 415, 422}
+
+
+@pytest.mark.slow
+def test_sixty_hostile_uploads_end_in_one_line(
+    make_server: Make, small: Problem, monkeypatch: Any, tmp_path: Path
+) -> None:
+    client = make_server(upload_bytes=UNPACKED_BYTES)
+    uploads = hostile_uploads((SAMPLE / "rig.yaml").read_bytes())
+    wrong = {
+        upload.name: found
+        for upload in uploads
+        if (found := what_is_wrong(client, upload, small, monkeypatch))
+    }
+    assert wrong == {}
+    assert len({upload.name for upload in uploads}) >= 60
+    assert beside(tmp_path) == {"data"}
+    assert not list((service_folder(client) / "arriving").iterdir())
+
+
+def what_is_wrong(client: Any, upload: Hostile, small: Problem, monkeypatch: Any) -> str:
+    """What is wrong with the answer to an upload; nothing if it is as it should be."""
+    files, fields = as_form(upload, small.rig, small.table)
+    start = time.perf_counter()
+    answer = client.post(f"/v1/{upload.kind}", files=files, data=fields)
+    outcome = JobOutcome(error_kind="bad input", error=answer.json().get("detail"))
+    if answer.status_code not in REFUSED:
+        if answer.status_code != 202:
+            return str(answer.text)
+        outcome = run(client, answer.json()["id"], monkeypatch)
+    seconds, detail = time.perf_counter() - start, outcome.error or ""
+    is_one_line = "\n" not in detail and len(detail) < MOST_LETTERS
+    has_path = str(service_folder(client)) in detail
+    is_refused = outcome.error_kind in ("bad input", "out of memory") and bool(detail)
+    is_done = outcome.verdict is not None and upload.is_harmless
+    good = is_one_line and not has_path and seconds < MOST_S and (is_refused or is_done)
+    return "" if good else f"{outcome} after {seconds:.1f} s"
+
+
+def run(client: Any, id: str, monkeypatch: Any) -> JobOutcome:
+    """Run a job as its process does, with its limit of memory."""
+    task = client.app.state.service.runner.task(id)
+    monkeypatch.chdir(os.getcwd())  # it goes back there
+    held = psutil.Process().memory_info().data
+    with memory_limit(held + MEMORY_BYTES):
+        return run_job(task, lambda _: None)
+
+
+def beside(folder: Path) -> set[str]:
+    """What lies where only the server's folder should."""
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_form_that_breaks_off_leaves_nothing(make_server: Make) -> None:
+    client = make_server()
+    kind = {"Content-Type": "multipart/form-data; boundary=b"}
+    part = b'--b\r\nContent-Disposition: form-data; name="rig"; filename="rig"\r\n\r\nformat'
+    for body in (part, part[:30], b"", b"garbage" * 100, part + b"\r\n--b"):
+        answer = client.post("/v1/solves", content=body, headers=kind)
+        assert answer.status_code == 400, body
+    for boundary in ("", "x" * 200):
+        kind = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
+        assert client.post("/v1/solves", content=part, headers=kind).status_code == 400
+    folder = service_folder(client)
+    assert not list((folder / "arriving").iterdir())
+    assert not list((folder / "jobs").iterdir())
+
+
+def test_limits_hold_while_an_upload_arrives(make_server: Make, small: Problem) -> None:
+    client = make_server(upload_bytes=1000)
+    sent = []
+
+    def endless() -> Any:
+        yield b'--b\r\nContent-Disposition: form-data; name="rig"; filename="rig"\r\n\r\n'
+        for _ in range(1000):
+            sent.append(1)
+            yield b"x" * 1000
+
+    kind = {"Content-Type": "multipart/form-data; boundary=b"}
+    assert client.post("/v1/solves", content=endless(), headers=kind).status_code == 413
+    many = [("recording", b"x")] * 101
+    assert make_server("other").post("/v1/calibrations", files=many).status_code == 422
+    assert make_server("third").post("/v1/solves", content=b"x").status_code == 415
+
+
+def test_a_token_cannot_be_smuggled(make_server: Make, tmp_path: Path) -> None:
+    path = tmp_path / "tokens.yaml"
+    (good,) = make_tokens(path, ("ours", "read"))
+    client = make_server(tokens=path)
+    secret = good["Authorization"].removeprefix("Bearer ")
+    for value in (
+        f"Basic {secret}",
+        secret,
+        f"Bearer {secret[:-1]}",
+        f"Bearer {secret}x",
+        "Bearer",
+    ):
+        assert client.get("/v1/jobs", headers={"Authorization": value}).status_code == 401
+    assert client.get("/v1/jobs", params={"token": secret}).status_code == 401
