@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -97,6 +98,14 @@ def add_problem_handlers(app: FastAPI) -> None:
         if error.errno in _DISK_FULL:
             return problem_response(507, "the server's disk is full; try again later")
         return _unexpected(request, error)
+
+    @app.exception_handler(SQLAlchemyError)
+    async def _database(request: Request, error: SQLAlchemyError) -> Response:
+        log.error("the database failed in %s %s: %s", request.method, request.url.path, error)
+        if "disk is full" in str(error):
+            return problem_response(507, "the server's disk is full; try again later")
+        text = "the server's database cannot be used; try again later"
+        return problem_response(503, text, {"Retry-After": "5"})
 
     @app.exception_handler(ClientDisconnect)
     async def _gone(_: Request, error: ClientDisconnect) -> Response:
