@@ -160,20 +160,20 @@ def _listed(http: httpx.Client) -> list[str]:
         before = {"before": page["next"]}
 
 
-def run(folder: Path, port: int, kills: int, seed: int) -> Table:
+def run(folder: Path, server: Server, kills: int, seed: int) -> Table:
     """All of it."""
     problems = make_problems(folder / "problems", 10)
-    server, seen = Server(folder / "data", port), Seen()
+    seen = Seen()
     server.start()
     rig = perturb(rig_of("kitti"), rotation_deg=0.5, translation_m=0.05, seed=1)
     body = {"rig": rig.model_dump(mode="json")}
     begun = httpx.post(f"{server.url}/v1/trackers", json=body, timeout=120)
     place = str(begun.raise_for_status().headers["location"])
     threads = [
-        threading.Thread(target=_submit, args=(server.url, client, problems, seen))
+        threading.Thread(target=_submit, args=(server.url, client, problems, seen), daemon=True)
         for client in range(CLIENTS)
     ]
-    threads.append(threading.Thread(target=_track, args=(server.url, place, seen)))
+    threads.append(threading.Thread(target=_track, args=(server.url, place, seen), daemon=True))
     for thread in threads:
         thread.start()
     start = time.monotonic()
@@ -183,7 +183,6 @@ def run(folder: Path, port: int, kills: int, seed: int) -> Table:
         thread.join()
     wall_s = time.monotonic() - start
     found = _check(server.url, place, problems, seen)
-    server.stop()
     rows = (
         ("kills of the server, of a worker", f"{killed['server']}, {killed['worker']}"),
         ("acknowledged jobs", f"{len(seen.jobs)}"),
@@ -204,7 +203,11 @@ def main() -> None:
     add_record_option(parser)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        table = run(Path(temporary), options.port, options.kills, options.seed)
+        server = Server(Path(temporary) / "data", options.port)
+        try:
+            table = run(Path(temporary), server, options.kills, options.seed)
+        finally:
+            server.kill()
     publish("service.faults", [table], record=options.record)
 
 

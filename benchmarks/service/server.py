@@ -98,6 +98,8 @@ class Server:
             self.process = psutil.Popen(self._words, stdout=log, stderr=subprocess.STDOUT)
         end = time.monotonic() + _READY_S
         while time.monotonic() < end:
+            if self.process.poll() is not None:
+                raise RuntimeError(f"the server has ended; see {self._log}")
             with suppress(httpx.HTTPError):
                 if httpx.get(f"{self.url}/readyz", timeout=5).status_code == httpx.codes.OK:
                     return
