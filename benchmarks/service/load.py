@@ -41,6 +41,7 @@ class Counts:
         acknowledged: ids of the jobs.
         wrong: results of another problem, or none.
         busy: refusals for the time being.
+        broken: requests without an answer, which were sent again.
         memory_mb: of the server and the largest worker, over time.
     """
 
@@ -48,6 +49,7 @@ class Counts:
     acknowledged: set[str] = field(default_factory=set)
     wrong: int = 0
     busy: int = 0
+    broken: int = 0
     memory_mb: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -81,7 +83,7 @@ async def _one(
         problem = problems[(number + turn) % len(problems)]
         start = time.perf_counter()
         id = await _submit(http, problem, f"{number}-{turn}", counts)
-        if await _is_right(http, id, problem):
+        if await _is_right(http, id, problem, counts):
             counts.seconds.append(time.perf_counter() - start)
         else:
             counts.wrong += 1
@@ -91,9 +93,13 @@ async def _one(
 async def _submit(http: httpx.AsyncClient, problem: Problem, key: str, counts: Counts) -> str:
     while True:
         headers = {"Idempotency-Key": key}
-        answer = await http.post(
-            "/v1/solves", files=problem.files, data={"settings": SETTINGS}, headers=headers
-        )
+        try:
+            answer = await http.post(
+                "/v1/solves", files=problem.files, data={"settings": SETTINGS}, headers=headers
+            )
+        except httpx.TransportError:
+            counts.broken += 1
+            continue
         if answer.status_code not in _BUSY:
             id = str(answer.raise_for_status().json()["id"])
             counts.acknowledged.add(id)
@@ -102,9 +108,14 @@ async def _submit(http: httpx.AsyncClient, problem: Problem, key: str, counts: C
         await asyncio.sleep(RETRY_S)
 
 
-async def _is_right(http: httpx.AsyncClient, id: str, problem: Problem) -> bool:
+async def _is_right(http: httpx.AsyncClient, id: str, problem: Problem, counts: Counts) -> bool:
     while True:
-        job = (await http.get(f"/v1/jobs/{id}", params={"wait_s": 60})).raise_for_status().json()
+        try:
+            answer = await http.get(f"/v1/jobs/{id}", params={"wait_s": 60})
+        except httpx.TransportError:
+            counts.broken += 1
+            continue
+        job = answer.raise_for_status().json()
         if job["state"] not in ("queued", "running"):
             break
     if job["state"] != "succeeded":
@@ -137,6 +148,7 @@ def _table(counts: Counts, wall_s: float, server_s: float, alone_s: float) -> Ta
         ("right results", f"{done}"),
         ("wrong, lost", f"{counts.wrong}, {len(counts.acknowledged) - done - counts.wrong}"),
         ("refused for the time being (429)", f"{counts.busy}"),
+        ("sent again after no answer", f"{counts.broken}"),
         ("solves per second", f"{done / wall_s:.1f}"),
         ("request to result, p50 s", f"{p50:.2f}"),
         ("request to result, p99 s", f"{p99:.2f}"),

@@ -15,6 +15,9 @@ from calibgraph.service.state import Service
 
 _CLOSE_S = 5
 """Connections that are open when the server stops are closed after this."""
+_IDLE_S = 75
+"""Connections are kept for so long: a client that uses one as it is closed gets no answer."""
+_BACKLOG = 4096
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,8 @@ def serve(app: FastAPI, address: Address) -> None:
         access_log=False,
         log_level="info",
         timeout_graceful_shutdown=_CLOSE_S,
+        timeout_keep_alive=_IDLE_S,
+        backlog=_BACKLOG,
     )
     server = _Server(config, service)
     try:

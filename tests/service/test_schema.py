@@ -22,9 +22,8 @@ HOOKS = """
 import schemathesis
 
 @schemathesis.serializer("application/vnd.apache.arrow.stream", "application/x-ndjson")
-class Bytes:
-    def as_requests(self, context, value):
-        return {"data": value if isinstance(value, bytes) else str(value).encode()}
+def as_bytes(context, value):
+    return value if isinstance(value, bytes) else str(value).encode()
 """
 
 
