@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
 from starlette.concurrency import run_in_threadpool
 
-from calibgraph.files import checked_model, yaml_text
+from calibgraph.files import checked_model
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
 from calibgraph.service.answers import utc
@@ -24,6 +24,7 @@ from calibgraph.service.submission import parse_json
 from calibgraph.service.tracker_request import ARROW, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.service.uploads import read_whole
+from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")
 

@@ -6,6 +6,7 @@ import logging
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -78,6 +79,7 @@ class Runner:
         self._table, self._folder, self._settings = table, folder, settings
         self._roots, self._metrics, self._ring = roots, metrics, ring
         self._steps: dict[str, Step] = {}
+        self._deaths: Counter[str] = Counter()
         self._slots = [_Slot() for _ in range(settings.jobs_at_once)]
         self._threads: list[threading.Thread] = []
         self._wake, self._taking = threading.Condition(), threading.Lock()
@@ -196,6 +198,8 @@ class Runner:
         with self._taking:
             slot.job = None
         self._steps.pop(record.id, None)
+        if outcome is not None:
+            self._deaths.pop(record.id, None)
         state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
         self._metrics.jobs.labels(record.kind, state).inc()
         self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
@@ -221,7 +225,8 @@ class Runner:
             if self._is_stopping:
                 return None
             log.warning("job %s: %s", record.id, error)
-            if record.starts >= _MOST_DEATHS or "no process" in str(error):
+            self._deaths[record.id] += 1  # those of the server are not the job's fault
+            if self._deaths[record.id] >= _MOST_DEATHS or "no process" in str(error):
                 return JobOutcome(error_kind="worker died", error=str(error))
             return None
 
@@ -281,7 +286,7 @@ class Runner:
 
 
 _MOST_DEATHS = min(5, MOST_STARTS)
-"""Starts of a job after which the death of its process is its own fault."""
+"""Deaths of a job's process, while one server runs, after which they are its own fault."""
 
 
 def remove_folder(folder: Path) -> None:

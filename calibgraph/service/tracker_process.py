@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from calibgraph.child_process import Note, answer_requests, memory_limit
 from calibgraph.errors import CalibrationError, CorrespondenceError
-from calibgraph.files import checked_model, parse_yaml, write_text
+from calibgraph.files import checked_model, write_text
 from calibgraph.service.tracker_request import ARROW, Refusal, TrackerRequest
+from calibgraph.yaml_text import parse_yaml
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
