@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -93,13 +94,15 @@ def contained(
         *(word for option in options.items() for word in option),
     ]  # fmt: skip
     with log.open("wb") as file:
-        process = subprocess.Popen(command, env=environment(data), stdout=file, stderr=file)
+        process = subprocess.Popen(
+            command, env=environment(data), stdout=file, stderr=file, start_new_session=True
+        )
     with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=120) as client:
         try:
             wait_until_ready(client, log)
             yield client, log
         finally:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)  # a change of user ends --kill-child
             process.wait()
 
 
