@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
-from scipy.stats import chi
+from scipy.special import expit, gammaincc
 
 from calibgraph.model.verdict import Check, Doubt, Verdict
 
@@ -106,7 +105,8 @@ def _beyond(covariance: Array, radius: float) -> float:
     """P(|x| > radius) of x with (3, 3) covariance: over directions, of the chi distribution."""
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 1e-24))  # zero, or below by rounding
-    return float(np.mean(chi.sf(radius / np.linalg.norm(_directions() @ root.T, axis=1), 3)))
+    squared = radius**2 / np.sum((_directions() @ root.T) ** 2, axis=1)
+    return float(np.mean(gammaincc(1.5, squared / 2)))  # of chi-squared, three degrees of freedom
 
 
 @cache
