@@ -21,7 +21,7 @@ from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
-from calibgraph.io.nuscenes import describe_motion, is_nuscenes
+from calibgraph.io.published import published_format
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.rig import Rig
 
@@ -92,7 +92,7 @@ def load_dataset(
     frames: str | None = None,
     bag: BagOptions | None = None,
 ) -> Dataset:
-    """Find the frames of a dataset folder, a KITTI sequence, nuScenes, a bag, or several of a rig.
+    """Find the frames of a dataset, a published data set, a bag, or several of one rig.
 
     Args:
         folders: one or several; several form one calibration problem.
@@ -137,8 +137,9 @@ def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> D
             frames_of_folder(path, list(data.rig.cameras), complete=complete)
         )
     )
-    if is_nuscenes(path) and (motion := describe_motion(path)):
-        data = replace(data, notes=(*data.notes, motion))
+    published = published_format(path)
+    if published is not None and (note := published.describe(path)):
+        data = replace(data, notes=(*data.notes, note))
     return _with(data, found, found)
 
 
@@ -202,12 +203,12 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
     for path in paths:
-        if is_bag(path) or is_nuscenes(path) or folder_layout(path).clouds.is_dir():
+        if is_bag(path) or published_format(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():
             raise FileError(
                 path,
-                "no such folder or ROS bag; expected a dataset, KITTI sequence, nuScenes or bag",
+                "no such folder or ROS bag; expected a dataset, KITTI, nuScenes, Argoverse or bag",
             )
         for recorded in (*path.glob("*.mcap"), *path.glob("*.db3")):
             raise FileError(

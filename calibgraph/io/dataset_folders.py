@@ -1,7 +1,4 @@
-"""Dataset folders: the cloud and the images of every frame, by the format of the folder.
-
-A further format of folders adds a :class:`FolderLayout` to :func:`folder_layout`.
-"""
+"""Dataset folders: the cloud and the images of every frame, by the format of the folder."""
 
 from __future__ import annotations
 
@@ -10,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.files import is_utf8
 from calibgraph.io import kitti
 from calibgraph.io.clouds import CLOUD_SUFFIXES
+from calibgraph.io.frame_files import FrameFiles, files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.kitti_raw import is_kitti_raw, kitti_raw_folders
-from calibgraph.io.nuscenes import is_nuscenes, nuscenes_frames
+from calibgraph.io.published import published_format
+from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 
 @dataclass(frozen=True)
@@ -24,35 +21,29 @@ class FolderLayout:
 
     Attributes:
         clouds: the folder of the clouds.
-        images: per camera, the folder of its images.
+        images: per camera, the folder of its images, or its video.
     """
 
     clouds: Path
     images: Mapping[str, Path]
 
 
-@dataclass(frozen=True)
-class FrameFiles:
-    """The files of one frame.
-
-    Attributes:
-        stem: their common stem.
-        cloud: the cloud's file.
-        images: per camera that has one, the image's file.
-    """
-
-    stem: str
-    cloud: Path
-    images: dict[str, Path]
-
-
 def folder_layout(folder: Path) -> FolderLayout:
-    """The layout of a KITTI odometry sequence or raw drive, or of a dataset folder."""
+    """The layout of a KITTI odometry sequence, or of a dataset folder.
+
+    Raises:
+        FileError: if a camera has a folder of images and a video, or two videos.
+    """
     if (folder / kitti.CALIBRATION_NAME).is_file():
         return FolderLayout(folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder))
-    if is_kitti_raw(folder):
-        return FolderLayout(*kitti_raw_folders(folder))
-    cameras = {path.name: path for path in sorted((folder / "cameras").glob("*/"))}
+    cameras: dict[str, Path] = {}
+    for path in sorted((folder / "cameras").glob("*")):
+        is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+        name = path.stem if is_video else path.name
+        if (is_video or path.is_dir()) and name in cameras:
+            raise FileError(path, f"and {cameras[name].name} are the same camera; keep one")
+        if is_video or path.is_dir():
+            cameras[name] = path
     return FolderLayout(folder / "lidar", cameras)
 
 
@@ -62,18 +53,23 @@ def frames_of_folder(
     """The frames of a folder, one per cloud, sorted by stem.
 
     Args:
-        folder: a dataset folder, a KITTI odometry sequence, or a nuScenes folder or scene.
+        folder: a dataset folder, a KITTI odometry sequence, or one of a published data set.
         cameras: the rig's.
         complete: whether every cloud must have an image of every camera, and every image a cloud.
 
     Raises:
         FileError, DatasetError: if a folder is missing or empty, or frames do not pair up.
     """
-    if is_nuscenes(folder):
-        return _frames_of_nuscenes(folder, cameras, complete=complete)
+    published = published_format(folder)
+    if published is not None:
+        frames = published.frames(folder, cameras)
+        for name in cameras if complete else ():
+            stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
+            _require_pairs(folder, name, *stems)
+        return frames
     layout = folder_layout(folder)
-    clouds = _files(layout.clouds, CLOUD_SUFFIXES)
-    images = {name: _files(_image_folder(folder, layout, name), IMAGE_SUFFIXES) for name in cameras}
+    clouds = files_by_stem(layout.clouds, CLOUD_SUFFIXES)
+    images = {name: _images(_image_folder(folder, layout, name), list(clouds)) for name in cameras}
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
     return [
@@ -82,18 +78,11 @@ def frames_of_folder(
     ]
 
 
-def _frames_of_nuscenes(
-    folder: Path, cameras: Sequence[str], *, complete: bool
-) -> list[FrameFiles]:
-    """The samples; complete ones have an image of every camera."""
-    found = [
-        FrameFiles(stem, cloud, {name: images[name] for name in cameras if name in images})
-        for stem, cloud, images in nuscenes_frames(folder)
-    ]
-    for name in cameras if complete else ():
-        stems = ({f.stem for f in found}, {f.stem for f in found if name in f.images})
-        _require_pairs(folder, name, *stems)
-    return found
+def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:
+    """The images of a camera by stem: of a folder, or those of a video that belong to clouds."""
+    if source.is_file():
+        return pictures_of_video(source, clouds)
+    return files_by_stem(source, IMAGE_SUFFIXES)
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
@@ -110,27 +99,6 @@ def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
             "in rig.yaml the same name, or remove the camera from rig.yaml",
         )
     return layout.images[camera]
-
-
-def _files(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """Files of a folder with one of the suffixes, by stem, in order."""
-    kinds = ", ".join(suffixes)
-    if not folder.is_dir():
-        beside = ", ".join(sorted(path.name for path in folder.parent.glob("*/"))) or "none"
-        raise FileError(
-            folder, f"no such folder; put the files ({kinds}) there, found are the folders {beside}"
-        )
-    files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in suffixes and not path.name.startswith("."):
-            if path.stem in files:
-                raise FileError(path, f"and {files[path.stem].name} are the same frame; keep one")
-            if not is_utf8(path.name):
-                raise FileError(path, "its name is not UTF-8; rename it")
-            files[path.stem] = path
-    if not files:
-        raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
-    return files
 
 
 def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]) -> None:

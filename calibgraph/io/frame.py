@@ -17,6 +17,7 @@ from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.images import load_image
 from calibgraph.io.motion import ScanMotion
+from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.rig import Camera
 
 _MOTION = "motion"
@@ -31,7 +32,7 @@ class Frame:
         index: number of the frame in its dataset, the ``frame`` of its correspondences.
         name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
         cloud_path: the cloud's file, or its address in a bag.
-        image_paths: the same of the image, per camera that has one.
+        image_paths: the image's file or address in a bag or video, per camera that has one.
     """
 
     index: int
@@ -111,5 +112,7 @@ def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
 
 
 def hash_source(path: Path) -> str:
-    """SHA-256 of an image's or a cloud's file, or of its message in a bag."""
+    """SHA-256 of a file, of a message in a bag, or of the pixels of a picture in a video."""
+    if path.suffix == PICTURE_SUFFIX:
+        return hash_picture(path)
     return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)

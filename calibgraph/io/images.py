@@ -1,4 +1,4 @@
-"""Images: PNG, JPEG and messages of bags, complete and of the size that the rig gives."""
+"""Images: PNG, JPEG, messages of bags and pictures of videos, complete and of the rig's size."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from PIL.PngImagePlugin import PngImageFile
 from calibgraph.errors import FileError
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_image
 from calibgraph.io.encoded_images import decode_image, is_png
+from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
 from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -28,7 +29,7 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """Decode an image, after its header's size was checked against the rig's.
 
     Args:
-        path: a file, or the address of a message in a bag.
+        path: a file, or the address of a message in a bag or of a picture in a video.
         camera: the camera that took it.
 
     Returns:
@@ -38,8 +39,8 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
         FileError, DatasetError: if it is missing, damaged, marked as turned, or not of the size
             that the rig gives.
     """
-    if path.suffix == MESSAGE_SUFFIX:
-        image = load_bag_image(path)
+    if path.suffix in (MESSAGE_SUFFIX, PICTURE_SUFFIX):
+        image = load_bag_image(path) if path.suffix == MESSAGE_SUFFIX else load_picture(path)
         _require_size(path, (image.shape[1], image.shape[0]), camera)
         return image
     data, header = _read(path)

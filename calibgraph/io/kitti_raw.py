@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
+from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.kitti import camera_of_projection, first_image_size
 from calibgraph.model.rig import Camera, Rig
 
@@ -28,6 +31,24 @@ def kitti_raw_folders(drive: Path) -> tuple[Path, dict[str, Path]]:
     """The folder of the clouds, and those of the images by camera (image_00 .. image_03)."""
     images = {each.name: each / "data" for each in sorted(drive.glob("image_0[0-3]"))}
     return drive / _CLOUDS / "data", images
+
+
+def kitti_raw_frames(drive: Path, cameras: Sequence[str]) -> list[FrameFiles]:
+    """The frames of a drive, in order.
+
+    Raises:
+        FileError: if a folder is missing or empty.
+    """
+    scans, folders = kitti_raw_folders(drive)
+    clouds = files_by_stem(scans, (".bin",))
+    images = {
+        name: files_by_stem(folders.get(name, drive / name / "data"), IMAGE_SUFFIXES)
+        for name in cameras
+    }
+    return [
+        FrameFiles(stem, cloud, {n: images[n][stem] for n in cameras if stem in images[n]})
+        for stem, cloud in clouds.items()
+    ]
 
 
 def load_kitti_raw_rig(drive: Path) -> Rig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
+from calibgraph.io.frame_files import FrameFiles
 from calibgraph.io.nuscenes_tables import (
     LIDAR,
     Instant,
@@ -87,8 +89,8 @@ def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> Non
             )
 
 
-def nuscenes_frames(path: Path) -> list[tuple[str, Path, dict[str, Path]]]:
-    """The stem (the stamp), the scan and the images by camera of every sample, in order of time.
+def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
+    """The samples, in order of time; their stems are their stamps.
 
     Raises:
         FileError: if a table is malformed, or there is no scan.
@@ -96,14 +98,10 @@ def nuscenes_frames(path: Path) -> list[tuple[str, Path, dict[str, Path]]]:
     tables = read_tables(path)
     root = tables.folder.parent
     frames = [
-        (
+        FrameFiles(
             str(each.stamp_us),
             root / each.taken[LIDAR].filename,
-            {
-                name: root / each.taken[name].filename
-                for name in tables.cameras
-                if name in each.taken
-            },
+            {name: root / each.taken[name].filename for name in cameras if name in each.taken},
         )
         for each in tables.instants
         if LIDAR in each.taken

@@ -1,4 +1,4 @@
-"""Rigs from disk: rig files, results, dataset folders, KITTI, nuScenes, ROS bags."""
+"""Rigs from disk: rig files, results, dataset folders, published data sets, ROS bags."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import rig_of_bag
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
-from calibgraph.io.kitti_raw import is_kitti_raw, load_kitti_raw_rig
-from calibgraph.io.nuscenes import is_nuscenes, load_nuscenes_rig
+from calibgraph.io.published import published_format
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Rig
 
@@ -19,10 +18,10 @@ RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 
 
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
-    """Read a rig from a rig file, a result, a dataset, a KITTI sequence, nuScenes or a bag.
+    """Read a rig from a rig file, a result, a dataset, a published data set or a bag.
 
-    A result gives the calibrated extrinsics, KITTI those of its own calibration, a
-    nuScenes folder those of its calibrated_sensor, a bag those of its /tf_static.
+    A result gives the calibrated extrinsics, KITTI, nuScenes and Argoverse those of their own
+    calibration, a bag those of its /tf_static.
 
     Args:
         path: a file or folder.
@@ -34,10 +33,9 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     path = rig_file(path)
     if is_bag(path):
         return rig_of_bag(path, bag)
-    if is_nuscenes(path):
-        return load_nuscenes_rig(path)
-    if is_kitti_raw(path):
-        return load_kitti_raw_rig(path)
+    published = published_format(path)
+    if published is not None:
+        return published.load_rig(path)
     if path.name == CALIBRATION_NAME:
         return load_kitti_rig(path.parent)
     content = read_yaml(path)
@@ -55,12 +53,12 @@ def rig_file(path: Path | str) -> Path:
         FileError: if there is no such path, or a folder holds none.
     """
     found = find_rig_file(path)
-    if found is None or not (found.exists() or is_nuscenes(found)):
+    if found is None or not (found.exists() or published_format(found)):
         what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
         raise FileError(
             path,
             f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
-            "dataset folder with a rig.yaml, a KITTI odometry sequence, nuScenes, or a ROS bag",
+            "dataset folder with a rig.yaml, one of KITTI, nuScenes or Argoverse 2, or a ROS bag",
         )
     return found
 
@@ -68,7 +66,7 @@ def rig_file(path: Path | str) -> Path:
 def find_rig_file(path: Path | str) -> Path | None:
     """The path itself, or the rig file of a folder of files; None if it holds none."""
     folder = Path(path)
-    if not folder.is_dir() or is_bag(folder) or is_nuscenes(folder) or is_kitti_raw(folder):
+    if not folder.is_dir() or is_bag(folder) or published_format(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it

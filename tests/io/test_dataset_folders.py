@@ -44,7 +44,7 @@ def test_missing_folders_are_named(sample: Path, tmp_path: Path) -> None:
 
 def test_an_empty_folder_is_told_what_it_lacks(sample: Path) -> None:
     for path in (sample / "lidar").iterdir():
-        path.rename(path.with_suffix(".las"))
+        path.rename(path.with_suffix(".xyz"))
     with pytest.raises(FileError, match=r"no file of a known kind; write or convert to \.npy"):
         load_dataset(sample)
 

@@ -1,0 +1,50 @@
+"""The files of frames: one cloud, and the images taken with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibgraph.errors import FileError
+from calibgraph.files import is_utf8
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of one frame.
+
+    Attributes:
+        stem: their common stem, or the stamp of the cloud.
+        cloud: the cloud's file.
+        images: per camera that has one, the image's file.
+    """
+
+    stem: str
+    cloud: Path
+    images: dict[str, Path]
+
+
+def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """Files of a folder with one of the suffixes, by stem, in order.
+
+    Raises:
+        FileError: if there is no such folder or file, or two have the same stem.
+    """
+    kinds = ", ".join(suffixes)
+    if not folder.is_dir():
+        beside = ", ".join(sorted(path.name for path in folder.parent.glob("*/"))) or "none"
+        raise FileError(
+            folder, f"no such folder; put the files ({kinds}) there, found are the folders {beside}"
+        )
+    files: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in suffixes and not path.name.startswith("."):
+            if path.stem in files:
+                raise FileError(path, f"and {files[path.stem].name} are the same frame; keep one")
+            if not is_utf8(path.name):
+                raise FileError(path, "its name is not UTF-8; rename it")
+            files[path.stem] = path
+    if not files:
+        raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
+    return files

@@ -1,0 +1,129 @@
+"""KITTI object folders: ``training`` with ``velodyne``, ``image_2`` and a ``calib`` file per frame.
+
+Its frames are of several drives, on days of different calibrations: those of one form a rig.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.files import read_text
+from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.images import IMAGE_SUFFIXES, image_size
+from calibgraph.io.kitti import CALIBRATION_NAME, CLOUD_FOLDER, camera_folders, camera_of_projection
+from calibgraph.model.rig import Camera, Rig
+
+Array = NDArray[np.float64]
+
+_CALIBRATIONS = "calib"
+_ROWS = {"P": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+
+
+def is_kitti_object(folder: Path) -> bool:
+    """Whether a folder is the training or testing part of the object data set."""
+    has_all = (folder / _CALIBRATIONS).is_dir() and (folder / CLOUD_FOLDER).is_dir()
+    return has_all and not (folder / CALIBRATION_NAME).exists()
+
+
+def load_kitti_object_rig(folder: Path) -> Rig:
+    """The rig of the calibration that most frames have.
+
+    Camera k projects by P_k R0_rect Tr_velo_to_cam, so T_camera_lidar is
+    translate(K^-1 P_k[:, 3]) R0_rect Tr_velo_to_cam.
+
+    Raises:
+        FileError: if a file is missing or malformed.
+    """
+    stem = _stems(folder)[0]
+    path = folder / _CALIBRATIONS / f"{stem}.txt"
+    lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
+    T, rectify = np.eye(4), np.eye(4)
+    T[:3] = _matrix(path, lines, "Tr_velo_to_cam")
+    rectify[:3, :3] = _matrix(path, lines, "R0_rect")
+    folders = camera_folders(folder)
+    if not folders:
+        raise FileError(folder, "has no image folder (image_0 .. image_3)")
+    cameras = {
+        name: _camera(path, lines, _image(images, stem), rectify @ T)
+        for name, images in folders.items()
+    }
+    return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
+
+
+def kitti_object_frames(folder: Path, cameras: Sequence[str]) -> list[FrameFiles]:
+    """The frames of the calibration that most have, in order.
+
+    Raises:
+        FileError: if a file is missing.
+    """
+    clouds = files_by_stem(folder / CLOUD_FOLDER, (".bin",))
+    folders = camera_folders(folder)
+    images = {
+        name: files_by_stem(folders.get(name, folder / name), IMAGE_SUFFIXES) for name in cameras
+    }
+    return [
+        FrameFiles(stem, clouds[stem], {n: images[n][stem] for n in cameras if stem in images[n]})
+        for stem in _stems(folder)
+    ]
+
+
+def describe_calibrations(folder: Path) -> str:
+    """How many frames are left out as of another calibration, in a line; empty if none is."""
+    kept, others = len(_stems(folder)), len(list((folder / CLOUD_FOLDER).glob("*.bin")))
+    if kept == others:
+        return ""
+    return (
+        f"{folder}: its {others} frames have several calibrations; taken are the {kept} of the "
+        "commonest, the others need folders of their own"
+    )
+
+
+def _stems(folder: Path) -> tuple[str, ...]:
+    """Of the frames of the commonest calibration."""
+    changed = ((folder / name).stat().st_mtime_ns for name in (_CALIBRATIONS, CLOUD_FOLDER))
+    return _read_stems(folder, *changed)
+
+
+@lru_cache(4)
+def _read_stems(folder: Path, *_changed_ns: int) -> tuple[str, ...]:
+    texts = {
+        stem: read_text(_calibration(folder, stem))
+        for stem in files_by_stem(folder / CLOUD_FOLDER, (".bin",))
+    }
+    commonest = Counter(texts.values()).most_common(1)[0][0]
+    return tuple(stem for stem, text in texts.items() if text == commonest)
+
+
+def _calibration(folder: Path, stem: str) -> Path:
+    path = folder / _CALIBRATIONS / f"{stem}.txt"
+    if not path.is_file():
+        raise FileError(path, f"no such file; the cloud {stem} needs its calibration")
+    return path
+
+
+def _image(folder: Path, stem: str) -> Path:
+    found = [folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES]
+    return next((path for path in found if path.is_file()), found[0])
+
+
+def _camera(path: Path, lines: dict[str, str], image: Path, T_rectified_lidar: Array) -> Camera:
+    name = f"P{image.parent.name[-1]}"
+    P = _matrix(path, lines, name)
+    return camera_of_projection(P, T_rectified_lidar, image_size(image), f"{path}: {name}")
+
+
+def _matrix(path: Path, lines: dict[str, str], name: str) -> Array:
+    shape = _ROWS[name.rstrip("0123") if name.startswith("P") else name]
+    try:
+        return np.array(lines[name].split(), dtype=np.float64).reshape(shape)
+    except KeyError:
+        raise FileError(path, f"line {name!r} is missing") from None
+    except ValueError as error:
+        raise FileError(path, f"line {name!r}: expected {np.prod(shape)} numbers") from error

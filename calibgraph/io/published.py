@@ -1,0 +1,52 @@
+"""Folders of published data sets that hold their own rig; each format is one entry here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibgraph.io import argoverse, kitti_object, kitti_raw, nuscenes
+from calibgraph.io.frame_files import FrameFiles
+from calibgraph.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class PublishedFormat:
+    """How a data set is read.
+
+    Attributes:
+        is_one: whether a path is a folder of it.
+        load_rig: its rig, of its own calibration.
+        frames: of a folder and of the rig's cameras, in order; some may lack images.
+        describe: what is worth a line in the log, empty if nothing is.
+    """
+
+    is_one: Callable[[Path], bool]
+    load_rig: Callable[[Path], Rig]
+    frames: Callable[[Path, Sequence[str]], list[FrameFiles]]
+    describe: Callable[[Path], str] = lambda _: ""
+
+
+_FORMATS = (
+    PublishedFormat(
+        nuscenes.is_nuscenes, nuscenes.load_nuscenes_rig, nuscenes.nuscenes_frames,
+        nuscenes.describe_motion,
+    ),
+    PublishedFormat(
+        kitti_raw.is_kitti_raw, kitti_raw.load_kitti_raw_rig, kitti_raw.kitti_raw_frames
+    ),
+    PublishedFormat(
+        kitti_object.is_kitti_object, kitti_object.load_kitti_object_rig,
+        kitti_object.kitti_object_frames, kitti_object.describe_calibrations,
+    ),
+    PublishedFormat(
+        argoverse.is_argoverse, argoverse.load_argoverse_rig, argoverse.argoverse_frames,
+        argoverse.describe_motion,
+    ),
+)  # fmt: skip
+
+
+def published_format(path: Path | str) -> PublishedFormat | None:
+    """The format of a folder of a published data set, or of its scene; None of others."""
+    return next((each for each in _FORMATS if each.is_one(Path(path))), None)
