@@ -16,7 +16,7 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
 from calibgraph.solver.whitening import (
     IDENTITY,
@@ -287,13 +287,16 @@ def merge(parts: Sequence[CameraBlock]) -> CameraBlock:
 
 def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str, CameraBlock]:
     """The preprocessed correspondences of every camera that has enough to be solved from."""
-    blocks = {}
-    for name, camera in rig.cameras.items():
-        rows = table.of_camera(name)
-        if len(rows) >= MIN_MATCHES:
-            root = sqrt_information(rows, config)
-            block = ProjectionBlock(
-                camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss
-            )
-            blocks[name] = CameraBlock(block, rows.information_px, rows.frame)
-    return blocks
+    rows = {name: table.of_camera(name) for name in rig.cameras}
+    return {
+        name: camera_block(camera, rows[name], config)
+        for name, camera in rig.cameras.items()
+        if len(rows[name]) >= MIN_MATCHES
+    }
+
+
+def camera_block(camera: Camera, rows: Correspondences, config: Config) -> CameraBlock:
+    """The preprocessed correspondences of one camera."""
+    root = sqrt_information(rows, config)
+    block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss)
+    return CameraBlock(block, rows.information_px, rows.frame)

@@ -13,7 +13,7 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.verdict import Check
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_block import CameraBlock, camera_block
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
@@ -116,7 +116,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         camera: one that has correspondences.
     """
     row = threshold("competing_solution")
-    block, gate_px = solution.objective.blocks[camera], solution.scales[camera].gate_px
+    block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.select(~ours).as_table(camera=camera)
     T = None
@@ -134,6 +134,14 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     share = 0.0 if same else only_theirs / max(only_ours, 1)
     advice = f"the other is {degrees:.2g} deg, {centimetres:.2g} cm away; which one is right?"
     return row.check(share, advice=advice)
+
+
+def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
+    """A camera's matches, also those of the frames that are left out: they may agree elsewhere."""
+    if not solution.counts[camera]["outlier_frames"]:
+        return solution.objective.blocks[camera]
+    rows = solution.correspondences.of_camera(camera)
+    return camera_block(solution.rig.cameras[camera], rows, solution.config)
 
 
 def _ransac_iterations(fewest: float, matches: int) -> int:

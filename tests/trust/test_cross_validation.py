@@ -50,3 +50,17 @@ def test_a_camera_with_all_matches_behind_it_is_one_line(pair: Rig) -> None:
     backwards = {name: np.diag([-1.0, 1, -1, 1]) @ T for name, T in solved.T_camera_lidar.items()}
     with pytest.raises(calibgraph.CorrespondenceError, match="'left': all its .* are behind"):
         solved.objective.scales_at(backwards)
+
+
+def test_frames_that_are_left_out_alike_are_a_competing_solution(pair: Rig) -> None:
+    """Six of ten frames of a camera are displaced alike; the weights leave the other four out."""
+    wrong = calibgraph.perturb(pair, rotation_deg=1, translation_m=0.5, seed=2)
+    one, two = simulated(pair, frames=10), simulated(wrong, frames=10)
+    left = [each.of_camera("left") for each in (one, two)]
+    displaced = left[1].select(left[1].frame < 6)
+    table = concatenate([one.of_camera("right"), left[0].select(left[0].frame >= 6), displaced])
+    result = solve(pair, table)
+    (check,) = named(result, "left", "competing solution")
+    assert check.status == "FAIL"
+    assert result.camera_verdicts["left"].status == "FAIL"
+    assert result.camera_verdicts["right"].status != "FAIL"
