@@ -6,7 +6,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist l
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install run test test-ci test-slow lint type docs bench clean
+.PHONY: help install run test test-ci test-slow lint type docs web bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -51,6 +51,9 @@ $(VENV)/docs: $(VENV)/test
 docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+web: ## Build the page of `calibgraph pick` (needs node and a network; its bundle is committed)
+	cd web/pick && npm ci && npm run check && npm run build
+
 bench: $(VENV)/test ## Measure a calibration, and the solve, updates and network against other ways
 	$(BIN)/python -m benchmarks.speed.stages data/sample
 	$(BIN)/python -m benchmarks.speed.kernel
@@ -60,5 +63,5 @@ bench: $(VENV)/test ## Measure a calibration, and the solve, updates and network
 	$(BIN)/python -m benchmarks.speed.cmrnext
 
 clean: ## Remove everything that was made
-	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) out build web/pick/node_modules *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -28,6 +28,7 @@ from calibgraph.cli.fleet_report import fleet_model, fleet_report
 from calibgraph.cli.guess import guess
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
+from calibgraph.cli.pick import pick
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
@@ -102,6 +103,7 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     train: outputs.training,
     tune: outputs.settings,
     track: outputs.result,
+    pick: outputs.picked,
     fleet: outputs.nothing,
     fleet_model: outputs.fleet_model,
     fleet_report: outputs.fleet_page,

@@ -48,11 +48,16 @@ def evaluate(
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Rig to compare with.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare an estimate with a reference: the paper's metrics, per camera and per pair."""
+    """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
+
+    Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
+    """
+    from calibgraph.io.calibrations import error_bars
     from calibgraph.io.rigs import load_rig, rig_file
     from calibgraph.model.metrics import evaluate
 
-    errors = evaluate(load_rig(estimate), load_rig(reference))
+    path = rig_file(estimate)
+    errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
     if as_json:
         from calibgraph.report.as_json import print_json
 
@@ -60,7 +65,7 @@ def evaluate(
     else:
         from calibgraph.cli.tables import print_evaluation
 
-        print_evaluation(terminal(), errors, rig_file(estimate), rig_file(reference))
+        print_evaluation(terminal(), errors, path, rig_file(reference))
 
 
 def perturb(

@@ -126,6 +126,13 @@ def training(given: Given) -> list[Output]:
     return [] if given["resume"] else [_marked_yaml(path, "train")]
 
 
+def picked(given: Given) -> list[Output]:
+    """The session of picking and what it gives, in the folder of ``--out``."""
+    from calibgraph.service.pick.reference import outputs_of_pick
+
+    return outputs_of_pick(given["out"])
+
+
 def benchmark(given: Given) -> list[Output]:
     """The tables and the plot of the paper's experiment."""
     from calibgraph.evaluation.output import outputs_of_report

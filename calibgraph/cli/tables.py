@@ -152,8 +152,14 @@ def add_number_columns(table: Table, *headings: str) -> None:
 def print_evaluation(console: Console, errors: Evaluation, estimate: Path, reference: Path) -> None:
     """Print the errors, and the two files that were compared."""
     console.print(evaluation_table(errors))
+    if errors.deviations:
+        console.print(deviation_table(errors))
     for what, path in (("estimate", estimate), ("reference", reference)):
         print_plain(console, f"{what}: {path}")
+    if errors.deviations:
+        print_plain(
+            console, "of: whose error bars count; p: how likely so large a difference is by chance"
+        )
     if errors.pairs:
         print_plain(console, "A->B: of the transform from A to B, in the axes of B")
 
@@ -172,6 +178,18 @@ def evaluation_table(errors: Evaluation) -> Table:
         table.add_section()
     for name, error in errors.pairs.items():
         table.add_row(escape(name), *_cells(error))
+    return table
+
+
+def deviation_table(errors: Evaluation) -> Table:
+    """One row per camera whose reference has error bars."""
+    table = empty_table("The same in standard deviations", "camera")
+    add_number_columns(
+        table, "pitch x", "yaw y", "roll z", "x right", "y down", "z ahead", "p of\nall six", "of"
+    )
+    for name, found in errors.deviations.items():
+        cells = [f"{value:+.1f}" for value in (*found.rotation, *found.translation)]
+        table.add_row(escape(name), *cells, f"{found.p:.2g}", found.of)
     return table
 
 

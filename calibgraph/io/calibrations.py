@@ -22,6 +22,7 @@ from calibgraph.model.result_files import (
     CALIBRATION_FORMAT,
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
+    is_calibration_file,
 )
 from calibgraph.model.rig import Finite, Rig
 from calibgraph.model.verdict import Check, Doubt, Verdict
@@ -184,6 +185,31 @@ def _table(
 def is_calibration(content: Mapping[str, Any]) -> bool:
     """Whether the content of a YAML file is a result."""
     return content.get("format") == CALIBRATION_FORMAT
+
+
+class _ErrorBars(BaseModel):
+    """The keys of a result's file that hold its error bars."""
+
+    covariance: dict[str, Matrix6 | None] = {}
+    error_bar_holds: dict[str, bool] = {}
+
+
+def error_bars(path: Path) -> dict[str, Array | None] | None:
+    """Per camera of a result, its (6, 6) covariance; None for one that does not hold.
+
+    Returns:
+        None if the file is no result.
+
+    Raises:
+        FileError: if it is a malformed one.
+    """
+    if not is_calibration_file(path):
+        return None
+    found = checked_model(_ErrorBars, read_yaml(path), path)
+    return {
+        name: covariance if found.error_bar_holds.get(name) else None
+        for name, covariance in found.covariance.items()
+    }
 
 
 def rig_of_calibration(content: Mapping[str, Any], path: Path) -> Rig:

@@ -223,7 +223,10 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
 def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
-        {name: camera.model_dump(exclude={"T_camera_lidar"}) for name, camera in r.cameras.items()}
+        {
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance"})
+            for name, camera in r.cameras.items()
+        }
         for r in (rig, other)
     ]
     if lenses[0] != lenses[1]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from calibgraph.errors import RigError
-from calibgraph.model.geometry import angle_deg, relative_transform
-from calibgraph.model.rig import Rig
+from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
+from calibgraph.model.rig import Camera, Rig
 
 Array = NDArray[np.float64]
 
@@ -41,26 +43,54 @@ class PoseError:
 
 
 @dataclass(frozen=True)
+class Deviation:
+    """A difference of two transforms over its standard deviation, of a reference with error bars.
+
+    Attributes:
+        rotation, translation: of xi in T_est = exp(xi) T_ref, about and along the camera's x, y, z.
+        p: probability of a difference as unlikely as this one if both error bars hold, chi-square
+            of six numbers.
+        of: whose error bars count.
+    """
+
+    rotation: tuple[float, float, float]
+    translation: tuple[float, float, float]
+    p: float
+    of: Literal["reference", "both"]
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Errors of all cameras, and of all pairs.
 
     The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
-    coordinates in B; its errors are along the axes of B.
+    coordinates in B; its errors are along the axes of B. ``deviations`` are of the cameras whose
+    reference has a covariance.
     """
 
     cameras: dict[str, PoseError]
     pairs: dict[str, PoseError]
+    deviations: dict[str, Deviation] = field(default_factory=dict)
 
     def to_mapping(self) -> dict[str, Any]:
         """As plain numbers, for JSON."""
         return {
             "cameras": {name: asdict(error) for name, error in self.cameras.items()},
             "pairs": {name: asdict(error) for name, error in self.pairs.items()},
+            "deviations": {name: asdict(found) for name, found in self.deviations.items()},
         }
 
 
-def evaluate(estimate: Rig, reference: Rig) -> Evaluation:
+def evaluate(
+    estimate: Rig, reference: Rig, covariance: Mapping[str, Array | None] | None = None
+) -> Evaluation:
     """Compare the extrinsics of two rigs.
+
+    Args:
+        estimate: to evaluate.
+        reference: its covariances, where it has any, give the deviations.
+        covariance: per camera of the estimate, (6, 6) of xi in T_camera_lidar = exp(xi) estimate;
+            that of the estimate's own rig if None.
 
     Raises:
         RigError: if a camera of the estimate is not in the reference.
@@ -80,7 +110,33 @@ def evaluate(estimate: Rig, reference: Rig) -> Evaluation:
         )
         for a, b in combinations(found, 2)
     }
-    return Evaluation(cameras, pairs)
+    if covariance is None:
+        covariance = {name: camera.covariance for name, camera in estimate.cameras.items()}
+    deviations = {
+        name: deviation(found[name], reference.cameras[name], covariance.get(name))
+        for name in found
+        if reference.cameras[name].covariance is not None
+    }
+    return Evaluation(cameras, pairs, deviations)
+
+
+def deviation(estimate: Array, reference: Camera, covariance: Array | None) -> Deviation:
+    """Difference of a (4, 4) transform from a reference, in standard deviations.
+
+    Args:
+        estimate: T_camera_lidar.
+        reference: with a covariance.
+        covariance: (6, 6) of the estimate, None if unknown.
+    """
+    xi = twist_between(estimate, reference.T_camera_lidar)
+    total = np.array(reference.covariance)
+    if covariance is not None:
+        total += covariance
+    z = (xi / np.sqrt(np.diag(total))).tolist()
+    p = float(chdtrc(len(xi), xi @ np.linalg.solve(total, xi)))
+    return Deviation(
+        (z[0], z[1], z[2]), (z[3], z[4], z[5]), p, "reference" if covariance is None else "both"
+    )
 
 
 def pose_error(estimate: Array, reference: Array) -> PoseError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +61,18 @@ def is_report(path: Path) -> bool:
         return PAGE_MARK in file.read(_HEAD_BYTES)
 
 
-def is_table_of_match(path: Path) -> bool:
-    """Whether a Parquet file was written by ``match``, and is not part of a result."""
-    metadata = _table_metadata(path) or {}
-    return metadata.get(WRITTEN_KEY) == MATCH and VERDICT_KEY not in metadata
+def written_by(command: str) -> Callable[[Path], bool]:
+    """Whether a Parquet file is a table that a command wrote, and not part of a result."""
+
+    def is_its_table(path: Path) -> bool:
+        metadata = _table_metadata(path) or {}
+        return metadata.get(WRITTEN_KEY) == command and VERDICT_KEY not in metadata
+
+    return is_its_table
+
+
+is_table_of_match = written_by(MATCH)
+"""Whether a Parquet file was written by ``match``, and is not part of a result."""
 
 
 def is_table_of_result(path: Path) -> bool:

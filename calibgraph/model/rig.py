@@ -20,6 +20,8 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
+    SerializerFunctionWrapHandler,
+    model_serializer,
     model_validator,
 )
 
@@ -76,6 +78,36 @@ Transform = Annotated[
     Array,
     BeforeValidator(rigid_transform),
     PlainSerializer(lambda T: T.tolist(), return_type=list),
+]
+
+
+def _pose_covariance(value: Any) -> Array:
+    """Check a (6, 6) covariance of a pose: symmetric, positive definite.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    try:
+        covariance = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError("expected a 6x6 matrix of numbers") from error
+    if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+        raise ValueError(f"expected a 6x6 matrix of finite numbers, found {covariance.shape}")
+    units = np.sqrt(np.abs(np.diag(covariance)))
+    if (np.diag(covariance) <= 0).any() or not np.allclose(
+        covariance / np.outer(units, units), covariance.T / np.outer(units, units)
+    ):
+        raise ValueError("the covariance is not symmetric with a positive diagonal")
+    if np.linalg.eigvalsh(covariance / np.outer(units, units))[0] <= 0:
+        raise ValueError("the covariance is not positive definite")
+    covariance.setflags(write=False)
+    return covariance
+
+
+PoseCovariance = Annotated[
+    Array,
+    BeforeValidator(_pose_covariance),
+    PlainSerializer(lambda covariance: covariance.tolist(), return_type=list),
 ]
 
 
@@ -143,7 +175,11 @@ class Intrinsics(_Model):
 
 
 class Camera(_Model):
-    """One camera: its lens, its image size, and its extrinsic: a guess, or the reference."""
+    """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
+
+    ``covariance`` is that of a reference with error bars: (6, 6) of xi = (rotation [rad],
+    translation [m]) in T_camera_lidar = exp(xi) T, in the camera's axes.
+    """
 
     model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
     width_px: Size
@@ -151,6 +187,14 @@ class Camera(_Model):
     intrinsics_px: Intrinsics
     distortion: tuple[Bounded, ...] = ()
     T_camera_lidar: Transform
+    covariance: PoseCovariance | None = None
+
+    @model_serializer(mode="wrap")
+    def _leave_out_no_covariance(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = dump(self)
+        if self.covariance is None:
+            fields.pop("covariance", None)
+        return fields
 
     @model_validator(mode="after")
     def _image_fits_into_memory(self) -> Self:
@@ -178,14 +222,14 @@ class Camera(_Model):
         return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
 
     def moved_to(self, T_camera_lidar: Array) -> Camera:
-        """The same camera with another (4, 4) T_camera_lidar."""
+        """The same camera with another (4, 4) T_camera_lidar, whose error is unknown."""
         T = rigid_transform(T_camera_lidar)
-        return self.model_copy(update={"T_camera_lidar": T})
+        return self.model_copy(update={"T_camera_lidar": T, "covariance": None})
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with some fields changed, not checked; the lens follows the intrinsics."""
         copy = super().model_copy(update=update, deep=deep)
-        if update and update.keys() - {"T_camera_lidar"}:
+        if update and update.keys() - {"T_camera_lidar", "covariance"}:
             copy.__dict__.pop("lens", None)
         return copy
 

@@ -1,0 +1,133 @@
+"""The joint solve of picked pairs over all cameras, with plain least squares.
+
+No loss and no gate: with a dozen pairs a robust loss hides a wrong one and makes the error bar
+depend on it. A wrong pair is found by what leaving it out changes, and removed by its picker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import pose_rows
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
+from calibgraph.solver.curvature import pose_hessian
+from calibgraph.solver.factor_graph import objective_graph, optimize
+from factors import ProjectionBlock, unit_diagonal
+
+Array = NDArray[np.float64]
+
+PSEUDO_RESIDUALS = 8.0
+"""Residuals of the stated sigma that are added to the measured ones: those of four pairs, so that
+the error bar rests on the statement while there are fewer than that, and on the residuals later."""
+
+_POSE = 6
+_FREE = 1e-9  # smallest eigenvalue of a unit-diagonal Hessian: below, a direction is free
+_SCALINGS = 3  # the scale only moves the solution where relative poses take part
+
+
+@dataclass(frozen=True, eq=False)
+class JointSolve:
+    """The extrinsics that fit all pairs best, and how well they are determined.
+
+    Attributes:
+        rig: of the cameras that are solved, at the solution.
+        covariance: (6 N, 6 N) of xi in T_camera_lidar = exp(xi) T, camera after camera; None if a
+            direction is free.
+        scale: measured over stated standard deviation of the pixels.
+        freedom: residuals less unknowns.
+    """
+
+    rig: Rig
+    covariance: Array | None
+    scale: float
+    freedom: int
+
+    def rows(self, camera: str) -> slice:
+        """The rows of a camera in the covariance."""
+        return pose_rows(list(self.rig.cameras).index(camera))
+
+    def covariance_of(self, camera: str) -> Array | None:
+        """(6, 6) of one camera."""
+        if self.covariance is None:
+            return None
+        rows = self.rows(camera)
+        block: Array = self.covariance[rows, rows]
+        return block
+
+
+def solve_pairs(rig: Rig, pairs: Mapping[str, Sequence[Pair]]) -> JointSolve:
+    """Solve all cameras of a rig jointly: the paper's Eq. 5 with its reprojection term alone.
+
+    Args:
+        rig: the cameras to solve, at the start; its measured relative poses take part.
+        pairs: per camera that has any.
+    """
+    freedom = 2 * sum(map(len, pairs.values())) + _POSE * (
+        len(rig.relative_poses) - len(rig.cameras)
+    )
+    scale = 1.0
+    for _ in range(_SCALINGS if rig.relative_poses else 1):
+        graph = _graph(rig, pairs, scale)
+        optimum = optimize(graph, list(rig.cameras), rig.T_camera_lidar)
+        rig = rig.moved_to(optimum.T_camera_lidar)
+        squares = sum(
+            float((whitened_residuals(rig.cameras[name], some) ** 2).sum())
+            for name, some in pairs.items()
+        )
+        scale = float(np.sqrt((PSEUDO_RESIDUALS + squares) / (PSEUDO_RESIDUALS + max(freedom, 0))))
+    hessian = pose_hessian(_graph(rig, pairs, scale), list(rig.cameras), rig.T_camera_lidar)
+    return JointSolve(rig, _inverse(hessian), scale, freedom)
+
+
+def _graph(
+    rig: Rig, pairs: Mapping[str, Sequence[Pair]], scale: float
+) -> gtsam.NonlinearFactorGraph:
+    blocks = {name: _block(rig.cameras[name], some, scale) for name, some in pairs.items()}
+    return objective_graph(rig, blocks, {}, Config(), "reprojection")
+
+
+def _block(camera: Camera, pairs: Sequence[Pair], scale: float) -> ProjectionBlock:
+    root = 1.0 / sigmas_of(pairs)
+    return ProjectionBlock(
+        camera.lens,
+        points_of(pairs),
+        pixels_of(pairs),
+        sqrt_information=np.column_stack([root, np.zeros_like(root), root]),
+        loss="l2",
+        sigma=scale,
+    )
+
+
+def _inverse(hessian: Array) -> Array | None:
+    """The inverse of a Hessian; None if a direction is free."""
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] < _FREE:
+        return None
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
+    return inverse
+
+
+def whitened_residuals(camera: Camera, pairs: Sequence[Pair]) -> Array:
+    """(n, 2) projection less pixel, over the stated sigma."""
+    T = camera.T_camera_lidar
+    projected, _ = camera.lens.project(points_of(pairs) @ T[:3, :3].T + T[:3, 3])
+    residuals: Array = (projected - pixels_of(pairs)) / sigmas_of(pairs)[:, None]
+    return residuals
+
+
+def pixel_jacobians(camera: Camera, points_lidar_m: Array) -> Array:
+    """(n, 2, 6) derivatives of pixels by xi in T_camera_lidar = exp(xi) T [px/rad, px/m]."""
+    T = camera.T_camera_lidar
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    _, by_point = camera.lens.project_with_jacobian(points)
+    # exp(xi) p = p + w x p + v: by w it is -[p]x, by v the identity.
+    by_rotation = np.cross(points[:, None, :], by_point)
+    return np.concatenate([by_rotation, by_point], axis=2)

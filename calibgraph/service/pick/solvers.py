@@ -1,0 +1,153 @@
+"""One camera's extrinsic from a few pairs by several PnP solvers, whose spread shows blunders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.rig import Camera
+from calibgraph.solver.pnp import normalized
+
+Array = NDArray[np.float64]
+
+MIN_PAIRS = 4
+"""Three pairs have up to four solutions; the fourth chooses."""
+MIN_PAIRS_LINEAR = 6
+"""From which OpenCV's iterative solver finds its own start."""
+
+_MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
+_INLIER_SIGMAS = 3.0
+_ITERATIONS = 2000  # of samples of 4: with half of the pairs wrong, all but 1e-56 of runs have one
+
+
+@dataclass(frozen=True, eq=False)
+class SolverPose:
+    """The extrinsic of one solver.
+
+    Attributes:
+        solver: its name.
+        T_camera_lidar: (4, 4).
+        median_px: median reprojection error of all pairs, with the lens.
+    """
+
+    solver: str
+    T_camera_lidar: Array
+    median_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    points_m: Array
+    pixels_px: Array  # of an ideal pinhole
+    matrix: Array
+    threshold_px: float
+
+
+Poses = list[tuple[NDArray[Any], NDArray[Any]]]  # rotation vectors and translations
+
+
+def poses_by_solver(
+    camera: Camera, points_lidar_m: Array, pixels_px: Array, sigmas_px: Array, *, flat: bool
+) -> list[SolverPose]:
+    """The extrinsics of all solvers that find one.
+
+    Args:
+        camera: its lens.
+        points_lidar_m: (n, 3).
+        pixels_px: (n, 2) as recorded.
+        sigmas_px: (n,), for the threshold of the robust solvers.
+        flat: whether the points lie in one plane, for which there is IPPE.
+
+    Returns:
+        Sorted by the median error; IPPE with both of its solutions. Empty under MIN_PAIRS.
+    """
+    plane = normalized(camera, pixels_px)
+    usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
+    if np.count_nonzero(usable) < MIN_PAIRS:
+        return []
+    focal = camera.intrinsics_px.fx
+    problem = _Problem(
+        np.ascontiguousarray(points_lidar_m[usable]),
+        np.ascontiguousarray(plane[usable] * focal),
+        np.diag([focal, focal, 1.0]),
+        _INLIER_SIGMAS * float(sigmas_px.max()),
+    )
+    solvers: dict[str, Callable[[_Problem], Poses]] = {
+        "SQPnP": lambda p: _all_solutions(p, cv2.SOLVEPNP_SQPNP)[:1],
+        "EPnP": lambda p: _all_solutions(p, cv2.SOLVEPNP_EPNP)[:1],
+        "P3P + RANSAC": _p3p_ransac,
+        "MAGSAC": _magsac,
+    }
+    if flat:
+        solvers["IPPE"] = lambda p: _all_solutions(p, cv2.SOLVEPNP_IPPE)
+    if np.count_nonzero(usable) >= MIN_PAIRS_LINEAR:
+        solvers["iterative"] = lambda p: _all_solutions(p, cv2.SOLVEPNP_ITERATIVE)[:1]
+    found = []
+    for name, solver in solvers.items():
+        for T in _transforms(solver, problem):
+            error = _median_error(camera, T, points_lidar_m, pixels_px)
+            found.append(SolverPose(name, T, error))
+    return sorted(found, key=lambda pose: pose.median_px)
+
+
+def _transforms(solver: Callable[[_Problem], Poses], problem: _Problem) -> list[Array]:
+    try:
+        poses = solver(problem)
+    except cv2.error:  # points in one place or on one line
+        return []
+    found = []
+    for rotation, translation in poses:
+        if np.isfinite(rotation).all() and np.isfinite(translation).all():
+            T = np.eye(4)
+            T[:3, :3] = cv2.Rodrigues(rotation)[0]
+            T[:3, 3] = translation.ravel()
+            found.append(T)
+    return found
+
+
+def _all_solutions(problem: _Problem, method: int) -> Poses:
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        problem.points_m, problem.pixels_px, problem.matrix, None, flags=method
+    )
+    return [(np.asarray(r), np.asarray(t)) for r, t in zip(rotations, translations, strict=True)]
+
+
+def _p3p_ransac(problem: _Problem) -> Poses:
+    cv2.setRNGSeed(0)
+    found, rotation, translation, _ = cv2.solvePnPRansac(
+        problem.points_m,
+        problem.pixels_px,
+        problem.matrix,
+        None,
+        iterationsCount=_ITERATIONS,
+        reprojectionError=problem.threshold_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    return [(np.asarray(rotation), np.asarray(translation))] if found else []
+
+
+def _magsac(problem: _Problem) -> Poses:
+    parameters = cv2.UsacParams()
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.threshold = problem.threshold_px
+    parameters.maxIterations = _ITERATIONS
+    parameters.confidence = 0.999
+    parameters.randomGeneratorState = 0
+    found, _, rotation, translation, _ = cv2.solvePnPRansac(
+        problem.points_m, problem.pixels_px, problem.matrix, None, params=parameters
+    )
+    return [(np.asarray(rotation), np.asarray(translation))] if found else []
+
+
+def _median_error(camera: Camera, T: Array, points_lidar_m: Array, pixels_px: Array) -> float:
+    """Median distance [px] of the projected points from the pixels; inf if most are behind."""
+    projected, valid = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
+    errors = np.linalg.norm(projected - pixels_px, axis=1)
+    return float(np.median(np.where(valid, errors, np.inf)))
