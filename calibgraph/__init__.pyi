@@ -2,8 +2,12 @@
 
 from .audit import Audit as Audit
 from .audit import CameraAudit as CameraAudit
+from .audit import CameraDrift as CameraDrift
+from .audit import Drift as Drift
 from .audit import LidarAudit as LidarAudit
+from .audit import Trend as Trend
 from .audit import check as check
+from .audit import drift as drift
 from .doctor import Diagnosis as Diagnosis
 from .doctor import Finding as Finding
 from .doctor import diagnose as diagnose

@@ -1,6 +1,19 @@
-"""Is a deployed calibration still right? Measured by images and clouds; nothing is replaced."""
+"""Is a calibration still right? By images and clouds, or by several results; nothing is replaced."""
 
 from calibgraph.audit.check import check
+from calibgraph.audit.drift import drift
+from calibgraph.audit.drift_result import CameraDrift, Drift, Trend, drift_summary
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit, audit_summary
 
-__all__ = ["Audit", "CameraAudit", "LidarAudit", "audit_summary", "check"]
+__all__ = [
+    "Audit",
+    "CameraAudit",
+    "CameraDrift",
+    "Drift",
+    "LidarAudit",
+    "Trend",
+    "audit_summary",
+    "check",
+    "drift",
+    "drift_summary",
+]

@@ -13,7 +13,7 @@ data cannot tell.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +46,7 @@ _RECORD = (
 )
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 
-
+SINGLE_CAMERA = "; a single camera cannot be told from the LiDAR: either has moved"
 _TOO_FEW_FRAMES = (
     f"too few frames for an error bar of their own (those of one place count as one): record at "
     f"least {ENOUGH_FRAMES}, better 30, of different places"
@@ -76,14 +76,19 @@ class Tolerance:
         return twist
 
 
-def significant_sigmas(cameras: int) -> float:
-    """How many sigmas are significant, of the six axes of so many cameras."""
-    return float(ndtri(1 - FALSE_ALARM_RATE / (2 * 6 * cameras)))
+def significant_sigmas(poses: int, rate: float = FALSE_ALARM_RATE) -> float:
+    """How many sigmas are significant, of the six axes of so many poses, at a false alarm rate."""
+    return float(ndtri(1 - rate / (2 * 6 * poses)))
 
 
-def detectable(sigma: Array, cameras: int) -> Array:
-    """(6,) the smallest change per axis that is significant with probability POWER."""
-    smallest: Array = (significant_sigmas(cameras) + float(ndtri(POWER))) * sigma
+def detectable(sigma: Array, quantile: float) -> Array:
+    """(6,) the smallest change per axis that is significant with probability POWER.
+
+    Args:
+        sigma: (6,) standard deviations.
+        quantile: how many of them are significant.
+    """
+    smallest: Array = (quantile + float(ndtri(POWER))) * sigma
     return smallest
 
 
@@ -106,12 +111,13 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     if block is not None and block.frames < ENOUGH_FRAMES:
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
     sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
-    status, reason = judge_axes(deviation, sigma, significant_sigmas(cameras), tolerance)
+    quantile = significant_sigmas(cameras)
+    status, reason = judge_axes(deviation, sigma, quantile, tolerance)
     if doubt:
         status, reason = "CANNOT TELL", doubt
     elif status == "WRONG" and cameras == 1:
-        reason += "; a single camera cannot be told from the LiDAR: either has moved"
-    return CameraAudit(status, reason, deviation, sigma, detectable(sigma, cameras), z_score)
+        reason += SINGLE_CAMERA
+    return CameraAudit(status, reason, deviation, sigma, detectable(sigma, quantile), z_score)
 
 
 def _deviation(evidence: Evidence, name: str) -> Array:
@@ -160,21 +166,45 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
         cameras: all of them, with trusted measurements.
     """
     wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
-    if evidence.joint_covariance is None or not wrong:
+    if evidence.joint_covariance is None:
         return None
-    deployed = evidence.guess.T_camera_lidar
+    deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
+    T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
+    quantile = significant_sigmas(len(cameras))
+    return find_lidar_motion(deviation, evidence.joint_covariance, T_camera_lidar, wrong, quantile)
+
+
+def find_lidar_motion(
+    deviation: Array,
+    covariance: Array,
+    T_camera_lidar: Sequence[Array],
+    moved: Collection[int],
+    quantile: float,
+) -> LidarAudit | None:
+    """The motion of the LiDAR, if one explains the deviations of all cameras; else None.
+
+    Args:
+        deviation: (6 N,) motions of the cameras in their own axes.
+        covariance: (6 N, 6 N) of them.
+        T_camera_lidar: (4, 4) each, before.
+        moved: the cameras that deviate, by their places; with none the LiDAR has not moved either.
+        quantile: number of sigmas from which on an axis of its motion is named.
+    """
+    if not moved:
+        return None
+    cameras = len(T_camera_lidar)
     steps = Steps(
-        cameras=tuple(range(len(cameras))),
-        step=np.concatenate([_deviation(evidence, name) for name in cameras]),
-        covariance=evidence.joint_covariance,
-        limits=np.full(len(cameras), float(chdtri(6, FALSE_ALARM_RATE / len(cameras)))),
-        T_lidar_camera=tuple(to_T_lidar_camera(deployed[name]) for name in cameras),
+        cameras=tuple(range(cameras)),
+        step=deviation,
+        covariance=covariance,
+        limits=np.full(cameras, float(chdtri(6, FALSE_ALARM_RATE / cameras))),
+        T_lidar_camera=tuple(to_T_lidar_camera(T) for T in T_camera_lidar),
     )
-    lidar = find_cause(steps, wrong).lidar
+    lidar = find_cause(steps, moved).lidar
     if lidar is None:
         return None
     motion, sigma = -lidar[0], np.sqrt(np.diag(lidar[1]))
-    clear = np.abs(motion) > significant_sigmas(len(cameras)) * sigma
+    clear = np.abs(motion) > quantile * sigma
     return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
 
 

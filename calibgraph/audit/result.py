@@ -37,7 +37,7 @@ class CameraAudit:
     z_score: float | None = None
 
     def __post_init__(self) -> None:
-        _freeze(self.deviation, self.sigma, self.detectable)
+        freeze(self.deviation, self.sigma, self.detectable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class LidarAudit:
     sigma: Array
 
     def __post_init__(self) -> None:
-        _freeze(self.motion, self.sigma)
+        freeze(self.motion, self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,8 @@ class Audit:
         return tuple(name for name, camera in self.cameras.items() if camera.status == "WRONG")
 
 
-def _freeze(*arrays: Array | None) -> None:
+def freeze(*arrays: Array | None) -> None:
+    """Make arrays read-only."""
     for array in arrays:
         if array is not None:
             array.setflags(write=False)
@@ -106,7 +107,7 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
         "tolerance_cm": audit.tolerance_cm,
         "frames": audit.frames,
         "cameras": {name: _camera_summary(camera) for name, camera in audit.cameras.items()},
-        "lidar": None if audit.lidar is None else _lidar_summary(audit.lidar),
+        "lidar": None if audit.lidar is None else lidar_summary(audit.lidar),
         "timings_s": dict(audit.timings_s),
     }
 
@@ -116,21 +117,22 @@ def _camera_summary(camera: CameraAudit) -> dict[str, Any]:
         "status": camera.status,
         "reason": camera.reason,
         "z_score": camera.z_score,
-        **_by_unit("deviation", camera.deviation),
-        **_by_unit("sigma", camera.sigma),
-        **_by_unit("detectable", camera.detectable),
+        **by_unit("deviation", camera.deviation),
+        **by_unit("sigma", camera.sigma),
+        **by_unit("detectable", camera.detectable),
     }
 
 
-def _lidar_summary(lidar: LidarAudit) -> dict[str, Any]:
+def lidar_summary(lidar: LidarAudit) -> dict[str, Any]:
+    """A motion of the LiDAR as plain values."""
     return {
         "reason": lidar.reason,
-        **_by_unit("motion", lidar.motion),
-        **_by_unit("sigma", lidar.sigma),
+        **by_unit("motion", lidar.motion),
+        **by_unit("sigma", lidar.sigma),
     }
 
 
-def _by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
+def by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
     """A (6,) of rotations and translations in degrees and centimetres."""
     return {
         f"{name}_deg": None if twist is None else np.degrees(twist[:3]).tolist(),
@@ -169,7 +171,7 @@ def _lidar_of(summary: Mapping[str, Any]) -> LidarAudit:
 
 
 def _from_units(name: str, summary: Mapping[str, Any]) -> Array | None:
-    """The inverse of :func:`_by_unit`."""
+    """The inverse of :func:`by_unit`."""
     degrees, centimetres = summary[f"{name}_deg"], summary[f"{name}_cm"]
     if degrees is None:
         return None

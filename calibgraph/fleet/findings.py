@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, false_discovery_control, fisher_exact
 
+from calibgraph.audit.trend import fit_slope
 from calibgraph.fleet.fit import Mount, Pooled
 from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, ModelFit
 from calibgraph.model.geometry import twists_between
@@ -95,10 +96,12 @@ def _tests(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
                 yield Finding("date", mount.model, mount.camera, label, *found)
         columns = {**mount.seen.covariates, "date": mount.seen.day}
         for column, x in columns.items():
-            slope = _drift(x, mount.batch, information, y)
+            slope = fit_slope(x, mount.batch, information, y)
             if slope is not None:
+                p = _p_value(slope.change, slope.covariance)
                 reach = float(np.nanmax(x) - np.nanmin(x))
-                yield Finding("drift", mount.model, mount.camera, "", *slope, column, reach)
+                yield Finding("drift", mount.model, mount.camera, "", p, slope.change,
+                              slope.sigma, column, reach)  # fmt: skip
 
 
 def _moved_mounts(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
@@ -158,35 +161,6 @@ def _change_at_a_date(
     first = np.datetime64(int(day[order][splits[best] + 1]), "D")
     p = min(1.0, len(splits) * float(chi2.sf(squared[best], 6)))
     return p, change[best], np.sqrt(np.diag(covariance[best])), str(first)
-
-
-def _drift(
-    x: Array, batch: NDArray[np.intp], information: Array, y: Array
-) -> tuple[float, Array, Array] | None:
-    """The slope of deviations against a column, within batches, by generalised least squares.
-
-    Each batch has a centre of its own, so that what changed between batches is no drift.
-
-    Returns:
-        p-value, (6,) slope per unit, (6,) sigma. None where the column does not vary.
-    """
-    known = np.isfinite(x)
-    hessian, right = np.zeros((6, 6)), np.zeros(6)
-    unit = float(np.std(x[known])) if known.any() else 0.0
-    for number in np.unique(batch[known]) if unit > 0 else ():
-        rows = known & (batch == number)
-        W, scaled = information[rows], x[rows] / unit
-        total, first = W.sum(axis=0), np.einsum("n,nij->ij", scaled, W)
-        Wy = np.einsum("nij,nj->ni", W, y[rows])
-        share = np.linalg.solve(total, np.column_stack([first, Wy.sum(axis=0)]))
-        hessian += np.einsum("n,nij->ij", scaled**2, W) - first @ share[:, :6]
-        right += scaled @ Wy - first @ share[:, 6]
-    values = np.linalg.eigvalsh(hessian)
-    if values[0] <= 1e-9 * max(values[-1], 1e-300):
-        return None
-    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
-    slope = covariance @ right
-    return _p_value(slope, covariance), slope / unit, np.sqrt(np.diag(covariance)) / unit
 
 
 def _p_value(change: Array, covariance: Array) -> float:

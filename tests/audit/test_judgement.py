@@ -61,7 +61,7 @@ def test_one_of_a_thousand_unchanged_rigs_has_a_significant_axis() -> None:
 
 
 def test_the_smallest_detectable_change_is_significant_with_the_stated_power() -> None:
-    sizes = detectable(np.ones(6), cameras=3)
+    sizes = detectable(np.ones(6), QUANTILE)
     draws = sizes[0] + np.random.default_rng(1).standard_normal(100_000)
     found = np.mean(np.abs(draws) > QUANTILE)
     assert abs(found - POWER) < 4 * np.sqrt(POWER * (1 - POWER) / 100_000)

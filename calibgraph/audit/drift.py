@@ -1,0 +1,240 @@
+"""``drift``: which of several results of one rig deviates, of which camera, in which axis?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from calibgraph.audit.common_pose import Deviations, Limits, compare, poses_of
+from calibgraph.audit.drift_inputs import Results, open_results
+from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
+from calibgraph.audit.judgement import (
+    CAMERA_AXES,
+    SINGLE_CAMERA,
+    Tolerance,
+    describe_motion,
+    detectable,
+    find_lidar_motion,
+    judge_axes,
+    significant_sigmas,
+)
+from calibgraph.audit.result import LidarAudit
+from calibgraph.audit.trend import fit_slope
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import pose_rows
+
+Array = NDArray[np.float64]
+
+FALSE_ALARM_RATE = 0.01
+"""Probability of a significant axis in one call, over all cameras, results and trends."""
+
+_FAILED = "its verdict is FAIL, so that nothing is known of its error; calibrate it again"
+_NO_ERROR_BAR = "it has no error bar; calibrate it from more frames, at more places"
+_ALONE = "no other result has an error bar of this camera that holds; give more results"
+
+
+def drift(
+    results: Results,
+    *,
+    days: Sequence[float] | None = None,
+    tolerance_deg: float = 0.5,
+    tolerance_cm: float = 10.0,
+    own_lenses: bool = False,
+) -> Drift:
+    """Compare results of one rig with each other, without a reference: of days, or of vehicles.
+
+    Each result is compared with the weighted mean of the others that agree. Errors that all
+    results share, of the matcher or of the lens, cancel in a difference; results do not state how
+    large this part is, so that the whole covariances count, and the test is conservative.
+
+    Args:
+        results: two or more, or their folders or files; of a mapping the keys are their names.
+        days: when each was recorded, for the trend; the order given if None.
+        tolerance_deg: largest deviation about an axis of a camera that is OK.
+        tolerance_cm: largest deviation along an axis of a camera that is OK.
+        own_lenses: whether the parameters of the lenses may differ, as between vehicles.
+
+    Returns:
+        Per camera and result OK, CHANGED or CANNOT TELL, the deviation per axis, its error bar and
+        the smallest change that would be detected.
+
+    Raises:
+        CalibrationError: if a file cannot be read, or the results are not of one rig.
+        ValueError: if a tolerance is not positive, or there is not a day for each result.
+    """
+    tolerance = Tolerance(tolerance_deg, tolerance_cm)
+    opened = open_results(results, own_lenses=own_lenses)
+    loaded, at = [*opened.values()], _times(days, len(opened))
+    cameras = [*loaded[0].rig.cameras]
+    quantile = significant_sigmas(len(cameras) * (len(loaded) + 1), FALSE_ALARM_RATE)
+    limits = Limits(quantile, tolerance.twist)
+    found = {name: _compare_camera(loaded, name, limits) for name in cameras}
+    compared = {name: each for name, each in found.items() if each is not None}
+    judged = {
+        name: _judge_camera([*opened], loaded, name, compared.get(name), quantile, tolerance)
+        for name in cameras
+    }
+    unit = "result" if days is None else "day"
+    trends = {name: _trend(each, at, unit, limits) for name, each in compared.items()}
+    return Drift(
+        results=(*opened,),
+        at=at,
+        cameras=judged,
+        trends={name: trend for name, trend in trends.items() if trend is not None},
+        lidar=tuple(_lidar(place, loaded, compared, judged, quantile)
+                    for place in range(len(loaded))),
+        tolerance_deg=tolerance_deg,
+        tolerance_cm=tolerance_cm,
+        false_alarm_rate=FALSE_ALARM_RATE,
+    )  # fmt: skip
+
+
+def _times(days: Sequence[float] | None, count: int) -> Array:
+    """(n,) days, or places.
+
+    Raises:
+        ValueError: if there is not a finite day for each result.
+    """
+    at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
+    if at.shape != (count,) or not np.isfinite(at).all():
+        raise ValueError(f"days: expected {count} finite numbers, one per result, found {days}")
+    return at
+
+
+def _why_unusable(result: Calibration, name: str) -> str:
+    """Why the pose of a camera takes no part; empty if it does."""
+    if not result.error_bar_holds(name):
+        return _FAILED
+    covariance = result.covariance[name]
+    if covariance is None or np.linalg.eigvalsh(covariance)[0] <= 0:
+        return _NO_ERROR_BAR
+    return ""
+
+
+def _compare_camera(results: list[Calibration], name: str, limits: Limits) -> Deviations | None:
+    """The deviations of one camera; None with fewer than two usable results."""
+    usable = [place for place, each in enumerate(results) if not _why_unusable(each, name)]
+    if len(usable) < 2:  # noqa: PLR2004 - a comparison
+        return None
+    T_camera_lidar = np.array([results[place].T_camera_lidar[name] for place in usable])
+    covariance = np.array([results[place].covariance[name] for place in usable])
+    return compare(poses_of(usable, T_camera_lidar, covariance), limits)
+
+
+def _judge_camera(
+    names: list[str],
+    results: list[Calibration],
+    camera: str,
+    found: Deviations | None,
+    quantile: float,
+    tolerance: Tolerance,
+) -> tuple[CameraDrift, ...]:
+    """The status of one camera in every result."""
+    judged = [
+        CameraDrift("CANNOT TELL", _why_unusable(each, camera) or _ALONE) for each in results
+    ]
+    if found is None:
+        return tuple(judged)
+    for row, place in enumerate(found.poses.results):
+        deviation, sigma = found.deviation[row], found.sigma[row]
+        audit, reason = judge_axes(deviation, sigma, quantile, tolerance)
+        status = cast(DriftStatus, "CHANGED" if audit == "WRONG" else audit)
+        if status == "CHANGED":
+            reason += _whose_change(found, row, names)
+            reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
+        smallest = detectable(sigma, quantile)
+        judged[place] = CameraDrift(status, reason, deviation, sigma, smallest)
+    return tuple(judged)
+
+
+def _whose_change(found: Deviations, row: int, names: list[str]) -> str:
+    """What else may have changed in place of a result; empty if nothing."""
+    count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
+    rivals = [names[found.poses.results[other]] for other in np.flatnonzero(found.rivals[row])]
+    if not rivals:
+        return ""
+    if count == 2:  # noqa: PLR2004 - no majority
+        return f" from {rivals[0]}; of two results it is not known which changed: give a third"
+    if 2 * agreeing <= count:
+        return "; no more than half of the results agree, so that it is not known which changed"
+    return f"; it may be {' or '.join(rivals)} that changed, not this result: give more results"
+
+
+def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | None:
+    """The steady motion of one camera; None with fewer than three results, or of one time.
+
+    It counts if it explains the results better than changes of single ones, by what is left of
+    the scatter and twice the numbers that each needs (Akaike's criterion).
+    """
+    poses, count = found.poses, len(found.poses)
+    x = at[poses.results]
+    one_batch = np.zeros(count, np.intp)
+    slope = fit_slope(x, one_batch, poses.information, poses.twist)
+    if count < 3 or slope is None:  # noqa: PLR2004 - a line passes through two
+        return None
+    span = float(np.ptp(x))
+    whole, sigma = slope.change * span, slope.sigma * span
+    everyone, single = np.ones(count, np.bool_), np.count_nonzero(~found.agreeing)
+    by_slope = poses.scatter(everyone) - slope.squared_sigmas + 2 * 6
+    by_changes = poses.scatter(found.agreeing) + 2 * 6 * single
+    beyond = bool(limits.exceeded(whole[None], sigma[None])[0])
+    changed = beyond and by_slope < by_changes
+    clear = np.abs(whole) > limits.sigmas * sigma
+    reason = "no significant trend"
+    if clear.any():
+        motion = describe_motion(whole, sigma, clear, CAMERA_AXES)
+        reason = f"{motion} from the first to the last result"
+        if not beyond:
+            reason += ", within the tolerance"
+        elif not changed:
+            reason += "; changes of single results explain it better"
+    return Trend(changed, reason, slope.change, slope.sigma, unit, span)
+
+
+def _lidar(
+    place: int,
+    results: list[Calibration],
+    compared: dict[str, Deviations],
+    judged: dict[str, tuple[CameraDrift, ...]],
+    quantile: float,
+) -> LidarAudit | None:
+    """The motion of the LiDAR that explains how all cameras of one result deviate, if one does."""
+    seen = {name: each for name, each in compared.items() if place in each.poses.results}
+    if len(seen) < 2:  # noqa: PLR2004 - one camera cannot be told from the LiDAR
+        return None
+    moved = [k for k, name in enumerate(seen) if judged[name][place].status == "CHANGED"]
+    covariance = _joint_covariance(place, results, seen)
+    if covariance is None:
+        return None
+    rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
+    deviation = np.concatenate(
+        [each.deviation[row] for each, row in zip(seen.values(), rows, strict=True)]
+    )
+    bases = [each.poses.base for each in seen.values()]
+    return find_lidar_motion(deviation, covariance, bases, moved, quantile)
+
+
+def _joint_covariance(
+    place: int, results: list[Calibration], seen: dict[str, Deviations]
+) -> Array | None:
+    """(6 N, 6 N) of one result's deviations of these cameras; None where a result has none."""
+    gains = {name: each.coefficients(int(np.flatnonzero(each.poses.results == place)[0]))
+             for name, each in seen.items()}  # fmt: skip
+    whole = np.zeros((6 * len(seen), 6 * len(seen)))
+    for other, result in enumerate(results):
+        at = {name: np.flatnonzero(each.poses.results == other) for name, each in seen.items()}
+        parts = [gains[name][rows[0]] if len(rows) else np.zeros((6, 6))
+                 for name, rows in at.items()]  # fmt: skip
+        if not np.any(parts):
+            continue
+        if result.joint_covariance is None:
+            return None
+        order = [*result.rig.cameras]
+        columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in seen])
+        gain = block_diag(*parts)
+        whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
+    return whole
