@@ -1,4 +1,4 @@
-"""Is a calibration still right? By images and clouds, or by several results; nothing is replaced."""
+"""Is a calibration still right? Measured by images and clouds, or by several results."""
 
 from calibgraph.audit.check import check
 from calibgraph.audit.drift import drift

@@ -79,9 +79,9 @@ class Limits:
     tolerance: Array
 
     def exceeded(self, deviation: Array, sigma: Array) -> Mask:
-        """(n,) whether an axis of (n, 6) deviations is beyond both."""
+        """(..., 6) which axes of deviations are beyond both."""
         size = np.abs(deviation)
-        beyond: Mask = ((size > self.sigmas * sigma) & (size > self.tolerance)).any(axis=1)
+        beyond: Mask = (size > self.sigmas * sigma) & (size > self.tolerance)
         return beyond
 
 
@@ -154,7 +154,7 @@ def _agreeing(poses: Poses, limits: Limits) -> Mask:
     kept = np.ones(len(poses), np.bool_)
     while np.count_nonzero(kept) > 1:
         deviation, covariance = _from_others(poses, kept)
-        apart = kept & limits.exceeded(deviation, _sigmas(covariance))
+        apart = kept & limits.exceeded(deviation, _sigmas(covariance)).any(axis=1)
         if not apart.any():
             break
         # By so much less would the rest scatter without each result.
@@ -172,7 +172,7 @@ def _rivals(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
             swapped = agreeing.copy()
             swapped[[removed, left]] = True, False
             deviation, covariance = _from_others(poses, swapped)
-            apart = swapped & limits.exceeded(deviation, _sigmas(covariance))
+            apart = swapped & limits.exceeded(deviation, _sigmas(covariance)).any(axis=1)
             rivals[removed, left] = rivals[left, removed] = not apart.any()
     return rivals
 

@@ -75,7 +75,7 @@ def drift(
     found = {name: _compare_camera(loaded, name, limits) for name in cameras}
     compared = {name: each for name, each in found.items() if each is not None}
     judged = {
-        name: _judge_camera([*opened], loaded, name, compared.get(name), quantile, tolerance)
+        name: _judge_camera([*opened], loaded, name, compared.get(name), limits, tolerance)
         for name in cameras
     }
     unit = "result" if days is None else "day"
@@ -130,24 +130,24 @@ def _judge_camera(
     results: list[Calibration],
     camera: str,
     found: Deviations | None,
-    quantile: float,
+    limits: Limits,
     tolerance: Tolerance,
 ) -> tuple[CameraDrift, ...]:
     """The status of one camera in every result."""
-    judged = [
-        CameraDrift("CANNOT TELL", _why_unusable(each, camera) or _ALONE) for each in results
-    ]
+    judged = [CameraDrift("CANNOT TELL", _why_unusable(each, camera) or _ALONE) for each in results]
     if found is None:
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
         deviation, sigma = found.deviation[row], found.sigma[row]
-        audit, reason = judge_axes(deviation, sigma, quantile, tolerance)
+        audit, reason = judge_axes(deviation, sigma, limits.sigmas, tolerance)
         status = cast(DriftStatus, "CHANGED" if audit == "WRONG" else audit)
+        axes: tuple[int, ...] = ()
         if status == "CHANGED":
+            axes = tuple(np.flatnonzero(limits.exceeded(deviation, sigma)).tolist())
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
-        smallest = detectable(sigma, quantile)
-        judged[place] = CameraDrift(status, reason, deviation, sigma, smallest)
+        smallest = detectable(sigma, limits.sigmas)
+        judged[place] = CameraDrift(status, reason, deviation, sigma, smallest, axes)
     return tuple(judged)
 
 
@@ -181,7 +181,7 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
     everyone, single = np.ones(count, np.bool_), np.count_nonzero(~found.agreeing)
     by_slope = poses.scatter(everyone) - slope.squared_sigmas + 2 * 6
     by_changes = poses.scatter(found.agreeing) + 2 * 6 * single
-    beyond = bool(limits.exceeded(whole[None], sigma[None])[0])
+    beyond = bool(limits.exceeded(whole, sigma).any())
     changed = beyond and by_slope < by_changes
     clear = np.abs(whole) > limits.sigmas * sigma
     reason = "no significant trend"

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.audit.judgement import CAMERA_AXES
 from calibgraph.audit.result import LidarAudit, by_unit, freeze, lidar_summary
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ class CameraDrift:
             frame by the other results: rotation [rad], translation [m]; None if not compared.
         sigma: (6,) standard deviations of ``deviation``.
         detectable: (6,) smallest change per axis that would be significant with 90 % probability.
+        axes: which of the six CHANGED, in this order.
     """
 
     status: DriftStatus
@@ -35,6 +37,7 @@ class CameraDrift:
     deviation: Array | None = None
     sigma: Array | None = None
     detectable: Array | None = None
+    axes: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self.deviation, self.sigma, self.detectable)
@@ -139,6 +142,7 @@ def _camera_summary(camera: CameraDrift) -> dict[str, Any]:
     return {
         "status": camera.status,
         "reason": camera.reason,
+        "axes": [CAMERA_AXES[axis] for axis in camera.axes],
         **by_unit("deviation", camera.deviation),
         **by_unit("sigma", camera.sigma),
         **by_unit("detectable", camera.detectable),

@@ -1,8 +1,8 @@
 """The command line's frame: its commands, one-line errors, exit codes.
 
 Human output goes to stderr, machine output (``--json``) to stdout. Exit codes: 0 done (PASS or
-WARN), 1 the calibration FAILed (its files are written and marked FAIL) or is WRONG (``check``),
-2 bad input (one line), 3 the data cannot tell (``check``), 130 interrupted.
+WARN), 1 the calibration FAILed (its files are written and marked FAIL), is WRONG (``check``) or has
+CHANGED (``drift``), 2 bad input (one line), 3 the data cannot tell (both), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from calibgraph.cli.benchmark import bench, paper, tune
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
+from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
@@ -87,6 +88,7 @@ def _options(
 COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     calibrate: outputs.result,
     check: outputs.nothing,
+    drift: outputs.plot_of_drift,
     match: outputs.table,
     solve: outputs.result,
     report: outputs.page,

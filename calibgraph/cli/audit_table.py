@@ -49,10 +49,11 @@ def _rows(camera: CameraAudit) -> list[tuple[str, list[str]]]:
         ("sigma", camera.sigma, ".2f"),
         ("detectable", camera.detectable, ".2f"),
     )
-    return [(label, _cells(twist, form)) for label, twist, form in rows]
+    return [(label, twist_cells(twist, form)) for label, twist, form in rows]
 
 
-def _cells(twist: NDArray[np.float64] | None, form: str) -> list[str]:
+def twist_cells(twist: NDArray[np.float64] | None, form: str) -> list[str]:
+    """Six numbers in degrees and centimetres; dashes if there are none."""
     if twist is None:
         return ["-"] * 6
     return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]

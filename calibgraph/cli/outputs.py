@@ -14,7 +14,7 @@ Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
 
 TABLE_SUFFIXES = (".parquet", ".csv")
-WRITTEN = ("out", "rerun", "mcap")
+WRITTEN = ("out", "rerun", "mcap", "plot")
 """The options that name what a command writes."""
 
 
@@ -49,6 +49,13 @@ def recordings(given: Given) -> list[Output]:
 
     makers = {"rerun": output_of_rerun, "mcap": output_of_mcap}
     return [make(given[name]) for name, make in makers.items() if given[name] is not None]
+
+
+def plot_of_drift(given: Given) -> list[Output]:
+    """The picture of a comparison, if it is wanted."""
+    from calibgraph.audit.drift_plot import output_of_drift_plot
+
+    return [] if given["plot"] is None else [output_of_drift_plot(given["plot"])]
 
 
 def fleet_page(given: Given) -> list[Output]:
