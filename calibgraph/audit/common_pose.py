@@ -62,7 +62,7 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array) -> Po
     apart = np.linalg.norm(from_first - np.median(from_first, axis=0), axis=1)
     base = T_camera_lidar[int(np.argmin(apart))]
     twist = -twists_between(T_camera_lidar, base)
-    information = np.linalg.inv(covariance)
+    information: Array = np.asarray(np.linalg.inv(covariance), np.float64)
     return Poses(np.array(results, np.intp), base, twist, covariance, information)
 
 

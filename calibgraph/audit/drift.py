@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +139,7 @@ def _judge_camera(
     for row, place in enumerate(found.poses.results):
         deviation, sigma = found.deviation[row], found.sigma[row]
         audit, reason = judge_axes(deviation, sigma, limits.sigmas, tolerance)
-        status = cast(DriftStatus, "CHANGED" if audit == "WRONG" else audit)
+        status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
             axes = tuple(np.flatnonzero(limits.exceeded(deviation, sigma)).tolist())
@@ -182,7 +181,7 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
     by_slope = poses.scatter(everyone) - slope.squared_sigmas + 2 * 6
     by_changes = poses.scatter(found.agreeing) + 2 * 6 * single
     beyond = bool(limits.exceeded(whole, sigma).any())
-    changed = beyond and by_slope < by_changes
+    changed = beyond and bool(by_slope < by_changes)
     clear = np.abs(whole) > limits.sigmas * sigma
     reason = "no significant trend"
     if clear.any():
