@@ -6,7 +6,9 @@ exp(y_r), with covariance P_r. The weighted mean of the others is m_r, with cova
     M_r^-1 = sum_s P_s^-1,   m_r = M_r sum_s P_s^-1 y_s,   s != r in the results that agree,
     d_r = y_r - m_r,         covariance P_r + M_r.
 
-All to first order in the deviations of the results that agree.
+All to first order in the deviations of the results that agree. A covariance that was estimated
+from F frames is itself uncertain, so that deviations follow Student's law, with as many degrees of
+freedom as Welch and Satterthwaite's formula gives for the sum of P_r and M_r on an axis.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from calibgraph.model.geometry import twists_between
 
@@ -32,6 +35,7 @@ class Poses:
         twist: (n, 6) y_r, rotation [rad], translation [m], in the camera's axes.
         covariance: (n, 6, 6) of y_r.
         information: (n, 6, 6) their inverses.
+        freedom: (n,) degrees of freedom of the covariances.
     """
 
     results: NDArray[np.intp]
@@ -39,6 +43,7 @@ class Poses:
     twist: Array
     covariance: Array
     information: Array
+    freedom: Array
 
     def __len__(self) -> int:
         return len(self.results)
@@ -50,20 +55,21 @@ class Poses:
         return float(np.einsum("ni,nij,nj->", y - mean, W, y - mean))
 
 
-def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array) -> Poses:
+def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freedom: Array) -> Poses:
     """The poses of one camera, relative to one in the middle.
 
     Args:
         results: (n,) places in the order given.
         T_camera_lidar: (n, 4, 4).
         covariance: (n, 6, 6) of xi in T_camera_lidar = exp(xi) estimate; positive definite.
+        freedom: (n,) degrees of freedom of the covariances.
     """
     from_first = twists_between(T_camera_lidar, T_camera_lidar[0])
     apart = np.linalg.norm(from_first - np.median(from_first, axis=0), axis=1)
     base = T_camera_lidar[int(np.argmin(apart))]
     twist = -twists_between(T_camera_lidar, base)
     information: Array = np.asarray(np.linalg.inv(covariance), np.float64)
-    return Poses(np.array(results, np.intp), base, twist, covariance, information)
+    return Poses(np.array(results, np.intp), base, twist, covariance, information, freedom)
 
 
 @dataclass(frozen=True)
@@ -71,17 +77,46 @@ class Limits:
     """From where on an axis deviates: both have to be exceeded.
 
     Attributes:
-        sigmas: of the deviation.
+        tail: probability of a larger deviation by chance, to either side.
         tolerance: (6,) rotation [rad], translation [m].
     """
 
-    sigmas: float
+    tail: float
     tolerance: Array
 
-    def exceeded(self, deviation: Array, sigma: Array) -> Mask:
+    def sigmas(self, freedom: Array) -> Array:
+        """How many sigmas are significant with these degrees of freedom."""
+        return np.asarray(-stdtrit(freedom, self.tail), np.float64)
+
+    def exceeded(self, deviation: Array, sigma: Array, freedom: Array) -> Mask:
         """(..., 6) which axes of deviations are beyond both."""
         size = np.abs(deviation)
-        beyond: Mask = (size > self.sigmas * sigma) & (size > self.tolerance)
+        beyond: Mask = (size > self.sigmas(freedom) * sigma) & (size > self.tolerance)
+        return beyond
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """How far each result is from the mean of others.
+
+    Attributes:
+        deviation: (n, 6) d_r.
+        covariance: (n, 6, 6) of it.
+        freedom: (n, 6) degrees of freedom of its variances.
+    """
+
+    deviation: Array
+    covariance: Array
+    freedom: Array
+
+    @property
+    def sigma(self) -> Array:
+        """(n, 6) standard deviations."""
+        return np.sqrt(_variances(self.covariance))
+
+    def beyond(self, limits: Limits) -> Mask:
+        """(n,) whether an axis of a result is."""
+        beyond: Mask = limits.exceeded(self.deviation, self.sigma, self.freedom).any(axis=1)
         return beyond
 
 
@@ -93,22 +128,15 @@ class Deviations:
         poses: of the camera.
         pool: (n,) the results whose mean each is compared with, itself excepted.
         agreeing: (n,) the largest part found that agrees.
-        deviation: (n, 6) d_r.
-        covariance: (n, 6, 6) of it.
+        apart: how far each is from that mean.
         rivals: (n, n) whether result s may have changed in place of result r.
     """
 
     poses: Poses
     pool: Mask
     agreeing: Mask
-    deviation: Array
-    covariance: Array
+    apart: Apart
     rivals: Mask
-
-    @property
-    def sigma(self) -> Array:
-        """(n, 6) standard deviations."""
-        return _sigmas(self.covariance)
 
     def coefficients(self, r: int) -> Array:
         """(n, 6, 6) by which the twist of each result enters d_r."""
@@ -137,30 +165,36 @@ def compare(poses: Poses, limits: Limits) -> Deviations:
     else:
         rivals = ~np.eye(len(poses), dtype=np.bool_)
     pool = agreeing | rivals.any(axis=1)
-    return Deviations(poses, pool, agreeing, *_from_others(poses, pool), rivals)
+    return Deviations(poses, pool, agreeing, _from_others(poses, pool), rivals)
 
 
-def _from_others(poses: Poses, kept: Mask) -> tuple[Array, Array]:
-    """(n, 6) and (n, 6, 6) each result from the mean of the others among those that are kept."""
+def _from_others(poses: Poses, kept: Mask) -> Apart:
+    """Each result from the mean of the others among those that are kept."""
     own = np.where(kept[:, None, None], poses.information, 0.0)
     weighted = np.einsum("nij,nj->ni", own, poses.twist)
     of_mean = np.linalg.inv(own.sum(axis=0) - own)
     mean = np.einsum("nij,nj->ni", of_mean, weighted.sum(axis=0) - weighted)
-    return poses.twist - mean, poses.covariance + of_mean
+    covariance = poses.covariance + of_mean
+    of_others = poses.freedom[kept].sum() - poses.freedom * kept
+    freedom = _variances(covariance) ** 2 / (
+        _variances(poses.covariance) ** 2 / poses.freedom[:, None]
+        + _variances(of_mean) ** 2 / of_others[:, None]
+    )
+    return Apart(poses.twist - mean, covariance, freedom)
 
 
 def _agreeing(poses: Poses, limits: Limits) -> Mask:
     """(n,) the results that are left, one at least."""
     kept = np.ones(len(poses), np.bool_)
     while np.count_nonzero(kept) > 1:
-        deviation, covariance = _from_others(poses, kept)
-        apart = kept & limits.exceeded(deviation, _sigmas(covariance)).any(axis=1)
-        if not apart.any():
+        apart = _from_others(poses, kept)
+        beyond = kept & apart.beyond(limits)
+        if not beyond.any():
             break
         # By so much less would the rest scatter without each result.
-        solved = np.linalg.solve(covariance, deviation[..., None])[..., 0]
-        less = np.einsum("ni,ni->n", deviation, solved)
-        kept[np.argmax(np.where(apart, less, -1.0))] = False
+        solved = np.linalg.solve(apart.covariance, apart.deviation[..., None])[..., 0]
+        less = np.einsum("ni,ni->n", apart.deviation, solved)
+        kept[np.argmax(np.where(beyond, less, -1.0))] = False
     return kept
 
 
@@ -171,11 +205,11 @@ def _rivals(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
         for left in np.flatnonzero(agreeing):
             swapped = agreeing.copy()
             swapped[[removed, left]] = True, False
-            deviation, covariance = _from_others(poses, swapped)
-            apart = swapped & limits.exceeded(deviation, _sigmas(covariance)).any(axis=1)
-            rivals[removed, left] = rivals[left, removed] = not apart.any()
+            agrees = not (swapped & _from_others(poses, swapped).beyond(limits)).any()
+            rivals[removed, left] = rivals[left, removed] = agrees
     return rivals
 
 
-def _sigmas(covariance: Array) -> Array:
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+def _variances(covariance: Array) -> Array:
+    """(n, 6) of (n, 6, 6)."""
+    return np.asarray(np.diagonal(covariance, axis1=1, axis2=2))

@@ -19,12 +19,12 @@ from calibgraph.audit.judgement import (
     detectable,
     find_lidar_motion,
     judge_axes,
-    significant_sigmas,
 )
 from calibgraph.audit.result import LidarAudit
 from calibgraph.audit.trend import fit_slope
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.covariance import PSEUDO_FRAMES
 
 Array = NDArray[np.float64]
 
@@ -69,8 +69,8 @@ def drift(
     opened = open_results(results, own_lenses=own_lenses)
     loaded, at = [*opened.values()], _times(days, len(opened))
     cameras = [*loaded[0].rig.cameras]
-    quantile = significant_sigmas(len(cameras) * (len(loaded) + 1), FALSE_ALARM_RATE)
-    limits = Limits(quantile, tolerance.twist)
+    tests = 6 * len(cameras) * (len(loaded) + 1)
+    limits = Limits(FALSE_ALARM_RATE / (2 * tests), tolerance.twist)
     found = {name: _compare_camera(loaded, name, limits) for name in cameras}
     compared = {name: each for name, each in found.items() if each is not None}
     judged = {
@@ -84,7 +84,7 @@ def drift(
         at=at,
         cameras=judged,
         trends={name: trend for name, trend in trends.items() if trend is not None},
-        lidar=tuple(_lidar(place, loaded, compared, judged, quantile)
+        lidar=tuple(_lidar(place, loaded, compared, judged, limits)
                     for place in range(len(loaded))),
         tolerance_deg=tolerance_deg,
         tolerance_cm=tolerance_cm,
@@ -121,7 +121,9 @@ def _compare_camera(results: list[Calibration], name: str, limits: Limits) -> De
         return None
     T_camera_lidar = np.array([results[place].T_camera_lidar[name] for place in usable])
     covariance = np.array([results[place].covariance[name] for place in usable])
-    return compare(poses_of(usable, T_camera_lidar, covariance), limits)
+    frames = np.array([results[place].counts[name]["frames_used"] for place in usable])
+    freedom = np.maximum(frames, 1.0) - 1.0 + PSEUDO_FRAMES
+    return compare(poses_of(usable, T_camera_lidar, covariance, freedom), limits)
 
 
 def _judge_camera(
@@ -137,15 +139,18 @@ def _judge_camera(
     if found is None:
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
-        deviation, sigma = found.deviation[row], found.sigma[row]
-        audit, reason = judge_axes(deviation, sigma, limits.sigmas, tolerance)
+        deviation, sigma = found.apart.deviation[row], found.apart.sigma[row]
+        quantile = limits.sigmas(found.apart.freedom[row])
+        audit, reason = judge_axes(deviation, sigma, quantile, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
-            axes = tuple(np.flatnonzero(limits.exceeded(deviation, sigma)).tolist())
+            axes = tuple(
+                np.flatnonzero(limits.exceeded(deviation, sigma, found.apart.freedom[row])).tolist()
+            )
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
-        smallest = detectable(sigma, limits.sigmas)
+        smallest = detectable(sigma, quantile)
         judged[place] = CameraDrift(status, reason, deviation, sigma, smallest, axes)
     return tuple(judged)
 
@@ -177,12 +182,13 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
         return None
     span = float(np.ptp(x))
     whole, sigma = slope.change * span, slope.sigma * span
+    freedom = np.array(poses.freedom.sum())
     everyone, single = np.ones(count, np.bool_), np.count_nonzero(~found.agreeing)
     by_slope = poses.scatter(everyone) - slope.squared_sigmas + 2 * 6
     by_changes = poses.scatter(found.agreeing) + 2 * 6 * single
-    beyond = bool(limits.exceeded(whole, sigma).any())
+    beyond = bool(limits.exceeded(whole, sigma, freedom).any())
     changed = beyond and bool(by_slope < by_changes)
-    clear = np.abs(whole) > limits.sigmas * sigma
+    clear = np.abs(whole) > limits.sigmas(freedom) * sigma
     reason = "no significant trend"
     if clear.any():
         motion = describe_motion(whole, sigma, clear, CAMERA_AXES)
@@ -199,7 +205,7 @@ def _lidar(
     results: list[Calibration],
     compared: dict[str, Deviations],
     judged: dict[str, tuple[CameraDrift, ...]],
-    quantile: float,
+    limits: Limits,
 ) -> LidarAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate, if one does."""
     seen = {name: each for name, each in compared.items() if place in each.poses.results}
@@ -211,10 +217,13 @@ def _lidar(
         return None
     rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
     deviation = np.concatenate(
-        [each.deviation[row] for each, row in zip(seen.values(), rows, strict=True)]
+        [each.apart.deviation[row] for each, row in zip(seen.values(), rows, strict=True)]
+    )
+    freedom = np.min(
+        [each.apart.freedom[row] for each, row in zip(seen.values(), rows, strict=True)]
     )
     bases = [each.poses.base for each in seen.values()]
-    return find_lidar_motion(deviation, covariance, bases, moved, quantile)
+    return find_lidar_motion(deviation, covariance, bases, moved, float(limits.sigmas(freedom)))
 
 
 def _joint_covariance(

@@ -76,17 +76,17 @@ class Tolerance:
         return twist
 
 
-def significant_sigmas(poses: int, rate: float = FALSE_ALARM_RATE) -> float:
-    """How many sigmas are significant, of the six axes of so many poses, at a false alarm rate."""
-    return float(ndtri(1 - rate / (2 * 6 * poses)))
+def significant_sigmas(cameras: int) -> float:
+    """How many sigmas are significant, of the six axes of so many cameras."""
+    return float(ndtri(1 - FALSE_ALARM_RATE / (2 * 6 * cameras)))
 
 
-def detectable(sigma: Array, quantile: float) -> Array:
+def detectable(sigma: Array, quantile: float | Array) -> Array:
     """(6,) the smallest change per axis that is significant with probability POWER.
 
     Args:
         sigma: (6,) standard deviations.
-        quantile: how many of them are significant.
+        quantile: how many of them are significant, per axis or of all.
     """
     smallest: Array = (quantile + float(ndtri(POWER))) * sigma
     return smallest
@@ -127,7 +127,7 @@ def _deviation(evidence: Evidence, name: str) -> Array:
 
 
 def judge_axes(
-    deviation: Array, sigma: Array, quantile: float, tolerance: Tolerance
+    deviation: Array, sigma: Array, quantile: float | Array, tolerance: Tolerance
 ) -> tuple[AuditStatus, str]:
     """The status of a trusted measurement, and its reason."""
     size, significant = np.abs(deviation), np.abs(deviation) > quantile * sigma

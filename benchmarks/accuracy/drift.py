@@ -1,0 +1,218 @@
+"""How often ``drift`` finds a moved camera, and how often it finds one where nothing has moved.
+
+    python -m benchmarks.accuracy.drift [--pool 150] [--calls 500]
+
+Results are solves of simulated tables of a stereo pair, 10 frames each. A call compares results
+drawn from the pool; a moved camera is a displaced extrinsic. The tolerance is next to nothing, so
+that whatever is significant is CHANGED. Three kinds of recordings:
+
+* sharp: matches with errors of their own and of their frames;
+* shared: with an error that all frames of a recording share, drawn anew for each, of the size that
+  the matcher ``structure`` reports;
+* common: with such an error, the same in all recordings, as of a lens.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.accuracy.uncertainty import ERRORS, stereo
+from benchmarks.tables import Table, add_record_option, publish
+from calibgraph import Calibration, Drift, Rig, drift, simulate_correspondences, solve
+from calibgraph.audit.judgement import CAMERA_AXES
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+
+KINDS = ("sharp", "shared", "common")
+FRAMES, MATCHES = 10, 100
+SHARED = np.repeat([np.radians(0.09), 0.02], 3)
+SIZES = {"deg": (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), "cm": (1.0, 2.0, 5.0, 10.0, 20.0)}
+TOLERANCE = {"tolerance_deg": 1e-6, "tolerance_cm": 1e-6}
+COUNTS = (2, 3, 5, 10)
+COMPARED = 5
+TIMES = (0.5, 0.75, 1.0, 1.25, 1.5)
+CALLS_PER_CELL = 5
+"""One of so many calls for each cell of a table of detections."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Calls with one moved camera.
+
+    Attributes:
+        right: share in which the result, the camera and the axis were named.
+        others: share in which another result or camera CHANGED too.
+    """
+
+    right: float
+    others: float
+
+    @property
+    def text(self) -> str:
+        """Both, in percent."""
+        return f"{self.right:.0%}"
+
+
+def main() -> None:
+    """Fill the pools, count, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--pool", type=int, default=150)
+    parser.add_argument("--calls", type=int, default=500)
+    add_record_option(parser)
+    options = parser.parse_args()
+    pools = {kind: fill_pool(kind, options.pool) for kind in KINDS}
+    tables = [false_alarms(pools, options.calls)]
+    for kind in ("sharp", "shared"):
+        tables += detections(kind, pools[kind], options.calls // CALLS_PER_CELL)
+    tables.append(at_detectable(pools, options.calls // CALLS_PER_CELL))
+    publish("accuracy.drift", tables, record=options.record)
+
+
+def fill_pool(kind: str, size: int) -> list[Calibration]:
+    """Results of as many recordings."""
+    rng = np.random.default_rng(KINDS.index(kind))
+    common = draw_shared(rng)
+    return [
+        solve_one(kind, common if kind == "common" else draw_shared(rng), seed)
+        for seed in range(size)
+    ]
+
+
+def draw_shared(rng: Rng) -> tuple[Array, Array]:
+    """(6,) motion of the cloud and (2, 6) of the cameras' matches, each with half the variance."""
+    half = SHARED / np.sqrt(2)
+    return half * rng.standard_normal(6), half * rng.standard_normal((2, 6))
+
+
+def solve_one(kind: str, shared: tuple[Array, Array], seed: int) -> Calibration:
+    """The result of one recording, of which the guess is the truth."""
+    truth = stereo()
+    seen = truth if kind == "sharp" else displaced(truth, *shared)
+    table = simulate_correspondences(
+        seen, frames=FRAMES, matches=MATCHES, errors=ERRORS, depth_m=None, seed=seed
+    )
+    if kind != "sharp":
+        found = {"systematic_rotation_rad": SHARED[0], "systematic_translation_m": SHARED[3]}
+        table = replace(table, metadata={**table.metadata, **found})
+    return replace(solve(truth, table), correspondences=None)
+
+
+def displaced(rig: Rig, cloud: Array, cameras: Array) -> Rig:
+    """The rig with its cloud and its cameras displaced."""
+    T_cloud = gtsam.Pose3.Expmap(cloud).matrix()
+    return rig.moved_to(
+        {
+            name: gtsam.Pose3.Expmap(xi).matrix() @ T @ T_cloud
+            for (name, T), xi in zip(rig.T_camera_lidar.items(), cameras, strict=True)
+        }
+    )
+
+
+def choose(pool: Sequence[Calibration], count: int, rng: Rng) -> list[Calibration]:
+    """Different results of a pool."""
+    return [pool[k] for k in rng.choice(len(pool), count, replace=False)]
+
+
+def false_alarms(pools: dict[str, list[Calibration]], calls: int) -> Table:
+    """Per kind and number of results, how often anything CHANGED though nothing moved."""
+    rng = np.random.default_rng(10)
+    rows = []
+    for kind, pool in pools.items():
+        cells = []
+        for count in COUNTS:
+            found = [drift(choose(pool, count, rng), **TOLERANCE) for _ in range(calls)]
+            cells.append(f"{np.mean([each.status == 'CHANGED' for each in found]):.1%}")
+        rows.append((kind, *cells))
+    heads = ("recordings", *(f"{count} results" for count in COUNTS))
+    return Table(f"CHANGED though nothing moved, of {calls} calls each (stated: 1 %)", heads,
+                 tuple(rows))  # fmt: skip
+
+
+def detections(kind: str, pool: list[Calibration], calls: int) -> list[Table]:
+    """Per axis and size, how often a moved camera was named with its axis."""
+    rng = np.random.default_rng(20)
+    tables = []
+    for unit, axes, scale in (("deg", range(3), np.pi / 180), ("cm", range(3, 6), 0.01)):
+        rows, others = [], []
+        for axis in axes:
+            found = [count_found(pool, axis, size * scale, calls, rng) for size in SIZES[unit]]
+            others += [each.others for each in found]
+            smallest = np.median(
+                [smallest_of(drift(choose(pool, COMPARED, rng)), axis) for _ in range(20)]
+            )
+            rows.append((CAMERA_AXES[axis], f"{smallest / scale:.2f}", *(f.text for f in found)))
+        title = (
+            f"{kind}: one camera of one of {COMPARED} results moved, named with its axis; "
+            f"another result or camera named too in {np.mean(others):.1%}"
+        )
+        heads = ("axis", f"detectable [{unit}]", *(f"{size:g} {unit}" for size in SIZES[unit]))
+        tables.append(Table(title, heads, tuple(rows)))
+    return tables
+
+
+def smallest_of(found: Drift, axis: int) -> float:
+    """The smallest detectable change of the first camera in the first result."""
+    smallest = next(iter(found.cameras.values()))[0].detectable
+    assert smallest is not None
+    return float(smallest[axis])
+
+
+def at_detectable(pools: dict[str, list[Calibration]], calls: int) -> Table:
+    """How often changes of multiples of the stated smallest detectable change are found."""
+    rng = np.random.default_rng(30)
+    rows = []
+    for kind in ("sharp", "shared"):
+        for axis in range(6):
+            cells = []
+            for times in TIMES:
+                found = [count_call(pools[kind], axis, None, times, rng) for _ in range(calls)]
+                cells.append(f"{np.mean([right for right, _ in found]):.0%}")
+            rows.append((f"{kind}, {CAMERA_AXES[axis]}", *cells))
+    heads = ("recordings, axis", *(f"{times:g} times" for times in TIMES))
+    title = f"moved by multiples of the stated smallest detectable change, {calls} calls each"
+    return Table(f"{title} (at 1: stated 90 %)", heads, tuple(rows))
+
+
+def count_found(pool: list[Calibration], axis: int, size: float, calls: int, rng: Rng) -> Found:
+    """Many calls with a camera moved along an axis."""
+    found = [count_call(pool, axis, size, 1.0, rng) for _ in range(calls)]
+    right, others = np.mean(found, axis=0)
+    return Found(float(right), float(others))
+
+
+def count_call(
+    pool: list[Calibration], axis: int, size: float | None, times: float, rng: Rng
+) -> tuple[bool, bool]:
+    """One call: whether the moved camera was named with its axis, and whether another was.
+
+    Args:
+        pool: of results.
+        axis: of the motion.
+        size: of it [rad or m]; that which is stated as detectable if None.
+        times: factor of the size.
+        rng: chooses results and direction.
+    """
+    chosen = choose(pool, COMPARED, rng)
+    if size is None:
+        size = smallest_of(drift(chosen), axis)
+    xi = np.zeros((2, 6))
+    xi[0, axis] = times * size * rng.choice([-1, 1])
+    first = chosen[0]
+    chosen[0] = replace(first, rig=displaced(first.rig, np.zeros(6), xi))
+    found = drift(chosen, **TOLERANCE)
+    name = next(iter(found.cameras))
+    others = any(what != (found.results[0], name) for what in found.changed)
+    return axis in found.cameras[name][0].axes, others
+
+
+if __name__ == "__main__":
+    main()
