@@ -114,10 +114,13 @@ class Apart:
         """(n, 6) standard deviations."""
         return np.sqrt(_variances(self.covariance))
 
+    def axes_beyond(self, limits: Limits) -> Mask:
+        """(n, 6) which axes are beyond the limits."""
+        return limits.exceeded(self.deviation, self.sigma, self.freedom)
+
     def beyond(self, limits: Limits) -> Mask:
         """(n,) whether an axis of a result is."""
-        beyond: Mask = limits.exceeded(self.deviation, self.sigma, self.freedom).any(axis=1)
-        return beyond
+        return np.asarray(self.axes_beyond(limits).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

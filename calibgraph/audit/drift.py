@@ -121,7 +121,7 @@ def _compare_camera(results: list[Calibration], name: str, limits: Limits) -> De
         return None
     T_camera_lidar = np.array([results[place].T_camera_lidar[name] for place in usable])
     covariance = np.array([results[place].covariance[name] for place in usable])
-    frames = np.array([results[place].counts[name]["frames_used"] for place in usable])
+    frames = np.array([results[place].counts[name].get("frames_used", 1) for place in usable])
     freedom = np.maximum(frames, 1.0) - 1.0 + PSEUDO_FRAMES
     return compare(poses_of(usable, T_camera_lidar, covariance, freedom), limits)
 
@@ -145,9 +145,7 @@ def _judge_camera(
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
-            axes = tuple(
-                np.flatnonzero(limits.exceeded(deviation, sigma, found.apart.freedom[row])).tolist()
-            )
+            axes = tuple(np.flatnonzero(found.apart.axes_beyond(limits)[row]).tolist())
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
         smallest = detectable(sigma, quantile)
@@ -216,12 +214,9 @@ def _lidar(
     if covariance is None:
         return None
     rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
-    deviation = np.concatenate(
-        [each.apart.deviation[row] for each, row in zip(seen.values(), rows, strict=True)]
-    )
-    freedom = np.min(
-        [each.apart.freedom[row] for each, row in zip(seen.values(), rows, strict=True)]
-    )
+    parts = [(each.apart, row) for each, row in zip(seen.values(), rows, strict=True)]
+    deviation = np.concatenate([apart.deviation[row] for apart, row in parts])
+    freedom = np.min([apart.freedom[row] for apart, row in parts])
     bases = [each.poses.base for each in seen.values()]
     return find_lidar_motion(deviation, covariance, bases, moved, float(limits.sigmas(freedom)))
 

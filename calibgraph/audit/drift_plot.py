@@ -31,6 +31,7 @@ _COLUMNS = (
 # Colours that differ for the colour-blind too (Okabe and Ito, "Color universal design").
 _AXIS_COLOURS = ("#0072B2", "#E69F00", "#009E73")
 _CHANGED = "#D55E00"
+_TURNED_DEG = 30.0  # names below the panels
 _APART = 0.16  # of two axes of one result, in results
 
 
@@ -83,7 +84,7 @@ def drift_figure(drift: Drift) -> Figure:
             _draw_panel(axes, entries, column, tolerance)
         grid[row, 0].set_title(name, loc="left", fontsize=10)
     for axes in grid[-1]:
-        axes.set_xticks(range(len(drift.results)), drift.results, rotation=30, ha="right")
+        axes.set_xticks(range(len(drift.results)), drift.results, rotation=_TURNED_DEG, ha="right")
     for axes in grid[0]:
         axes.legend(fontsize=8, ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
     figure.suptitle(

@@ -1,0 +1,101 @@
+"""drift: its exit codes, table, JSON and picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.audit.drifting import draw, template, twist
+from tests.cli.conftest import error_line
+from tests.conftest import Call
+
+
+@pytest.fixture(scope="module")
+def week(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of five days, in the last of which a camera has turned; and a wide one."""
+    folder, rng = tmp_path_factory.mktemp("week"), np.random.default_rng(0)
+    for day in ("mon", "tue", "wed", "thu"):
+        draw(rng).save(folder / day)
+    draw(rng, {"left": twist("yaw", 1.0)}).save(folder / "fri")
+    draw(rng, wider=24.0).save(folder / "fog")
+    return folder
+
+
+def test_results_that_agree_exit_with_0_and_the_json_names_its_units(
+    call: Call, week: Path
+) -> None:
+    code, out, err = call("drift", *(week / day for day in ("mon", "tue", "wed")), "--json")
+    assert (code, err) == (0, "")
+    content = json.loads(out)
+    assert content["status"] == "OK"
+    assert content["results"] == ["mon", "tue", "wed"]
+    each = content["cameras"]["left"]["results"]["tue"]
+    keys = {f"{k}_{u}" for k in ("deviation", "sigma", "detectable") for u in ("deg", "cm")}
+    assert set(each) == {"status", "reason", "axes", *keys}
+    assert all(len(each[key]) == 3 for key in keys)
+
+
+def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(call: Call, week: Path) -> None:
+    """Results may be given as files, too."""
+    days = [week / day / "calibration.yaml" for day in ("mon", "tue", "wed", "thu", "fri")]
+    code, out, err = call("drift", *days)
+    assert (code, out) == (1, "")
+    lines = err.splitlines()
+    assert lines[0] == "CHANGED"
+    assert lines[1].startswith("  CHANGED fri, left: turned about y (yaw) by +")
+    assert not lines[2].startswith("  CHANGED")
+    assert lines[-1] == "nothing was written"
+    assert "x right y down z ahead" in err  # no heading is cut
+
+
+def test_a_wide_error_bar_exits_with_3(call: Call, week: Path) -> None:
+    code, _, err = call("drift", week / "mon", week / "fog")
+    assert code == 3
+    assert err.startswith("CANNOT TELL\n")
+
+
+def test_the_picture_is_drawn_and_replaces_only_its_own(
+    call: Call, week: Path, tmp_path: Path
+) -> None:
+    given = ("drift", week / "mon", week / "tue", week / "fri", "--plot")
+    for _ in range(2):
+        assert call(*given, tmp_path / "drift.png")[0] == 1
+    picture = Image.open(tmp_path / "drift.png")
+    assert min(picture.size) > 300
+    other = tmp_path / "other.png"
+    picture.save(other)
+    before = other.read_bytes()
+    assert "was not written by calibgraph drift" in error_line(*call(*given, other))
+    assert other.read_bytes() == before
+    assert ".png" in error_line(*call(*given, tmp_path / "drift.txt"))
+
+
+def test_dates_make_the_trend_one_per_day(call: Call, week: Path) -> None:
+    dates = "2026-03-02,2026-03-03,2026-03-09"
+    results = (week / day for day in ("mon", "tue", "wed"))
+    code, out, _ = call("drift", *results, "--days", dates, "--json")
+    assert code == 0
+    trend = json.loads(out)["cameras"]["right"]["trend"]
+    assert trend["per"] == "day"
+    assert len(trend["slope_deg"]) == 3
+
+
+def test_bad_input_is_one_line(call: Call, week: Path, tmp_path: Path) -> None:
+    mon, tue = week / "mon", week / "tue"
+    cases = {
+        (mon,): "1 result given; a comparison needs two or more",
+        (mon, mon): "is the same result as",
+        (mon, tmp_path / "none"): "none",
+        (mon, tue, "--tolerance-deg", "0"): "tolerance_deg must be positive",
+        (mon, tue, "--days", "0,soon"): "expected a date like 2026-03-01 or a number",
+        (mon, tue, "--days", "0,1,2"): "expected 2 finite numbers",
+    }
+    for arguments, words in cases.items():
+        assert words in error_line(*call("drift", *arguments))
+    rig = tmp_path / "rig.yaml"
+    template().rig.save(rig)
+    assert "expected calibgraph-calibration/1" in error_line(*call("drift", mon, rig))
