@@ -61,7 +61,9 @@ class _AtOnce:
 
     def submit(self, task: Task) -> Future[Outcome]:
         numbers = tuple(np.random.default_rng(task.job.row).random(36).tolist())
-        cameras = tuple(CameraResult(f"c{i}", "PASS", (), numbers[:16], numbers) for i in range(6))
+        cameras = tuple(
+            CameraResult(f"c{i}", "PASS", False, (), numbers[:16], numbers) for i in range(6)
+        )
         future: Future[Outcome] = Future()
         future.set_result(
             Outcome(cameras=cameras, versions='{"calibgraph": "0.1.0"}', log="x" * 500)

@@ -36,7 +36,8 @@ _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 def print_result(console: Console, result: Calibration, written: list[Path]) -> None:
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
     status = result.verdict.status
-    console.print(f"[bold {_COLOURS[status]}]{status}[/]", highlight=False)
+    cannot_tell = ": these data cannot tell" if result.verdict.cannot_tell else ""
+    console.print(f"[bold {_COLOURS[status]}]{status}[/]{cannot_tell}", highlight=False)
     reasons = group_reasons(result.camera_verdicts, result.weaknesses)
     for reason in reasons[:MAX_REASONS]:
         print_plain(console, f"  {reason.status:5}{reason.cameras}: {reason.text}")
@@ -46,9 +47,9 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     console.print(result_table(result))
     config = result.config
     console.print(
-        f"off: probability of an error over {config.tolerance_deg:g} deg or "
-        f"{config.tolerance_cm:g} cm; moved: from the guess; median: error of all matches, in "
-        "pixels; inliers, matches: within the gate"
+        "?: the data cannot tell; off: probability of an error over "
+        f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm; moved: from the "
+        "guess; median: error of all matches, in pixels; inliers, matches: within the gate"
     )
     console.print(error_bar_table(result))
     console.print(
@@ -96,7 +97,7 @@ def result_table(result: Calibration) -> Table:
         verdict = result.camera_verdicts[name]
         table.add_row(
             escape(name),
-            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
+            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]{' ?' if verdict.cannot_tell else ''}",
             "-" if verdict.doubt is None else verdict.doubt.percent,
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",

@@ -35,6 +35,7 @@ class RemoteJob:
         state: queued, running, succeeded, failed or cancelled.
         stage, done, total: how far it is, while it runs.
         verdict: of the result; None as long as there is none.
+        cannot_tell: whether the data determine too little for another one; None if unknown.
         error: why it failed, in one line.
     """
 
@@ -45,6 +46,7 @@ class RemoteJob:
     done: int = 0
     total: int = 0
     verdict: str | None = None
+    cannot_tell: bool | None = None
     error: str | None = None
 
     @property
@@ -64,6 +66,7 @@ def job_of(answer: Mapping[str, Any]) -> RemoteJob:
         done=progress.get("done", 0),
         total=progress.get("total", 0),
         verdict=answer.get("verdict"),
+        cannot_tell=answer.get("cannot_tell"),
         error=error.get("detail"),
     )
 

@@ -119,6 +119,7 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
         CameraResult(
             camera=name,
             verdict=result.camera_verdicts[name].status,
+            cannot_tell=result.camera_verdicts[name].cannot_tell,
             reasons=tuple(result.camera_verdicts[name].reasons),
             T_camera_lidar=tuple(T.ravel().tolist()),
             covariance=None if (c := covariance[name]) is None else tuple(c.ravel().tolist()),

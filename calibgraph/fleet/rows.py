@@ -35,6 +35,7 @@ SCHEMA = pa.schema(
         ("camera", pa.string()),
         ("status", pa.string()),
         ("verdict", pa.string()),
+        ("cannot_tell", pa.bool_()),
         ("reasons", pa.list_(pa.string())),
         ("T_camera_lidar", pa.list_(pa.float64(), 16)),
         ("covariance", pa.list_(pa.float64(), 36)),

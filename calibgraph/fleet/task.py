@@ -61,6 +61,7 @@ class CameraResult:
     Attributes:
         camera: its name.
         verdict: PASS, WARN or FAIL.
+        cannot_tell: whether it is WARN because the data determine too little.
         reasons: of the verdict.
         T_camera_lidar: 16 numbers by rows.
         covariance: 36 numbers by rows; None without an error bar.
@@ -68,6 +69,7 @@ class CameraResult:
 
     camera: str
     verdict: str
+    cannot_tell: bool
     reasons: tuple[str, ...]
     T_camera_lidar: tuple[float, ...]
     covariance: tuple[float, ...] | None

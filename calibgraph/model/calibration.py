@@ -274,4 +274,9 @@ def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
 
 def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
     doubt = None if verdict.doubt is None else vars(verdict.doubt)
-    return {"status": verdict.status, "doubt": doubt, "reasons": list(verdict.reasons)}
+    return {
+        "status": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
+        "doubt": doubt,
+        "reasons": list(verdict.reasons),
+    }

@@ -15,6 +15,22 @@ PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
 """Probabilities that a result is off by more than the tolerance, where verdicts are cut."""
 TOLERANCE = (0.5, 10.0)
 """Rotation [deg] and distance [cm] that users tolerate if they state nothing else."""
+ABOUT_THE_DATA = frozenset(
+    {
+        "correspondences",
+        "correspondences_used",
+        "difference between even and odd frames",  # too few frames to split
+        "focal_sensitivity",
+        "frames",
+        "image evidence",
+        "prior_share",
+        "repeated_frames",
+        "sigma_rotation",
+        "sigma_translation",
+        "terms",
+    }
+)
+"""Kinds of checks of how much the data determine: beyond a limit, nothing seems wrong yet."""
 _SURE = 0.99
 _LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
 
@@ -123,9 +139,14 @@ class Doubt:
         return f"off by more than {tolerated} with a probability"
 
     @property
+    def of_error_bar(self) -> bool:
+        """Whether it is a doubt, and rather by a wide error bar than by checks."""
+        return self.status != "PASS" and self.by_error_bar >= self.by_checks
+
+    @property
     def advice(self) -> str:
         """What to do if the data cannot tell more; empty if something seems wrong."""
-        if self.status == "PASS" or self.by_error_bar < self.by_checks:
+        if not self.of_error_bar:
             return ""
         return ": the data cannot tell, by the error bar; record more frames, at more places"
 
@@ -138,10 +159,12 @@ class Verdict:
         checks: all checks, in order.
         doubt: the probability that it is off; without it, as while driving, the checks alone
             decide.
+        cameras: of a rig's verdict, those of its cameras.
     """
 
     checks: tuple[Check, ...] = ()
     doubt: Doubt | None = None
+    cameras: tuple[Verdict, ...] = ()
 
     @property
     def status(self) -> Status:
@@ -157,6 +180,28 @@ class Verdict:
         if self.doubt.status == "PASS" and worst != "PASS":
             return "WARN"
         return self.doubt.status
+
+    @property
+    def cannot_tell(self) -> bool:
+        """Whether it is WARN because the data determine too little, not because something is odd.
+
+        So if the error bar leaves more doubt than the checks do, or if the only checks beyond a
+        limit are of how much the data determine. Of a rig, if this is so of every camera that is
+        not PASS.
+        """
+        if self.status != "WARN":
+            return False
+        if self.cameras:
+            return all(each.cannot_tell for each in self.cameras if each.status != "PASS")
+        if self.doubt is not None and self.doubt.of_error_bar:
+            return True
+        beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
+        return bool(beyond) and beyond <= ABOUT_THE_DATA
+
+    @property
+    def label(self) -> str:
+        """The status for people: CANNOT TELL in place of such a WARN."""
+        return "CANNOT TELL" if self.cannot_tell else self.status
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -179,7 +224,7 @@ def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
     )
     doubts = [verdict.doubt for verdict in cameras.values() if verdict.doubt is not None]
     worst = max(doubts, key=lambda doubt: (doubt.status == "FAIL", doubt.probability), default=None)
-    return Verdict(checks, worst)
+    return Verdict(checks, worst, tuple(cameras.values()))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
             "verdict": result.camera_verdicts[name].status,
+            "cannot_tell": result.camera_verdicts[name].cannot_tell,
             "probability_off": _probability(result.camera_verdicts[name]),
             "reasons": list(result.camera_verdicts[name].reasons),
             **_sigmas(result, name),
@@ -38,6 +39,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         }
     return {
         "verdict": result.verdict.status,
+        "cannot_tell": result.verdict.cannot_tell,
         "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
         "cameras": cameras,

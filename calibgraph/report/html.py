@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
+    "CANNOT TELL": "With care: nothing seems wrong, but these data do not determine it well enough "
+    "for the tolerance. Record more frames, at more places; the reasons name what is missing.",
     "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
     "and look at the pictures.",
     "FAIL": "No. Do not use this result; the reasons below name what to correct.",
@@ -68,7 +70,7 @@ def report_html(result: Calibration) -> str:
     return environment.from_string(template).render(
         result=result,
         cameras=cameras,
-        usable=_CAN_I_USE_IT[result.verdict.status],
+        usable=_CAN_I_USE_IT[result.verdict.label],
         accuracy=_accuracy(result),
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
         reasons=group_reasons(verdicts, weaknesses),

@@ -46,6 +46,8 @@ class JobAnswer(BaseModel):
         created, started, finished: times (UTC); null if not yet.
         progress: of a running job.
         verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        cannot_tell: whether the data determine too little for another verdict: of a WARN that
+            nothing odd was found behind, and of CANNOT TELL; null as long as there is none.
         error: of a failed job.
     """
 
@@ -57,6 +59,7 @@ class JobAnswer(BaseModel):
     finished: datetime | None
     progress: Progress | None
     verdict: str | None
+    cannot_tell: bool | None
     error: JobError | None
 
 
@@ -84,6 +87,7 @@ def job_answer(record: JobRecord, step: Step | None) -> JobAnswer:
         finished=None if record.finished_s is None else utc(record.finished_s),
         progress=Progress(**vars(step)) if is_running and step else None,
         verdict=record.verdict,
+        cannot_tell=record.cannot_tell,
         error=JobError(kind=record.error_kind or "internal error", detail=record.error)
         if record.error is not None
         else None,

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import (
     BigInteger,
+    Boolean,
     Column,
     Engine,
     Float,
@@ -21,6 +22,7 @@ from sqlalchemy import (
     event,
     inspect,
     select,
+    text,
 )
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
@@ -48,6 +50,7 @@ jobs = Table(
     Column("finished_s", Float),
     Column("starts", Integer, nullable=False),
     Column("verdict", String(16)),
+    Column("cannot_tell", Boolean),
     Column("error_kind", String(16)),
     Column("error", Text),
     UniqueConstraint("tenant", "idempotency_key"),
@@ -86,11 +89,20 @@ def open_database(folder: Path, url: str | None, owner: str) -> Engine:
         engine = _engine(folder, url)
         if inspect(engine).has_table("about") or not inspect(engine).get_table_names():
             tables.create_all(engine)
+            _add_columns(engine)
         _require_ours(engine, where, owner)
     except (SQLAlchemyError, ImportError, ArgumentError, NoSuchModuleError) as error:
         why = str(getattr(error, "orig", None) or error).split("\n")[0]
         raise CalibrationError(f"{where}: cannot be opened ({why}); check --database") from error
     return engine
+
+
+def _add_columns(engine: Engine) -> None:
+    """Add the columns that a database of an earlier version has not."""
+    held = {column["name"] for column in inspect(engine).get_columns("jobs")}
+    if "cannot_tell" not in held:
+        with engine.begin() as connection:
+            connection.execute(text("ALTER TABLE jobs ADD COLUMN cannot_tell BOOLEAN"))
 
 
 def _engine(folder: Path, url: str | None) -> Engine:

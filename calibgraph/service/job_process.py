@@ -38,7 +38,7 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
     (task.folder / WORK / FILES).mkdir(parents=True)
     os.chdir(task.folder / INPUT)
     try:
-        return JobOutcome(verdict=_run(task, _progress(note)))
+        return _run(task, _progress(note))
     except MemoryError:
         kind: ErrorKind = "out of memory"
         text = "not enough memory; give fewer frames, or smaller files"
@@ -54,15 +54,15 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
     return JobOutcome(error_kind=kind, error=str(CalibrationError(text)))
 
 
-def _run(task: JobTask, progress: Progress) -> str:
-    """Make the result; its verdict."""
+def _run(task: JobTask, progress: Progress) -> JobOutcome:
+    """Make the result."""
     job = task.job
     rig = _found(task, RIG)
     table = _found(task, TABLE)
     recordings = [
         path for i in range(job.recordings) if (path := _found(task, recording_name(i))) is not None
     ]
-    run: Callable[[JobTask, Path | None, Path | None, list[Path], Progress], str]
+    run: Callable[[JobTask, Path | None, Path | None, list[Path], Progress], JobOutcome]
     run = {"solve": _solve, "calibration": _calibrate, "check": _check}[job.kind]
     return run(task, rig, table, recordings, progress)
 
@@ -122,7 +122,7 @@ def _link(task: JobTask, uri: str, name: str) -> Path:
 
 def _solve(
     task: JobTask, rig: Path | None, table: Path | None, _: list[Path], progress: Progress
-) -> str:
+) -> JobOutcome:
     from calibgraph.files import sha256
     from calibgraph.io.rigs import load_rig
     from calibgraph.pipeline import solve
@@ -138,7 +138,7 @@ def _solve(
 
 def _calibrate(
     task: JobTask, rig: Path | None, table: Path | None, recordings: list[Path], progress: Progress
-) -> str:
+) -> JobOutcome:
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.structure import StructureMatcher
@@ -165,18 +165,18 @@ def _calibrate(
     return _write(task, result, data, with_report=settings.report)
 
 
-def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> str:
+def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> JobOutcome:
     from calibgraph.report.as_json import result_summary
     from calibgraph.report.result_files import write_result
 
     written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
-    return result.verdict.status
+    return JobOutcome(result.verdict.status, result.verdict.cannot_tell)
 
 
 def _check(
     task: JobTask, rig: Path | None, _: Path | None, recordings: list[Path], progress: Progress
-) -> str:
+) -> JobOutcome:
     from calibgraph.audit import audit_summary, check
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
@@ -197,7 +197,7 @@ def _check(
         progress=progress,
     )
     _write_summary(task, audit_summary(audit))
-    return audit.status
+    return JobOutcome(audit.status, audit.status == "CANNOT TELL")
 
 
 def _write_summary(task: JobTask, summary: dict[str, Any]) -> None:

@@ -44,9 +44,11 @@ class JobOutcome:
 
     Attributes:
         verdict: of the result; None if it failed.
+        cannot_tell: whether the data determine too little for another one.
         error_kind, error: why it failed, in one line.
     """
 
     verdict: str | None = None
+    cannot_tell: bool | None = None
     error_kind: ErrorKind | None = None
     error: str | None = None

@@ -37,6 +37,7 @@ class JobRecord:
         created_s, started_s, finished_s: times since 1970; None if not yet.
         starts: how often it was started.
         verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        cannot_tell: whether the data determine too little for another one; None if unknown.
         error_kind, error: why it failed, in one line.
         idempotency_key: that the request had.
     """
@@ -51,6 +52,7 @@ class JobRecord:
     finished_s: float | None
     starts: int
     verdict: str | None
+    cannot_tell: bool | None
     error_kind: ErrorKind | None
     error: str | None
     idempotency_key: str | None = None
@@ -177,13 +179,14 @@ class JobTable:
         state: JobState,
         *,
         verdict: str | None = None,
+        cannot_tell: bool | None = None,
         error_kind: ErrorKind | None = None,
         error: str | None = None,
     ) -> bool:
         """Give a running job its final state; False if it has one."""
         values = {
-            "state": state, "verdict": verdict, "error_kind": error_kind, "error": error,
-            "finished_s": time.time(),
+            "state": state, "verdict": verdict, "cannot_tell": cannot_tell,
+            "error_kind": error_kind, "error": error, "finished_s": time.time(),
         }  # fmt: skip
         return self._change(_is(id, "running"), values) > 0
 

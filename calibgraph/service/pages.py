@@ -79,7 +79,7 @@ class JobView:
 
 def job_view(record: JobRecord, step: Step | None) -> JobView:
     """A job as a page shows it."""
-    result = record.verdict or record.state
+    result = "CANNOT TELL" if record.cannot_tell else record.verdict or record.state
     took = ""
     if record.started_s is not None and record.finished_s is not None:
         took = _in_words(record.finished_s - record.started_s)
@@ -133,6 +133,7 @@ def camera_table(cameras: Mapping[str, Any]) -> tuple[list[str], list[CameraView
 
 def _camera_view(name: str, camera: Mapping[str, Any], rows: Sequence[_Row]) -> CameraView:
     verdict = str(camera.get("status") or camera.get("verdict"))
+    verdict = "CANNOT TELL" if camera.get("cannot_tell") else verdict
     numbers = tuple(_numbers(camera, path, form) for _, path, form in rows)
     return CameraView(name, verdict, mark_of(verdict), numbers)
 

@@ -91,6 +91,7 @@ class TrackerState(BaseModel):
     Attributes:
         frame: last frame that was taken in; null if none.
         verdict: of the estimate: PASS, WARN or FAIL.
+        cannot_tell: whether it is WARN because the data determine too little.
         reasons: of the verdict.
         cameras: per camera, as in a result.
         events: the last ones.
@@ -98,6 +99,7 @@ class TrackerState(BaseModel):
 
     frame: int | None
     verdict: str
+    cannot_tell: bool
     reasons: list[str]
     cameras: dict[str, Any]
     events: list[dict[str, Any]]

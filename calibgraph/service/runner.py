@@ -190,7 +190,8 @@ class Runner:
             self._table.put_back(record.id)
         elif outcome.error_kind is None and outcome.verdict is not None:
             self._keep_result(record.id)
-            self._table.finish(record.id, "succeeded", verdict=outcome.verdict)
+            self._table.finish(record.id, "succeeded", verdict=outcome.verdict,
+                               cannot_tell=outcome.cannot_tell)  # fmt: skip
         else:
             self._table.finish(
                 record.id, "failed", error_kind=outcome.error_kind, error=outcome.error

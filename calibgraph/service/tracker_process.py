@@ -232,6 +232,7 @@ def _state(tracker: _Open) -> dict[str, Any]:
     return {
         "frame": tracker.calibrator.tracker.frame,
         "verdict": summary["verdict"],
+        "cannot_tell": summary["cannot_tell"],
         "reasons": summary["reasons"],
         "cameras": finite(summary["cameras"]),
         "events": _events(tracker.folder),

@@ -33,6 +33,7 @@ def _camera(update: Update, name: str) -> dict[str, Any]:
         "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
         "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
         "verdict": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
         "used": update.used.get(name, 0),
         "left_out": name in update.left_out,

@@ -79,8 +79,9 @@ def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
     assert stderr == ""
     summary = json.loads(stdout)
     keys = {"verdict", "probability_off", "reasons", "cameras", "pairs", "timings_s", "files"}
-    assert set(summary) == keys
+    assert set(summary) == {*keys, "cannot_tell"}
     assert summary["verdict"] == "PASS"
+    assert summary["cannot_tell"] is False
     each = [camera["probability_off"] for camera in summary["cameras"].values()]
     assert 0 < summary["probability_off"] == max(each) < 0.005
     assert np.array(summary["cameras"]["left"]["T_camera_lidar"]).shape == (4, 4)

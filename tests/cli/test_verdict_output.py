@@ -54,3 +54,38 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     assert "xi = (rotation [rad], translation [m])" in content["covariance_of"]
     assert "in the axes of B" in content["pair_covariance_of"]
     assert content["config"]["bootstrap"] == 5
+
+
+def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(
+    call: Call, tmp_path: Path, pair: Rig
+) -> None:
+    """In the terminal, in JSON, in the file and on the page; the exit code is that of a WARN."""
+    pair.save(tmp_path / "rig.yaml")
+    simulate_correspondences(pair, frames=3, matches=60).save(tmp_path / "few.parquet")
+    out = tmp_path / "out"
+    command = ("solve", tmp_path / "rig.yaml", tmp_path / "few.parquet", "--out", out)
+    code, _, text = call(*command)
+    assert code == 0
+    assert text.startswith("WARN: these data cannot tell\n")
+    assert "WARN ?" in text
+    summary = yaml.safe_load(call(*command, "--json")[1])
+    assert summary["verdict"] == "WARN"
+    assert summary["cannot_tell"] is True
+    assert {camera["cannot_tell"] for camera in summary["cameras"].values()} == {True}
+    assert "<title>CANNOT TELL" in (out / "report.html").read_text()
+    content = yaml.safe_load((out / "calibration.yaml").read_text())
+    assert content["verdict"]["status"] == "WARN"
+    assert content["verdict"]["cannot_tell"] is True
+    assert content["camera_verdicts"]["left"]["cannot_tell"] is True
+
+
+def test_a_result_of_before_the_distinction_is_read_and_has_it(tmp_path: Path, pair: Rig) -> None:
+    table = simulate_correspondences(pair, frames=3, matches=60)
+    path = calibgraph.solve(pair, table).save(tmp_path)
+    content = yaml.safe_load(path.read_text())
+    for verdict in (content["verdict"], *content["camera_verdicts"].values()):
+        del verdict["cannot_tell"]
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    loaded = calibgraph.load_calibration(tmp_path)
+    assert loaded.verdict.cannot_tell
+    assert loaded.camera_verdicts["left"].cannot_tell

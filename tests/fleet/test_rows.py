@@ -41,6 +41,18 @@ def test_columns_that_only_some_rows_have_are_null_in_the_others(tmp_path: Path)
     assert by_vehicle == {"a": None, "a-2": "2026-03"}
 
 
+def test_rows_of_before_the_distinction_of_warnings_are_kept_beside_new_ones(
+    tmp_path: Path,
+) -> None:
+    place = SCHEMA.get_field_index("cannot_tell")
+    earlier = rows("a").replace_schema_metadata(None).drop_columns(["cannot_tell"])
+    store = RowStore(str(tmp_path))
+    store.publish(earlier)
+    store.publish(rows("a", camera="left").set_column(place, "cannot_tell", pa.array([True])))
+    store.publish(rows("b"))
+    assert set(read_rows(str(tmp_path)).column_names) == set(SCHEMA.names)
+
+
 def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / f"bucket={bucket_of('a'):02x}" / "rows.parquet"
     path.parent.mkdir()

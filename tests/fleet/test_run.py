@@ -100,6 +100,7 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
     for camera, T in result.T_camera_lidar.items():
         row = fleet.rows[name, camera]
         assert row["verdict"] == result.camera_verdicts[camera].status
+        assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
         # The sums of one thread and of several differ in their rounding.
         np.testing.assert_allclose(np.reshape(row["T_camera_lidar"], (4, 4)), T, atol=1e-9)
         np.testing.assert_allclose(

@@ -33,6 +33,8 @@ QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 NO_TRANSFORM = "the inverse of an information matrix or a normal equation, not of a transform"
 INVERTING = {
+    "calibgraph/audit/common_pose.py": NO_TRANSFORM,
+    "calibgraph/audit/trend.py": NO_TRANSFORM,
     "calibgraph/fleet/centers.py": NO_TRANSFORM,
     "calibgraph/fleet/deviations.py": NO_TRANSFORM,
     "calibgraph/fleet/findings.py": NO_TRANSFORM,

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sqlalchemy import inspect, text
 from starlette.testclient import TestClient
 
 from calibgraph import load_rig, solve
 from calibgraph.service.app import create_app
+from calibgraph.service.database import open_database
+from calibgraph.service.jobs import JobTable
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
 
@@ -50,6 +53,21 @@ def test_a_result_has_files_a_report_and_exports(working: TestClient, solved: st
     assert "sandbox" in report.headers["content-security-policy"]
     assert b"<robot" in working.get(f"{at}/exports/urdf").content
     assert working.get(f"{at}/exports/nonsense").status_code == 404
+
+
+def test_a_job_states_whether_the_data_could_tell(working: TestClient, solved: str) -> None:
+    assert working.get(f"/v1/jobs/{solved}").json()["cannot_tell"] is False
+
+
+def test_a_database_of_before_that_field_gets_its_column(tmp_path: Path) -> None:
+    engine = open_database(tmp_path, None, "owner")
+    with engine.begin() as connection:
+        connection.execute(text("ALTER TABLE jobs DROP COLUMN cannot_tell"))
+    engine.dispose()
+    engine = open_database(tmp_path, None, "owner")
+    assert "cannot_tell" in {column["name"] for column in inspect(engine).get_columns("jobs")}
+    assert JobTable(engine).ids() == set()
+    engine.dispose()
 
 
 def test_events_end_with_the_result(working: TestClient, solved: str) -> None:
