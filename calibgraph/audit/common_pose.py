@@ -64,9 +64,8 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freed
         covariance: (n, 6, 6) of xi in T_camera_lidar = exp(xi) estimate; positive definite.
         freedom: (n,) degrees of freedom of the covariances.
     """
-    from_first = twists_between(T_camera_lidar, T_camera_lidar[0])
-    apart = np.linalg.norm(from_first - np.median(from_first, axis=0), axis=1)
-    base = T_camera_lidar[int(np.argmin(apart))]
+    apart = [np.linalg.norm(twists_between(T_camera_lidar, T), axis=1) for T in T_camera_lidar]
+    base = T_camera_lidar[int(np.argmin(np.sum(apart, axis=1)))]
     twist = -twists_between(T_camera_lidar, base)
     information: Array = np.asarray(np.linalg.inv(covariance), np.float64)
     return Poses(np.array(results, np.intp), base, twist, covariance, information, freedom)
@@ -173,15 +172,14 @@ def compare(poses: Poses, limits: Limits) -> Deviations:
 
 def _from_others(poses: Poses, kept: Mask) -> Apart:
     """Each result from the mean of the others among those that are kept."""
-    own = np.where(kept[:, None, None], poses.information, 0.0)
-    weighted = np.einsum("nij,nj->ni", own, poses.twist)
-    of_mean = np.linalg.inv(own.sum(axis=0) - own)
-    mean = np.einsum("nij,nj->ni", of_mean, weighted.sum(axis=0) - weighted)
+    others = (kept & ~np.eye(len(poses), dtype=np.bool_)).astype(np.float64)
+    weighted = np.einsum("nij,nj->ni", poses.information, poses.twist)
+    of_mean = np.linalg.inv(np.tensordot(others, poses.information, axes=1))
+    mean = np.einsum("nij,nj->ni", of_mean, others @ weighted)
     covariance = poses.covariance + of_mean
-    of_others = poses.freedom[kept].sum() - poses.freedom * kept
-    freedom = _variances(covariance) ** 2 / (
-        _variances(poses.covariance) ** 2 / poses.freedom[:, None]
-        + _variances(of_mean) ** 2 / of_others[:, None]
+    own = _variances(poses.covariance) / _variances(covariance)
+    freedom = 1 / (
+        own**2 / poses.freedom[:, None] + (1 - own) ** 2 / (others @ poses.freedom)[:, None]
     )
     return Apart(poses.twist - mean, covariance, freedom)
 

@@ -224,7 +224,7 @@ def _lidar(
 def _joint_covariance(
     place: int, results: list[Calibration], seen: dict[str, Deviations]
 ) -> Array | None:
-    """(6 N, 6 N) of one result's deviations of these cameras; None where a result has none."""
+    """(6 N, 6 N) of one result's deviations of these cameras; None if it is not known."""
     gains = {name: each.coefficients(int(np.flatnonzero(each.poses.results == place)[0]))
              for name, each in seen.items()}  # fmt: skip
     whole = np.zeros((6 * len(seen), 6 * len(seen)))
@@ -240,4 +240,4 @@ def _joint_covariance(
         columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in seen])
         gain = block_diag(*parts)
         whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
-    return whole
+    return whole if np.linalg.eigvalsh(whole)[0] > 0 else None

@@ -83,6 +83,20 @@ def test_of_two_results_it_is_not_known_which_changed() -> None:
         assert "of two results it is not known which changed" in each.reason
 
 
+def test_a_camera_that_looks_back_is_named_though_its_twist_has_two_signs() -> None:
+    for place in range(3):
+        found = calibgraph.drift(results(4, 3, **{f"r{place}": {"left": twist("pitch", 180.0)}}))
+        assert found.changed == ((str(place), "left"),)
+
+
+def test_a_result_that_is_much_sharper_than_the_others_is_compared_with_them() -> None:
+    rng = np.random.default_rng(5)
+    given = [draw(rng, {"left": twist("yaw", 1.0)}, wider=1e-7), *(draw(rng) for _ in range(4))]
+    found = calibgraph.drift(given)
+    assert found.changed == (("result 1", "left"),)
+    assert abs(np.degrees(found.cameras["left"][0].deviation[1]) - 1.0) < 0.1
+
+
 def test_two_against_two_is_no_majority() -> None:
     move = {"left": twist("roll", 2.0)}
     found = calibgraph.drift(results(5, 4, r1=move, r3=move))
