@@ -158,6 +158,7 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
     squared = None if covariance is None else float(xi @ np.linalg.solve(covariance, xi)) / 6
     return {
         "status": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
         "error_deg": error.rotation_error_deg,
         "error_cm": error.translation_error_cm,

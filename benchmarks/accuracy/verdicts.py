@@ -190,8 +190,21 @@ def figures(counted: list[Record]) -> Table:
              share(len(_passed(counted)), len(wrong_cases))),
             (f"PASS or WARN, of results within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases "
              "that were refused", share(calm, right + refused_good)),
+            *((f"cannot_tell, of WARN of results that are {which}", _unsure(counted, which))
+              for which in ("off", "right")),
         ),
     )  # fmt: skip
+
+
+def _unsure(counted: list[Record], which: str) -> str:
+    """Of the results of a class that WARN, those for lack of data."""
+    warned = [
+        camera.get("cannot_tell", False)
+        for record in counted
+        for camera in record.get("cameras", {}).values()
+        if (class_of(camera), camera["status"]) == (which, "WARN")
+    ]
+    return share(sum(warned), len(warned))
 
 
 def remarks(records: list[Record], counted: list[Record]) -> list[str]:
