@@ -19,7 +19,7 @@ def drift(
     results: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RESULT RESULT...",
+            metavar="RESULT...",
             help="Results of one rig: their folders, or calibration.yaml files.",
         ),
     ],
@@ -39,7 +39,9 @@ def drift(
     ] = 10.0,
     own_lenses: Annotated[
         bool,
-        typer.Option("--own-lenses", help="Lenses may differ: several vehicles, each with its own"),
+        typer.Option(
+            "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+        ),
     ] = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw the deviations, per camera.")
