@@ -172,16 +172,23 @@ def compare(poses: Poses, limits: Limits) -> Deviations:
 
 def _from_others(poses: Poses, kept: Mask) -> Apart:
     """Each result from the mean of the others among those that are kept."""
-    others = (kept & ~np.eye(len(poses), dtype=np.bool_)).astype(np.float64)
-    weighted = np.einsum("nij,nj->ni", poses.information, poses.twist)
-    of_mean = np.linalg.inv(np.tensordot(others, poses.information, axes=1))
-    mean = np.einsum("nij,nj->ni", of_mean, others @ weighted)
+    W = np.where(kept[:, None, None], poses.information, 0.0)
+    of_mean = np.linalg.inv(_sums_of_others(W))
+    weighted = _sums_of_others(np.einsum("nij,nj->ni", W, poses.twist))
+    mean = np.einsum("nij,nj->ni", of_mean, weighted)
     covariance = poses.covariance + of_mean
     own = _variances(poses.covariance) / _variances(covariance)
-    freedom = 1 / (
-        own**2 / poses.freedom[:, None] + (1 - own) ** 2 / (others @ poses.freedom)[:, None]
-    )
+    of_others = _sums_of_others(poses.freedom * kept)[:, None]
+    freedom = 1 / (own**2 / poses.freedom[:, None] + (1 - own) ** 2 / of_others)
     return Apart(poses.twist - mean, covariance, freedom)
+
+
+def _sums_of_others(values: Array) -> Array:
+    """Per entry of the first axis, the sum of all others; exact where one is far the largest."""
+    before, after = np.zeros_like(values), np.zeros_like(values)
+    before[1:] = np.cumsum(values[:-1], axis=0)
+    after[:-1] = np.cumsum(values[:0:-1], axis=0)[::-1]
+    return before + after
 
 
 def _agreeing(poses: Poses, limits: Limits) -> Mask:

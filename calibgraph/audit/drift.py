@@ -207,9 +207,9 @@ def _lidar(
 ) -> LidarAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate, if one does."""
     seen = {name: each for name, each in compared.items() if place in each.poses.results}
-    if len(seen) < 2:  # noqa: PLR2004 - one camera cannot be told from the LiDAR
-        return None
     moved = [k for k, name in enumerate(seen) if judged[name][place].status == "CHANGED"]
+    if len(seen) < 2 or not moved:  # noqa: PLR2004 - one camera cannot be told from the LiDAR
+        return None
     covariance = _joint_covariance(place, results, seen)
     if covariance is None:
         return None

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
-
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -34,13 +32,15 @@ def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
     loaded = [item if isinstance(item, Calibration) else load_calibration(item) for item in items]
     if len(loaded) < 2:  # noqa: PLR2004 - a comparison
         raise CalibrationError(f"{len(loaded)} result given; a comparison needs two or more")
-    for place, name in enumerate(names):
-        for before in range(place):
-            if _are_same(loaded[before], loaded[place]):
-                raise CalibrationError(
-                    f"{name}: is the same result as {names[before]}; give each once"
-                )
-        _require_same_rig(names[0], loaded[0], name, loaded[place], own_lenses=own_lenses)
+    seen: dict[bytes, str] = {}
+    for name, result in zip(names, loaded, strict=True):
+        extrinsics = b"".join(T.tobytes() for _, T in sorted(result.T_camera_lidar.items()))
+        if extrinsics in seen:  # equal to the last bit: a copy
+            raise CalibrationError(
+                f"{name}: is the same result as {seen[extrinsics]}; give each once"
+            )
+        seen[extrinsics] = name
+        _require_same_rig(names[0], loaded[0], name, result, own_lenses=own_lenses)
     return dict(zip(names, loaded, strict=True))
 
 
@@ -54,12 +54,6 @@ def _names(given: Sequence[Result]) -> list[str]:
         return [str(item) for item in given]
     common = os.path.commonpath([end.parent for end in ends])
     return [str(end.relative_to(common)) for end in ends]
-
-
-def _are_same(one: Calibration, two: Calibration) -> bool:
-    """Whether all extrinsics are equal to the last bit: a copy."""
-    a, b = one.T_camera_lidar, two.T_camera_lidar
-    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
 
 
 def _require_same_rig(

@@ -102,7 +102,7 @@ class Drift:
 
     @property
     def changed(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of a result and what CHANGED there: "LiDAR", or a camera."""
+        """Pairs of a result and what CHANGED there: "LiDAR", or a camera. Without the trends."""
         found = []
         for place, (result, lidar) in enumerate(zip(self.results, self.lidar, strict=True)):
             moved = [name for name, each in self.cameras.items()

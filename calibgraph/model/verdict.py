@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
-Direction = Literal["at most", "at least"]
 
 _ORDER: tuple[Status, ...] = ("PASS", "WARN", "FAIL")
 PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
@@ -32,7 +31,6 @@ ABOUT_THE_DATA = frozenset(
 )
 """Kinds of checks of how much the data determine: beyond a limit, nothing seems wrong yet."""
 _SURE = 0.99
-_LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
 
 
 @dataclass(frozen=True)
@@ -227,120 +225,6 @@ def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
     return Verdict(checks, worst, tuple(cameras.values()))
 
 
-@dataclass(frozen=True)
-class Threshold:
-    """The limits of one measured number: a row of the table in ``trust.thresholds``.
-
-    Attributes:
-        key: by which checks look the row up.
-        name: what is measured; the name of the check.
-        direction: "at most" or "at least": on which side of the limits PASS lies.
-        warn: the last value that is PASS.
-        fail: the last value that is not FAIL.
-        unit: of the values; "share" is printed in percent.
-        question: what the check answers, in words.
-        reason: why these limits: what they mean, or the data that they were read from.
-        advice: what to do if it is not PASS.
-    """
-
-    key: str
-    name: str
-    direction: Direction
-    warn: float
-    fail: float
-    unit: str
-    question: str
-    reason: str
-    advice: str = ""
-
-    def grade(self, value: float) -> Status:
-        """PASS, WARN or FAIL of a value; NaN fails."""
-        return self.check(value).status
-
-    def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
-        """The check of a value.
-
-        Args:
-            value: in the row's unit.
-            name: in place of the row's, where it depends on the data.
-            advice: likewise.
-        """
-        build = at_most if self.direction == "at most" else at_least
-        check = build(
-            name or self.name, value, self.warn, self.fail, self.unit, advice or self.advice
-        )
-        return replace(check, kind=self.key)
-
-    def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
-        """A check whose sentence, and perhaps status, depend on more than the value."""
-        limits = (self.warn, self.fail, self.unit)
-        return Check(name or self.name, status, text, value, *limits, kind=self.key)
-
-
-def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
-) -> Check:
-    """A check that a number is at most its limits; NaN fails.
-
-    Args:
-        name: what was measured.
-        value: what was found.
-        warn: the largest value that is PASS.
-        fail: the largest value that is not FAIL.
-        unit: of the values; "share" is printed in percent.
-        advice: what to do if it is above.
-    """
-    status = grade(not value <= warn, not value <= fail)
-    return _measured(name, status, "above", value, warn, fail, unit, advice)
-
-
-def at_least(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
-) -> Check:
-    """A check that a number is at least its limits; NaN fails. Arguments as of `at_most`."""
-    status = grade(not value >= warn, not value >= fail)
-    return _measured(name, status, "below", value, warn, fail, unit, advice)
-
-
 def grade(warn: bool, fail: bool) -> Status:
     """FAIL, else WARN, else PASS."""
     return "FAIL" if fail else "WARN" if warn else "PASS"
-
-
-def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
-    name: str,
-    status: Status,
-    side: str,
-    value: float,
-    warn: float,
-    fail: float,
-    unit: str,
-    advice: str,
-) -> Check:
-    limit = fail if status == "FAIL" else warn
-    digits = 3 if status == "PASS" or in_unit(value, unit) != in_unit(limit, unit) else 9
-    text = f"{name} {in_unit(value, unit, digits)}"
-    if status != "PASS":
-        text += f" is {side} {in_unit(limit, unit)}"
-        text += f": {advice}" if advice else ""
-    return Check(name, status, text, float(value), warn, fail, unit)
-
-
-def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
-    """Whether a value can lie beyond a limit.
-
-    Args:
-        limit: of the value.
-        unit: of the value; a count is not negative, a share of a score can be.
-        direction: "at most" or "at least": on which side of the limit PASS lies.
-    """
-    if direction == "at most":
-        return limit < _LARGEST.get(unit, math.inf)
-    return limit > 0 or unit == "share"
-
-
-def in_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit, for display."""
-    if unit == "share":
-        return f"{100 * value:.{digits}g}%"
-    return f"{value:.{digits}g} {unit}".rstrip()

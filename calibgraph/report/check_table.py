@@ -7,7 +7,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from calibgraph.model.verdict import Check, Direction, Verdict, in_unit, is_reachable
+from calibgraph.model.threshold import Direction, in_unit, is_reachable
+from calibgraph.model.verdict import Check, Verdict
 
 _ROUNDED_FROM = 1000  # three digits would need an exponent
 _WORST_FIRST = ("FAIL", "WARN", "PASS")

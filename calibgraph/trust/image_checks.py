@@ -10,7 +10,8 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check, Threshold
+from calibgraph.model.threshold import Threshold
+from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.verdict import Check, Threshold
+from calibgraph.model.threshold import Threshold
+from calibgraph.model.verdict import Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from calibgraph.model.verdict import Threshold, in_unit, is_reachable
+from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 
 _COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import pytest
 
 from calibgraph import Check, Verdict
-from calibgraph.model.verdict import ABOUT_THE_DATA, Doubt, at_least, at_most, rig_verdict
+from calibgraph.model.threshold import at_least, at_most
+from calibgraph.model.verdict import ABOUT_THE_DATA, Doubt, rig_verdict
 from calibgraph.trust.thresholds import threshold
 
 

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 import pytest
 
 from calibgraph import Config, Rig, solve
-from calibgraph.model.verdict import Threshold
+from calibgraph.model.threshold import Threshold
 from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, thresholds_markdown
 from tests.conftest import ROOT
 from tests.trust.conftest import simulated
 
-TABLE, VERDICT = "trust/thresholds.py", "model/verdict.py"
+TABLE, GRADING = "trust/thresholds.py", "model/threshold.py"
 
 
 def calls(name: str, *, but_in: tuple[str, ...]) -> Iterator[ast.Call]:
@@ -45,8 +45,8 @@ def test_every_row_is_used_by_a_check_and_every_key_has_a_row(
 
 def test_only_rows_of_the_table_grade_numbers() -> None:
     for function in ("at_most", "at_least"):
-        assert not list(calls(function, but_in=(VERDICT,)))
-    for call in calls("Check", but_in=(VERDICT, "io/calibrations.py")):  # which reads them
+        assert not list(calls(function, but_in=(GRADING,)))
+    for call in calls("Check", but_in=(GRADING, "io/calibrations.py")):  # which reads them
         limits = {keyword.arg for keyword in call.keywords} & {"warn", "fail"}
         assert len(call.args) <= 4 and not limits, ast.unparse(call)
 
