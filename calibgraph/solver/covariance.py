@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.solver.camera_pairs import USUAL_CORRELATION, PairTerm, usual_excess
 from calibgraph.solver.curvature import (
     Curvature,
     add_pair_hessians,
@@ -30,11 +30,6 @@ PSEUDO_FRAMES = 6.0
 """Frames that are added with the scatter along each principal direction. A covariance of six
 numbers from few frames is too small for their joint error (its inverse, by (F - 1) / (F - 8) for F
 frames)."""
-
-USUAL_CORRELATION = 0.2
-"""Of the errors of two matches of one frame. It multiplies the variance of n matches by
-1 + 0.2 (n - 1), and counts where frames are few: simulated errors that are half the frame's have
-0.5, matches of ``structure`` on recordings about 0.1."""
 
 _USUAL_FRAMES = 0.5  # as many frames as what is usual counts for
 
@@ -96,10 +91,9 @@ def usual_scatter(inliers: Objective, T_camera_lidar: Transforms, curvature: Cur
         excess = USUAL_CORRELATION * (len(block) / block.frames - 1)
         usual[rows, rows] = (1 + excess) * curvature.of_correspondences[rows, rows]
     for pair in inliers.pairs:
-        excess = USUAL_CORRELATION * (len(pair.frame) / (len(pair.frame_edges) - 1) - 1)
         own = np.zeros_like(usual)
         add_pair_hessians(own, [pair], T_camera_lidar)
-        usual += (1 + excess) * own
+        usual += usual_excess([pair]) * own
     return usual
 
 

@@ -18,7 +18,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms
+from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms, usual_excess
 from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
 from calibgraph.solver.objective import Objective, Scales
 from factors import EpipolarBlock, pose_sigmas
@@ -175,7 +175,7 @@ def covariance_of_fit(
     T_camera_lidar: Mapping[str, Array],
     covariance_a: Array,
 ) -> Array:
-    """(12, 12) covariance of A and B after ``fit_pair``, if all features were independent.
+    """(12, 12) covariance of A and B after ``fit_pair``, if features of a frame err as usual.
 
     Args:
         names: A and B.
@@ -185,8 +185,9 @@ def covariance_of_fit(
     """
     hessian = np.zeros((12, 12))
     hessian[:6, :6] = np.linalg.pinv(covariance_a, hermitian=True)
+    excess = usual_excess(terms)
     for term in terms:
         rows = np.r_[tuple(pose_rows(names.index(name)) for name in (term.a, term.b))]
         scaled = term.with_sigma(term.sigma_px(T_camera_lidar))
-        hessian[np.ix_(rows, rows)] += scaled.sums(T_camera_lidar).hessian
+        hessian[np.ix_(rows, rows)] += scaled.sums(T_camera_lidar).hessian / excess
     return np.asarray(np.linalg.pinv(hessian, hermitian=True))
