@@ -139,7 +139,8 @@ def _solve(problem: Path, out: Path) -> None:
     write_result(result, out, None, with_report=False)
 
 
-def _table(counts: Counts, wall_s: float, server_s: float, alone_s: float) -> Table:
+def _table(counts: Counts, wall_s: float, used_s: tuple[float, float], alone_s: float) -> Table:
+    own_s, server_s = used_s
     done = len(counts.seconds)
     p50, p99 = np.percentile(counts.seconds, [50, 99])
     first, last = counts.memory_mb[len(counts.memory_mb) // 4], counts.memory_mb[-1]
@@ -154,6 +155,7 @@ def _table(counts: Counts, wall_s: float, server_s: float, alone_s: float) -> Ta
         ("request to result, p99 s", f"{p99:.2f}"),
         ("library alone, processor ms a solve", f"{1e3 * alone_s:.1f}"),
         ("service, processor ms a solve", f"{1e3 * server_s / done:.1f}"),
+        ("of these the server without its workers", f"{1e3 * own_s / done:.1f}"),
         ("overhead, processor ms a solve", f"{1e3 * (server_s / done - alone_s):.1f}"),
         ("server MB, at a quarter and at the end", f"{first[0]:.0f}, {last[0]:.0f}"),
         ("largest worker MB, the same", f"{first[1]:.0f}, {last[1]:.0f}"),
@@ -181,10 +183,12 @@ def main() -> None:
             before_s = library_s(folder / "problems", PROBLEMS)
             asyncio.run(submit_all(server, problems, 4, 10))  # workers are warm
             begun_s, start = server.processor_s(), time.monotonic()
+            own_s = server.own_processor_s()
             counts = asyncio.run(submit_all(server, problems, options.clients, options.seconds))
             wall_s, used_s = time.monotonic() - start, server.processor_s() - begun_s
+            own_s = server.own_processor_s() - own_s
             alone_s = (before_s + library_s(folder / "problems", PROBLEMS)) / 2
-            tables.append(_table(counts, wall_s, used_s, alone_s))
+            tables.append(_table(counts, wall_s, (own_s, used_s), alone_s))
         if options.trackers:
             tables.append(track(server, options.trackers, options.hz, options.seconds))
         server.stop()

@@ -125,6 +125,10 @@ class Server:
         workers = [process.memory_info().rss for process in self.workers()]
         return self.process.memory_info().rss / 1e6, max(workers, default=0) / 1e6
 
+    def own_processor_s(self) -> float:
+        """Processor time of the server alone so far."""
+        return sum(self.process.cpu_times()[:2])
+
     def processor_s(self) -> float:
         """Processor time of the server and its workers so far, of those too that have ended."""
         return sum(sum(process.cpu_times()[:4]) for process in (self.process, *self.workers()))

@@ -32,16 +32,18 @@ class Bell:
             loop.call_soon_threadsafe(self._set_all)
 
     @contextmanager
-    def listen(self, id: str) -> Iterator[asyncio.Event]:
-        """An event that is set whenever something happens to an id."""
+    def listen(self, *ids: str) -> Iterator[asyncio.Event]:
+        """An event that is set whenever something happens to one of these."""
         heard = asyncio.Event()
-        self._waiting[id].add(heard)
+        for id in ids:
+            self._waiting[id].add(heard)
         try:
             yield heard
         finally:
-            self._waiting[id].discard(heard)
-            if not self._waiting[id]:
-                del self._waiting[id]
+            for id in ids:
+                self._waiting[id].discard(heard)
+                if not self._waiting[id]:
+                    del self._waiting[id]
 
     def _set_all(self) -> None:
         for id in list(self._waiting):
@@ -50,6 +52,11 @@ class Bell:
     def _set(self, id: str) -> None:
         for heard in self._waiting.get(id, ()):
             heard.set()
+
+
+def progress_of(id: str) -> str:
+    """What is rung when a job gets on, apart from its changes of state."""
+    return f"{id} progress"
 
 
 async def wait_for(heard: asyncio.Event, seconds: float) -> None:

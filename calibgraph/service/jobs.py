@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Engine, RowMapping, func, select
+from sqlalchemy import ColumnElement, Engine, RowMapping, bindparam, func, select
 from sqlalchemy.exc import IntegrityError
 
 from calibgraph.fleet.task import ErrorKind
@@ -22,6 +22,20 @@ MOST_STARTS = 20
 """A job during which the process or the server ended so often is not started again."""
 
 _SHORT = [c for c in jobs.c if c.name not in ("request", "digest")]
+
+# Statements of every job, built once: building one takes as long as running it.
+_ADD = jobs.insert().returning(*_SHORT)
+_BY_ID = select(*_SHORT).where(jobs.c.id == bindparam("id"))
+_COUNT = select(func.count()).select_from(jobs).where(jobs.c.state == bindparam("wanted"))
+_WAITS_LONGEST = (
+    select(jobs.c.id).where(jobs.c.state == "queued").order_by(jobs.c.number).limit(1)
+).scalar_subquery()
+_START_NEXT = (
+    jobs.update()
+    .where((jobs.c.id == _WAITS_LONGEST) & (jobs.c.state == "queued"))
+    .values(state="running", started_s=bindparam("now_s"), starts=jobs.c.starts + 1)
+    .returning(*_SHORT)
+)
 
 
 @dataclass(frozen=True)
@@ -106,15 +120,12 @@ class JobTable:
         }  # fmt: skip
         try:
             with self._engine.begin() as connection:
-                connection.execute(jobs.insert().values(values))
+                return _record(connection.execute(_ADD, values).mappings().one())
         except IntegrityError:
             known = self.known(tenant, key, digest)
             if known is None:
                 raise
             return known
-        found = self.get(id)
-        assert found is not None
-        return found
 
     def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
         """The job that a request with an idempotency key made before.
@@ -134,7 +145,7 @@ class JobTable:
     def get(self, id: str, caller: Caller | None = None) -> JobRecord | None:
         """A job; None if there is none that the caller sees."""
         with self._engine.connect() as connection:
-            row = connection.execute(select(*_SHORT).where(jobs.c.id == id)).mappings().first()
+            row = connection.execute(_BY_ID, {"id": id}).mappings().first()
         if row is None or (caller is not None and not caller.sees(row["tenant"])):
             return None
         return _record(row)
@@ -157,21 +168,14 @@ class JobTable:
 
     def count(self, state: JobState) -> int:
         """How many jobs are in a state."""
-        query = select(func.count()).select_from(jobs).where(jobs.c.state == state)
         with self._engine.connect() as connection:
-            return int(connection.execute(query).scalar_one())
+            return int(connection.execute(_COUNT, {"wanted": state}).scalar_one())
 
     def start_next(self) -> JobRecord | None:
         """Take the job that has waited longest; None if none waits. One thread at a time."""
-        waits = select(jobs.c.id).where(jobs.c.state == "queued").order_by(jobs.c.number).limit(1)
         with self._engine.begin() as connection:
-            id = connection.execute(waits).scalar()
-            if id is None:
-                return None
-            started = {"state": "running", "started_s": time.time(), "starts": jobs.c.starts + 1}
-            connection.execute(jobs.update().where(_is(id, "queued")).values(started))
-        found = self.get(id)
-        return found if found is not None and found.state == "running" else None
+            row = connection.execute(_START_NEXT, {"now_s": time.time()}).mappings().first()
+        return None if row is None else _record(row)
 
     def finish(
         self,

@@ -15,7 +15,7 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.service.access import Reader, Submitter
 from calibgraph.service.answers import JobAnswer, JobList, job_answer
 from calibgraph.service.api_schema import reference
-from calibgraph.service.bell import wait_for
+from calibgraph.service.bell import progress_of, wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem, documented
@@ -139,7 +139,7 @@ async def job_events(id: JobId, state: State, caller: Reader) -> Response:
 
 async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]:
     sent, last_s = "", time.monotonic()
-    with state.bell.listen(id) as heard:
+    with state.bell.listen(id, progress_of(id)) as heard:
         while not state.is_stopping:
             record = await run_in_threadpool(state.jobs.get, id, caller)
             if record is None:

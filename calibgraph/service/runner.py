@@ -15,6 +15,7 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
+from calibgraph.service.bell import progress_of
 from calibgraph.service.folders import DataFolder
 from calibgraph.service.job_task import RESULT, WORK, JobOutcome, JobTask
 from calibgraph.service.jobs import MOST_STARTS, JobRecord, JobTable
@@ -246,7 +247,7 @@ class Runner:
 
     def _note(self, id: str, note: tuple[str, int, int]) -> None:
         self._steps[id] = Step(*note)
-        self._ring(id)
+        self._ring(progress_of(id))
 
     def _renew(self, slot: _Slot, *, failed: bool) -> None:
         """End a process that has run many jobs, or one that failed: it may be in disorder."""

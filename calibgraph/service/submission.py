@@ -61,9 +61,7 @@ async def submit(
     """
     _require_key(key)
     service.require_room()
-    known = await run_in_threadpool(service.jobs.known, caller.tenant, key)
-    if known is None:
-        await run_in_threadpool(_require_place_in_queue, service)
+    await run_in_threadpool(_require_place_unless_known, service, caller.tenant, key)
     id = new_id()
     arriving = service.folder.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
@@ -73,12 +71,18 @@ async def submit(
     except OtherRequestError:
         raise Problem(422, "this Idempotency-Key was given with another request") from None
     finally:
-        await run_in_threadpool(shutil.rmtree, arriving, ignore_errors=True)
+        if arriving.exists():  # it was not kept
+            await run_in_threadpool(shutil.rmtree, arriving, ignore_errors=True)
 
 
 def _require_key(key: str | None) -> None:
     if key is not None and not (0 < len(key) <= _MOST_KEY and key.isprintable()):
         raise Problem(422, f"Idempotency-Key: expected 1 to {_MOST_KEY} printable characters")
+
+
+def _require_place_unless_known(service: Service, tenant: str, key: str | None) -> None:
+    if service.jobs.known(tenant, key) is None:
+        _require_place_in_queue(service)
 
 
 def _require_place_in_queue(service: Service) -> None:
