@@ -178,20 +178,22 @@ def main() -> None:
         folder = Path(temporary)
         problems = make_problems(folder / "problems", PROBLEMS)
         server = Server(folder / "data", options.port)
-        server.start()
-        if options.clients:
-            before_s = library_s(folder / "problems", PROBLEMS)
-            asyncio.run(submit_all(server, problems, 4, 10))  # workers are warm
-            begun_s, start = server.processor_s(), time.monotonic()
-            own_s = server.own_processor_s()
-            counts = asyncio.run(submit_all(server, problems, options.clients, options.seconds))
-            wall_s, used_s = time.monotonic() - start, server.processor_s() - begun_s
-            own_s = server.own_processor_s() - own_s
-            alone_s = (before_s + library_s(folder / "problems", PROBLEMS)) / 2
-            tables.append(_table(counts, wall_s, (own_s, used_s), alone_s))
-        if options.trackers:
-            tables.append(track(server, options.trackers, options.hz, options.seconds))
-        server.stop()
+        try:
+            server.start()
+            if options.clients:
+                before_s = library_s(folder / "problems", PROBLEMS)
+                asyncio.run(submit_all(server, problems, 4, 10))  # workers are warm
+                begun_s, start = server.processor_s(), time.monotonic()
+                own_s = server.own_processor_s()
+                counts = asyncio.run(submit_all(server, problems, options.clients, options.seconds))
+                wall_s, used_s = time.monotonic() - start, server.processor_s() - begun_s
+                own_s = server.own_processor_s() - own_s
+                alone_s = (before_s + library_s(folder / "problems", PROBLEMS)) / 2
+                tables.append(_table(counts, wall_s, (own_s, used_s), alone_s))
+            if options.trackers:
+                tables.append(track(server, options.trackers, options.hz, options.seconds))
+        finally:
+            server.stop()
     publish("service.load", tables, record=options.record)
 
 

@@ -174,7 +174,7 @@ def list_trackers(state: State, caller: Reader) -> list[TrackerAnswer]:
 @router.post(
     "/{id}/frames",
     response_model=FramesAnswer,
-    responses=documented(404, 413, 415, 422, 507),
+    responses=documented(404, 413, 415, 422, 429, 507),
     openapi_extra=_FRAMES_BODY,
 )
 async def add_frames(id: TrackerId, request: Request, state: State, caller: Submitter) -> Response:
@@ -185,32 +185,32 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
     body = await read_whole(request.stream(), state.settings.frames_bytes)
     asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
-    answer = await run_in_threadpool(state.trackers.ask, id, asked)
+    answer = await state.trackers.answer(id, asked)
     state.metrics.frames.inc(len(answer["updates"]))
     return JSONResponse(answer)
 
 
-@router.get("/{id}/state", responses=documented(404, 422))
-def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
+@router.get("/{id}/state", responses=documented(404, 422, 429))
+async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
     """The last estimate, with its error bars, verdicts and events."""
-    find_tracker(state, caller, id)
+    await run_in_threadpool(find_tracker, state, caller, id)
     asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    return TrackerState(**state.trackers.ask(id, asked))
+    return TrackerState(**await state.trackers.answer(id, asked))
 
 
 @router.get(
     "/{id}/drift.png",
     response_class=Response,
-    responses={**documented(404, 422), 200: {"content": {"image/png": {}}}},
+    responses={**documented(404, 422, 429), 200: {"content": {"image/png": {}}}},
 )
-def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
+async def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
     """The extrinsics over time, with their error bars and events."""
-    find_tracker(state, caller, id)
+    await run_in_threadpool(find_tracker, state, caller, id)
     asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
-    return Response(state.trackers.ask(id, asked), media_type="image/png")
+    return Response(await state.trackers.answer(id, asked), media_type="image/png")
 
 
-@router.delete("/{id}", status_code=204, responses=documented(404, 422))
+@router.delete("/{id}", status_code=204, responses=documented(404, 422, 429))
 def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
     """Remove a tracker and its state."""
     find_tracker(state, caller, id)

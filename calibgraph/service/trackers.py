@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import queue
+import asyncio
 import threading
+from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +19,10 @@ from calibgraph.service.tracker_request import Refusal, TrackerRequest
 _CHILD = "calibgraph.service.tracker_process"
 _TIMEOUT_S = 120.0
 _MOST_AT_ONCE = 64
+_MOST_BYTES_AT_ONCE = 2 * 2**20
+"""A few seconds of work: small frames take a millisecond a kilobyte."""
+_MOST_WAITING = 512
+_MOST_BYTES_WAITING = 64 * 2**20
 _AGAIN = {"Retry-After": "1"}
 
 
@@ -31,28 +37,48 @@ class _Host:
 
     def __init__(self, memory_bytes: int) -> None:
         self._child = ChildProcess(_CHILD, (str(memory_bytes),))
-        self._asked: queue.Queue[_Asked | None] = queue.Queue()
+        self._waiting: deque[_Asked] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._is_closed = False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def ask(self, request: TrackerRequest) -> Any:
+    def ask(self, request: TrackerRequest) -> Future[Any]:
+        """The answer, when it has come.
+
+        Raises:
+            Problem: if too much waits already.
+        """
         asked = _Asked(request, Future())
-        self._asked.put(asked)
-        return asked.answer.result()
+        with self._changed:
+            if self._is_closed:
+                raise _stopping()
+            if len(self._waiting) >= _MOST_WAITING or self._bytes > _MOST_BYTES_WAITING:
+                raise Problem(429, "the trackers are behind; send the frames again later", _AGAIN)
+            self._waiting.append(asked)
+            self._bytes += len(request.body)
+            self._changed.notify()
+        return asked.answer
 
     def _work(self) -> None:
-        while (first := self._asked.get()) is not None:
-            together, is_last = [first], False
-            while len(together) < _MOST_AT_ONCE and not self._asked.empty():
-                another = self._asked.get()
-                if another is None:
-                    is_last = True
-                    break
-                together.append(another)
+        while together := self._take():
             self._answer(together)
-            if is_last:
-                break
         self._child.close()
+
+    def _take(self) -> list[_Asked]:
+        """What has waited longest, some seconds of work; nothing when all is done and closed."""
+        together: list[_Asked] = []
+        size = 0
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed)
+            while self._waiting and len(together) < _MOST_AT_ONCE:
+                size += len(self._waiting[0].request.body)
+                if together and size > _MOST_BYTES_AT_ONCE:
+                    break
+                together.append(self._waiting.popleft())
+                self._bytes -= len(together[-1].request.body)
+        return together
 
     def _answer(self, together: list[_Asked]) -> None:
         try:
@@ -68,10 +94,16 @@ class _Host:
 
     def close(self) -> None:
         """Let what was asked be answered, then write all states and end."""
-        closed = _Asked(TrackerRequest("close all", ""), Future())
-        self._asked.put(closed)
-        self._asked.put(None)
+        with self._changed:
+            if not self._is_closed:
+                self._waiting.append(_Asked(TrackerRequest("close all", ""), Future()))
+            self._is_closed = True
+            self._changed.notify()
         self._thread.join()
+
+
+def _stopping() -> Problem:
+    return Problem(503, "the server is being stopped; try again soon", _AGAIN)
 
 
 class Trackers:
@@ -89,30 +121,28 @@ class Trackers:
         self._is_closed = False
 
     def ask(self, id: str, request: TrackerRequest) -> Any:
-        """What the process of a tracker answers.
+        """What the process of a tracker answers; see :meth:`answer`."""
+        return _checked(self._host(id).ask(request).result)
+
+    async def answer(self, id: str, request: TrackerRequest) -> Any:
+        """What the process of a tracker answers; no thread waits for it.
 
         Args:
             id: of the tracker.
             request: to it.
 
         Raises:
-            Problem: if it is refused, or the process ended: then it may be asked again.
+            Problem: if it is refused, too much waits, or the process ended: then it may be asked
+                again.
         """
-        try:
-            answer = self._host(id).ask(request)
-        except ChildEndedError:
-            text = "the tracker's process ended; ask again: frames that were taken in are known"
-            raise Problem(503, text, _AGAIN) from None
-        except ChildTimeoutError:
-            raise Problem(503, "the tracker is busy; send fewer frames at once", _AGAIN) from None
-        if isinstance(answer, Refusal):
-            raise Problem(answer.status, answer.detail)
-        return answer
+        asked = self._host(id).ask(request)
+        await asyncio.wait([asyncio.wrap_future(asked)])
+        return _checked(asked.result)
 
     def _host(self, id: str) -> _Host:
         with self._lock:
             if self._is_closed:
-                raise Problem(503, "the server is being stopped; try again soon", _AGAIN)
+                raise _stopping()
             if not self._hosts:
                 memory = self._settings.tracker_memory_bytes
                 self._hosts = [_Host(memory) for _ in range(self._settings.tracker_processes)]
@@ -126,3 +156,21 @@ class Trackers:
             self._is_closed = True
         for host in self._hosts:
             host.close()
+
+
+def _checked(result: Callable[[], Any]) -> Any:
+    """An answer that is none of the refusals.
+
+    Raises:
+        Problem: if it is one, or the process ended.
+    """
+    try:
+        answer = result()
+    except ChildEndedError:
+        text = "the tracker's process ended; ask again: frames that were taken in are known"
+        raise Problem(503, text, _AGAIN) from None
+    except ChildTimeoutError:
+        raise Problem(503, "the tracker is busy; send fewer frames at once", _AGAIN) from None
+    if isinstance(answer, Refusal):
+        raise Problem(answer.status, answer.detail)
+    return answer
