@@ -145,10 +145,10 @@ class Runner:
 
     def _work(self, slot: _Slot) -> None:
         """A thread: one job after the other."""
-        with suppress(ChildEndedError):  # the first job does not wait for libraries to load
-            slot.child.start()
         while not self._is_stopping:
             try:
+                with suppress(ChildEndedError):  # no job dies while libraries load
+                    slot.child.start()
                 record = self._take(slot)
                 if record is None:
                     self._wait()
@@ -228,7 +228,7 @@ class Runner:
                 return None
             log.warning("job %s: %s", record.id, error)
             self._deaths[record.id] += 1  # those of the server are not the job's fault
-            if self._deaths[record.id] >= _MOST_DEATHS or "no process" in str(error):
+            if self._deaths[record.id] >= _MOST_DEATHS:
                 return JobOutcome(error_kind="worker died", error=str(error))
             return None
 
