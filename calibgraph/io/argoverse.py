@@ -32,6 +32,7 @@ _TRAJECTORY = Path("city_SE3_egovehicle.feather")
 _QUATERNION, _PLACE = ("qx", "qy", "qz", "qw"), ("tx_m", "ty_m", "tz_m")
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _SIZE = ("width_px", "height_px")
+_MOST_DIGITS = 18  # of a stamp, in 64 bits
 _APART_NS = 30_000_000
 """Between a sweep and its image: half the period of the cameras around the vehicle, and some."""
 
@@ -64,8 +65,7 @@ def _camera(
             raise FileError(log / path, f"has no row of {name!r}; found {', '.join(table)}")
     lens = lenses[name]
     content = {
-        "width_px": int(lens["width_px"]),
-        "height_px": int(lens["height_px"]),
+        **{column: lens[column] for column in _SIZE},
         "intrinsics_px": {column[:2]: lens[column] for column in _LENS},
         "T_camera_lidar": invert(_matrix(poses[name], log / _POSES)),
     }
@@ -128,7 +128,7 @@ def _stamped(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Files by their stamp [ns], in order of time."""
     found = files_by_stem(folder, suffixes)
     for stem, path in found.items():
-        if not stem.isdecimal():
+        if not stem.isdecimal() or len(stem) > _MOST_DIGITS:
             raise FileError(path, "its name is no stamp in nanoseconds")
     return {int(stem): found[stem] for stem in sorted(found, key=int)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,10 @@ from numpy.typing import NDArray
 from calibgraph.errors import CalibrationError, FileError
 
 _CHUNK = 1_000_000
+_HEADER = struct.Struct("<4s90sHIIBH")  # its size, the points' offset, the records before them, ...
+_RECORD_BYTES = 54  # of a record's header
+_END_RECORDS = struct.Struct("<QI")  # of version 1.4: where those after the points begin, how many
+_END_RECORDS_AT, _WITH_END_RECORDS, _END_RECORD_BYTES = 235, 375, 60
 
 
 def read_las(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -26,6 +31,7 @@ def read_las(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
         raise CalibrationError(
             f"{path}: reading {path.suffix} needs laspy: pip install 'calibgraph[las]' ({error})"
         ) from error
+    _require_header(path)
     try:
         with laspy.open(path) as file:
             expected = file.header.point_count
@@ -39,3 +45,23 @@ def read_las(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     if len(points) != expected:
         raise FileError(path, f"is truncated: {len(points)} of {expected} points; write it again")
     return points[:, :3], points[:, 3]
+
+
+def _require_header(path: Path) -> None:
+    """Check what a header claims: laspy would read billions of records that are not there.
+
+    Raises:
+        FileError: if it is none, or the file is too short for what it claims.
+    """
+    with path.open("rb") as file:
+        head = file.read(_WITH_END_RECORDS)
+        size = file.seek(0, 2)
+    if len(head) < _HEADER.size or not head.startswith(b"LASF"):
+        raise FileError(path, "cannot be read as LAS (it has no header); is it complete?")
+    _, _, header_bytes, offset, records, _, point_bytes = _HEADER.unpack_from(head)
+    fits = header_bytes + records * _RECORD_BYTES <= offset <= size and point_bytes > 0
+    if header_bytes >= _WITH_END_RECORDS and len(head) == _WITH_END_RECORDS:
+        start, count = _END_RECORDS.unpack_from(head, _END_RECORDS_AT)
+        fits = fits and (count == 0 or start + count * _END_RECORD_BYTES <= size)
+    if not fits:
+        raise FileError(path, "cannot be read as LAS (its header claims more than the file holds)")

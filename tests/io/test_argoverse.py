@@ -121,6 +121,11 @@ def test_a_sweep_without_an_image_of_a_camera_is_left_out(tmp_path: Path) -> Non
         (f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "y": [2.0]}, "column 'z' is missing"),
         (f"sensors/lidar/{START_NS}.feather", {"x": [None], "y": [2.0], "z": [1.0]}, "1 empty"),
         ("sensors/lidar/first.feather", {"x": [1.0]}, "its name is no stamp"),
+        (f"sensors/lidar/{10**24}.feather", {"x": [1.0]}, "its name is no stamp"),
+        ("calibration/intrinsics.feather",
+         {"sensor_name": ["front_left"], **{n: [500.0] for n in
+          ("fx_px", "fy_px", "cx_px", "cy_px", "height_px")}, "width_px": [float("nan")]},
+         "front_left: width_px"),
     ],
 )  # fmt: skip
 def test_damaged_logs_are_refused_in_one_line(

@@ -43,6 +43,14 @@ def test_an_incomplete_file_is_refused(path: Path, kept: int) -> None:
     assert len(str(caught.value)) < 400
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_header_of_noise_is_refused_at_once(tmp_path: Path, seed: int) -> None:
+    noise = np.random.default_rng(seed).bytes(400)
+    (tmp_path / "scan.las").write_bytes(b"LASF" + noise)
+    with pytest.raises(FileError, match="cannot be read as LAS"):
+        load_cloud(tmp_path / "scan.las")
+
+
 def test_a_file_without_points_is_refused(tmp_path: Path) -> None:
     laspy.LasData(laspy.LasHeader(point_format=3, version="1.2")).write(tmp_path / "scan.las")
     with pytest.raises(FileError, match="holds no point"):
