@@ -116,6 +116,7 @@ def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: 
         calibgraph.load_calibration(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_camera_without_correspondences_is_calibrated_by_its_neighbour(
     data: Dataset, truth: Rig
 ) -> None:

@@ -49,6 +49,7 @@ def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> N
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_bag_is_calibrated_and_reported(call: Call, tmp_path: Path, table: Path) -> None:
     bag, out = sample_bag(tmp_path, "ros1", raw=True), tmp_path / "out"
     code, _, err = call("calibrate", bag, "--matcher", table, "--out", out)

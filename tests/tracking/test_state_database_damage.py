@@ -84,7 +84,7 @@ def test_a_log_that_is_damaged_or_cut_short_costs_the_inputs_from_there_on_at_mo
     files, truth = crashed(memory / "state", 8)
     log = files[LOG]
     lengths = set()
-    for at in range(0, len(log), 97):
+    for at in range(0, len(log), 251):
         for damaged in (log[:at], flipped(log, at)):
             result = recovered(restored(memory / "copy", files | {LOG: damaged}))
             assert truth.startswith(held(result))
