@@ -16,6 +16,7 @@ Runs = NDArray[np.int64]
 
 _MAX_STEPS = 50  # with a start in the right basin, 4 to 8 are enough
 _DAMPING, _MAX_DAMPING = 1e-5, 1e6  # relative to the diagonal
+_MIN_DAMPING = 1e-12  # with less, frames that leave a direction free would be singular
 _SMALL_STEP = 1e-10  # rad, m: below what residuals of 1e-6 px resolve
 FINE, COARSE = 1e-10, 1e-3
 """Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
@@ -63,6 +64,7 @@ def fit_frames(
         T[moved], costs[moved] = trial[better], new.cost[better]
         hessians[moved], gradients[moved] = new.hessian[better], new.gradient[better]
         dampings[active] *= np.where(better, 0.1, 10.0)
+        np.maximum(dampings, _MIN_DAMPING, out=dampings)
         active = active[~done & (dampings[active] < _MAX_DAMPING)]
         if not len(active):
             break
@@ -77,10 +79,10 @@ def solve_damped(hessians: Array, gradients: Array, dampings: Array | float) -> 
     Args:
         hessians: (f, 6, 6).
         gradients: (f, 6).
-        dampings: of each, or of all: what is added to the diagonal, relative to it.
+        dampings: of each, or of all: what is added to the diagonal, relative to it; above 1e-15.
     """
-    diagonal = np.einsum("fii->fi", hessians)
-    damped = hessians.copy()
-    added = np.reshape(dampings, (-1, 1)) * diagonal + np.finfo(float).tiny
-    np.einsum("fii->fi", damped)[:] += added
-    return np.asarray(-np.linalg.solve(damped, gradients[:, :, None])[:, :, 0])
+    sizes = np.sqrt(np.einsum("fii->fi", hessians))
+    units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > 0)
+    damped = hessians * units[:, :, None] * units[:, None, :]
+    np.einsum("fii->fi", damped)[:] = 1.0 + np.reshape(dampings, (-1, 1))
+    return np.asarray(-units * np.linalg.solve(damped, (units * gradients)[:, :, None])[:, :, 0])

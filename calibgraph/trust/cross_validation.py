@@ -26,6 +26,7 @@ RESTARTS, RESTART_DEG, RESTART_M = 3, 2.0, 0.2
 """How many displaced starts, and how far they are from the solution."""
 
 _RESTART_SAMPLE = 5000  # matches of a camera that first lead back from a displaced start
+_MET_DEG, _MET_CM = 0.01, 0.3  # a tenth of what the check allows: starts that have come together
 _ROUGH = 1e-6  # relative change of the cost at which their first pass stops: the gate needs no more
 _FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes what it finds
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
@@ -63,13 +64,12 @@ def restart_checks(evidence: Evidence) -> Checks:
     if not evidence.fitted_blocks:
         return {}
     solution = evidence.of_correspondences.solution
-    coarse = solution.objective.coarse(_RESTART_SAMPLE)
     rig = solution.solved_rig
     displaced = [
         perturb(rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed).T_camera_lidar
         for seed in range(RESTARTS)
     ]
-    ends = map_on_cores(partial(_solve_from, solution, coarse), displaced)
+    ends = _ends_from(solution, displaced)
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
     name = f"solving again from starts {starts}: largest difference"
     checks = {}
@@ -88,15 +88,52 @@ def restart_checks(evidence: Evidence) -> Checks:
     return checks
 
 
-def _solve_from(solution: Solution, coarse: Objective, start: Transforms) -> Transforms | None:
-    """The T_camera_lidar from a start; None if it keeps too few matches.
+def _ends_from(solution: Solution, starts: list[Transforms]) -> list[Transforms | None]:
+    """The T_camera_lidar from each start; None where too few matches are kept.
 
-    First coarsely with a selection of the matches, then both passes with all of them from there.
+    First coarsely with a selection of the matches, then both passes with all of them; starts that
+    have come together by then go on as one.
     """
+    coarse = solution.objective.coarse(_RESTART_SAMPLE)
+    near = map_on_cores(partial(_solve_coarsely, coarse), starts)
+    distinct: list[Transforms] = []
+    number_of = [_number_among(distinct, each) for each in near]
+    ends = map_on_cores(partial(_solve_from, solution), distinct)
+    return [None if number is None else ends[number] for number in number_of]
+
+
+def _number_among(distinct: list[Transforms], near: Transforms | None) -> int | None:
+    """Which of the distinct ones it has come together with; added to them if with none."""
+    if near is None:
+        return None
+    for number, other in enumerate(distinct):
+        if _have_met(near, other):
+            return number
+    distinct.append(near)
+    return len(distinct) - 1
+
+
+def _have_met(first: Transforms, second: Transforms) -> bool:
+    """Whether all cameras are where further steps would lead to one minimum."""
+    return all(
+        pose_difference(T, second[name])[0] < _MET_DEG
+        and pose_difference(T, second[name])[1] < _MET_CM
+        for name, T in first.items()
+    )
+
+
+def _solve_coarsely(coarse: Objective, start: Transforms) -> Transforms | None:
+    try:
+        return coarse.minimize_with_scale(start)[0]
+    except CorrespondenceError:
+        return None
+
+
+def _solve_from(solution: Solution, start: Transforms) -> Transforms | None:
+    """Both passes, with all matches; None if too few are kept."""
     objective = solution.objective
     try:
-        near, _ = coarse.minimize_with_scale(start)
-        rough, scales = objective.with_tolerance(_ROUGH).minimize_with_scale(near)
+        rough, scales = objective.with_tolerance(_ROUGH).minimize_with_scale(start)
         return objective.without_outliers(rough, scales).minimize(rough, scales).T_camera_lidar
     except CorrespondenceError:
         return None

@@ -44,3 +44,23 @@ def test_a_free_direction_gets_no_step() -> None:
     hessian = np.diag([1.0, 2, 0, 4, 5, 6])
     step = solve_damped(hessian[None], np.array([[1.0, 2, 0, 4, 5, 6]]), 0.0)[0]
     np.testing.assert_allclose(step, [-1, -1, 0, -1, -1, -1])
+
+
+def test_frames_that_leave_directions_free_do_not_become_singular(pair: Rig) -> None:
+    """Matches in one point: two rows of six, and a damping that falls with every good step."""
+    camera, frames, matches = pair.cameras["left"], 2000, 5
+    rng = np.random.default_rng(0)
+    seen = simulate_correspondences(pair, frames=1, matches=frames).of_camera("left")
+    seen = seen.select(rng.integers(len(seen), size=frames))
+    points = np.repeat(seen.points_lidar_m, matches, axis=0)
+    pixels = np.repeat(seen.pixels_px, matches, axis=0) + rng.normal(size=(len(points), 2))
+    block = ProjectionBlock(camera.lens, points, pixels)
+    runs = to_runs(np.arange(0, len(points) + 1, matches))
+    fit = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (frames, 1, 1)))
+    assert fit.converged.all()
+    # The last step changes the cost, of 5 matches of 1 px, by 1e-10 of itself: what is left to the
+    # minimum is of that size.
+    sums = block.run_sums(fit.T_camera_lidar, runs)
+    to_minimum = np.linalg.pinv(sums.hessian, rcond=1e-9, hermitian=True)
+    left = np.einsum("fi,fij,fj->f", sums.gradient, to_minimum, sums.gradient)
+    assert (left <= 1e-8 * sums.cost).all()
