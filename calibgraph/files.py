@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import tempfile
@@ -9,7 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+import numpy as np
+from pydantic import BaseModel, ValidationError, ValidationInfo, field_validator
 
 from calibgraph.errors import FileError
 from calibgraph.yaml_text import describe_value, parse_yaml, yaml_text
@@ -23,13 +25,18 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
 
     A crash leaves the old file or the new one, never half of one.
+
+    Raises:
+        FileError: if there is no place for it.
+        OSError: if it cannot be written; with the path.
     """
     require_place_for_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = None
     try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
         write(temporary)
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -38,8 +45,22 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
         sync_folder(path.parent)
+    except OSError as error:
+        if error.filename and not str(error.filename).startswith(f"{path.parent}/.writing-"):
+            raise  # of another file, which is read
+        raise cannot_write(path, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSError:
+    """An error of the disk, with the file that it is about."""
+    number = number or getattr(error, "errno", None) or errno.EIO
+    reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+    return OSError(
+        number, f"cannot be written ({reason}); free or mend the disk and start again", str(path)
+    )
 
 
 def require_place_for_file(path: Path, *suffixes: str) -> None:
@@ -121,6 +142,8 @@ def require_file(path: Path) -> Path:
         raise FileError(path, f"cannot be read ({error.strerror}); check the path") from error
     if is_folder:
         raise FileError(path, "is a folder, expected a file")
+    if not is_file and os.path.lexists(path):
+        raise FileError(path, "is no file that can be read: a pipe, a device or a link to nothing")
     if not is_file:
         raise FileError(path, "no such file; check the path")
     return path
@@ -160,6 +183,25 @@ def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> 
     """
     text = yaml_text(content)
     write_text(path, f"{first_line}\n{text}" if first_line else text)
+
+
+class StrictNumbers(BaseModel):
+    """A model whose numbers are none of YAML's truth values: ``true`` is not 1 px."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_truth_values(cls, value: Any, info: ValidationInfo) -> Any:
+        wanted = cls.model_fields[info.field_name or ""].annotation
+        if wanted is not bool and holds_truth_value(value):
+            raise ValueError(f"expected no truth value, found {describe_value(value)}")
+        return value
+
+
+def holds_truth_value(value: object) -> bool:
+    """Whether it is True or False, or a list that holds one."""
+    if isinstance(value, (list, tuple)):
+        return any(map(holds_truth_value, value))
+    return isinstance(value, (bool, np.bool_))
 
 
 def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:

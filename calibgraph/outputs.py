@@ -13,6 +13,8 @@ from pathlib import Path
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_file
 
+_DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
+
 
 def is_never_ours(path: Path) -> bool:
     """For files without a place for a mark: none that exists is replaced."""
@@ -60,6 +62,28 @@ def require_free(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:
                 f"was not written by calibgraph {output.by}, and would be replaced; move it, or "
                 "choose another --out",
             )
+
+
+def require_apart(path: Path, datasets: Iterable[Path]) -> None:
+    """Check that what is written does not lie among the images and clouds of a dataset.
+
+    There it would be taken for one of them, and the dataset refused from then on.
+
+    Args:
+        path: of the file or folder that is written.
+        datasets: folders, or whatever else is read.
+
+    Raises:
+        FileError: if it does.
+    """
+    written = path.resolve()
+    for folder in datasets:
+        for part in _DATA_FOLDERS:
+            if written.is_relative_to(folder.resolve() / part):
+                raise FileError(
+                    path, f"is among the data of {folder}, and would be read as such; choose "
+                    "another --out"
+                )  # fmt: skip
 
 
 def yaml_mark(command: str) -> str:

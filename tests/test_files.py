@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from calibgraph import (
     Rig,
     load_rig,
 )
-from calibgraph.files import read_yaml
+from calibgraph.files import read_yaml, write_atomically, write_yaml
+from calibgraph.model.config import load_config
 from tests.model.test_rig import written
 
 
@@ -96,3 +98,46 @@ def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> Non
         load_rig(tmp_path)
     with pytest.raises(FileError, match="no such file"):
         load_rig(tmp_path / "nothing.yaml")
+
+
+@pytest.mark.parametrize("wrong", [{"fx": True}, {"cx": False}])
+def test_truth_values_are_no_numbers(wrong: dict[str, bool], pair: Rig, tmp_path: Path) -> None:
+    path = written(pair, tmp_path)
+    content = read_yaml(path)
+    content["cameras"]["left"]["intrinsics_px"] |= wrong
+    write_yaml(path, content)
+    with pytest.raises(FileError, match=r"cameras.left.intrinsics_px.*expected no truth value"):
+        load_rig(path)
+
+
+def test_truth_values_are_no_numbers_in_a_list_or_a_setting(pair: Rig, tmp_path: Path) -> None:
+    path = written(pair, tmp_path)
+    content = read_yaml(path)
+    content["cameras"]["left"]["distortion"] = [0.1, 0.0, True, 0.0]
+    write_yaml(path, content)
+    with pytest.raises(FileError, match=r"distortion.*expected no truth value"):
+        load_rig(path)
+    config = tmp_path / "config.yaml"
+    config.write_text("loss_scale_px: true\n")
+    with pytest.raises(FileError, match="loss_scale_px: expected no truth value"):
+        load_config(config)
+    config.write_text("learnt_weights: false\n")
+    assert not load_config(config).learnt_weights
+
+
+def test_a_full_disk_is_named_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "written.yaml"
+
+    def fail(_: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="cannot be written .No space left on device.*free") as caught:
+        write_atomically(path, fail)
+    assert caught.value.filename == str(path)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_an_input_that_cannot_be_read_meanwhile_keeps_its_name(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        write_atomically(tmp_path / "copy", lambda _: (tmp_path / "gone").read_bytes() and None)
+    assert caught.value.filename == str(tmp_path / "gone")

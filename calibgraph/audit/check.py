@@ -20,6 +20,7 @@ from calibgraph.rounds import AnyMatcher, Datasets
 from calibgraph.trust.cross_validation import competing_solution_checks
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
+from calibgraph.trust.image_evidence import measure_image_evidence
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
@@ -79,7 +80,7 @@ def check(
     try:
         run = tie_cameras(match_from_deployed(matching, watch), report)
         with watch("checks"):
-            cameras, lidar = _judge(run, tolerance)
+            cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
         too_few_matches = error.camera in rig.cameras and error.row is None
         if not too_few_matches:  # a wrong table
@@ -104,11 +105,11 @@ def _config(matcher: FullMatcher, seed: int) -> Config:
 
 
 def _judge(
-    run: MatchingRun, tolerance: Tolerance
+    run: MatchingRun, tolerance: Tolerance, progress: Progress
 ) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
     """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
     evidence = Evidence(run.solution, run.guess)
-    doubts = _doubts(run, evidence)
+    doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
     }
@@ -116,14 +117,36 @@ def _judge(
     return cameras, judge_lidar(evidence, cameras) if trusted else None
 
 
-def _doubts(run: MatchingRun, evidence: Evidence) -> dict[str, str]:
+def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
     parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
     z_scores = evidence.findings.z_score
+    of_frames = _doubts_by_frames(run, progress)
     return {
         name: _doubt_by_z_score(z_scores.get(name))
         or "; ".join(check.text for check in checks if check.status == "FAIL")
+        or of_frames.get(name, "")
         for name, checks in concatenate(parts, evidence.cameras).items()
+    }
+
+
+def _doubts_by_frames(run: MatchingRun, progress: Progress) -> dict[str, str]:
+    """Per camera, the frames that fit another extrinsic: something moved during the recording.
+
+    The solve leaves such frames out, and what is left agrees. Of matchers that may use what these
+    scores do not, nothing is concluded.
+    """
+    if not run.matcher.fails_on_images:
+        return {}
+    rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
+    found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
+    names = {frame.index: frame.name for frame in run.dataset.frames}
+    return {
+        camera: f"frames {', '.join(names[number] for number in of_camera.frames_lost[:5])} fit "
+        "another extrinsic better: has the camera or the LiDAR moved during the recording, or do "
+        "their images and clouds not belong together?"
+        for camera, of_camera in found.items()
+        if row.grade(of_camera.frames_best) != "PASS"
     }
 
 

@@ -14,6 +14,7 @@ from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,
+    Quantiles,
     Tolerance,
     describe_motion,
     detectable,
@@ -30,6 +31,8 @@ Array = NDArray[np.float64]
 
 FALSE_ALARM_RATE = 0.01
 """Probability of a significant axis in one call, over all cameras, results and trends."""
+
+_LATEST_DAY = 1e9  # a number of seconds would still be one, twice that of the present
 
 _FAILED = "its verdict is FAIL, so that nothing is known of its error; calibrate it again"
 _NO_ERROR_BAR = "it has no error bar; calibrate it from more frames, at more places"
@@ -96,11 +99,13 @@ def _times(days: Sequence[float] | None, count: int) -> Array:
     """(n,) days, or places.
 
     Raises:
-        ValueError: if there is not a finite day for each result.
+        ValueError: if there is not a day for each result, or one is none.
     """
     at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
-    if at.shape != (count,) or not np.isfinite(at).all():
-        raise ValueError(f"days: expected {count} finite numbers, one per result, found {days}")
+    if at.shape != (count,) or not (np.abs(at) <= _LATEST_DAY).all():
+        raise ValueError(
+            f"days: expected {count} numbers up to {_LATEST_DAY:g}, one per result, found {days}"
+        )
     return at
 
 
@@ -140,15 +145,15 @@ def _judge_camera(
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
         deviation, sigma = found.apart.deviation[row], found.apart.sigma[row]
-        quantile = limits.sigmas(found.apart.freedom[row])
-        audit, reason = judge_axes(deviation, sigma, quantile, tolerance)
+        quantiles = Quantiles.of(found.apart.freedom[row], limits.tail)
+        audit, reason = judge_axes(deviation, sigma, quantiles, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
             axes = tuple(np.flatnonzero(found.apart.axes_beyond(limits)[row]).tolist())
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
-        smallest = detectable(sigma, quantile)
+        smallest = detectable(sigma, quantiles.significant)
         judged[place] = CameraDrift(status, reason, deviation, sigma, smallest, axes)
     return tuple(judged)
 

@@ -5,7 +5,10 @@ Three statements about the deviation d of an axis with standard deviation sigma:
 * it is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has a
   significant axis;
 * it is beyond the tolerance: |d| > tolerance;
-* it is certainly within: |d| + 1.64 sigma <= tolerance, with 95 % confidence.
+* it is certainly within: |d| + p sigma <= tolerance, with 95 % confidence (p is 1.64 or more).
+
+Both are quantiles of Student's t: sigma is itself estimated, from the scatter of few frames. The
+part of it that is stated, for the error that all frames share, has no such doubt.
 
 WRONG: an axis is significant and beyond the tolerance. OK: all axes are certainly within. Else the
 data cannot tell.
@@ -17,16 +20,17 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import chdtri, ndtri
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri, ndtri, stdtrit
 
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
-from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 FALSE_ALARM_RATE = 1e-3
 """Probability of a significant axis on a rig, of all its cameras, that has not changed."""
@@ -76,9 +80,51 @@ class Tolerance:
         return twist
 
 
-def significant_sigmas(cameras: int) -> float:
-    """How many sigmas are significant, of the six axes of so many cameras."""
-    return float(ndtri(1 - FALSE_ALARM_RATE / (2 * 6 * cameras)))
+@dataclass(frozen=True, eq=False)
+class Quantiles:
+    """How many sigmas mean something, by the degrees of freedom that the sigmas have.
+
+    Attributes:
+        significant: (6,) from where on a deviation is none of chance.
+        confident: (6,) below which an error is with probability CONFIDENCE.
+    """
+
+    significant: Array
+    confident: Array
+
+    @classmethod
+    def of(cls, freedom: ArrayLike, tail: float) -> Quantiles:
+        """Of Student's t.
+
+        Args:
+            freedom: degrees of freedom of the sigmas, (6,) or of all; infinite where known.
+            tail: probability of a larger deviation by chance, to either side.
+        """
+        freedom = np.broadcast_to(np.asarray(freedom, np.float64), 6)
+        return cls(-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE))
+
+    def beside_known(self, share: Array, known: Quantiles) -> Quantiles:
+        """Of a variance of which only a share is estimated: squares add up (after Cochran).
+
+        It errs on the side of fewer alarms: a quarter of the stated ones if the shares are alike.
+
+        Args:
+            share: (6,) of the variances that is estimated.
+            known: quantiles of the rest.
+        """
+
+        def blend(ours: Array, theirs: Array) -> Array:
+            blended: Array = np.sqrt(share * ours**2 + (1 - share) * theirs**2)
+            return blended
+
+        return Quantiles(
+            blend(self.significant, known.significant), blend(self.confident, known.confident)
+        )
+
+
+def tail_of_axis(cameras: int) -> float:
+    """Probability of a significant deviation by chance, of one of six axes, to either side."""
+    return FALSE_ALARM_RATE / (2 * 6 * cameras)
 
 
 def detectable(sigma: Array, quantile: float | Array) -> Array:
@@ -110,14 +156,26 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     block = evidence.solution.inliers.blocks.get(name)
     if block is not None and block.frames < ENOUGH_FRAMES:
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
-    sigma, cameras = np.sqrt(np.diag(covariance)), len(evidence.cameras)
-    quantile = significant_sigmas(cameras)
-    status, reason = judge_axes(deviation, sigma, quantile, tolerance)
+    sigma = np.sqrt(np.diag(covariance))
+    quantiles = _quantiles(evidence, name, covariance)
+    status, reason = judge_axes(deviation, sigma, quantiles, tolerance)
     if doubt:
         status, reason = "CANNOT TELL", doubt
-    elif status == "WRONG" and cameras == 1:
+    elif status == "WRONG" and len(evidence.cameras) == 1:
         reason += SINGLE_CAMERA
-    return CameraAudit(status, reason, deviation, sigma, detectable(sigma, quantile), z_score)
+    smallest = detectable(sigma, quantiles.significant)
+    return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
+
+
+def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
+    """Of a camera's error bar: of few frames' scatter, but for what is stated of shared errors."""
+    tail = tail_of_axis(len(evidence.cameras))
+    known = Quantiles.of(np.inf, tail)
+    block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
+    if block is None or scatter is None:
+        return known
+    estimated = Quantiles.of(block.frames - 1 + PSEUDO_FRAMES, tail)
+    return estimated.beside_known(np.diag(scatter) / np.diag(covariance), known)
 
 
 def _deviation(evidence: Evidence, name: str) -> Array:
@@ -127,26 +185,34 @@ def _deviation(evidence: Evidence, name: str) -> Array:
 
 
 def judge_axes(
-    deviation: Array, sigma: Array, quantile: float | Array, tolerance: Tolerance
+    deviation: Array, sigma: Array, quantiles: Quantiles, tolerance: Tolerance
 ) -> tuple[AuditStatus, str]:
     """The status of a trusted measurement, and its reason."""
-    size, significant = np.abs(deviation), np.abs(deviation) > quantile * sigma
+    size, significant = np.abs(deviation), np.abs(deviation) > quantiles.significant * sigma
     wrong = significant & (size > tolerance.twist)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    unsure = size + ndtri(CONFIDENCE) * sigma > tolerance.twist
+    reach = quantiles.confident * sigma
+    unsure = size + reach > tolerance.twist
     if unsure.any():
-        return "CANNOT TELL", _advise(deviation, sigma, unsure, tolerance)
+        blind = unsure & (reach > tolerance.twist)
+        return "CANNOT TELL", _advise(deviation, sigma, unsure, blind)
     if significant.any():
         moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
         return "OK", f"within the tolerance, though significant: {moved}"
     return "OK", "no significant deviation, and all axes are within the tolerance"
 
 
-def _advise(deviation: Array, sigma: Array, unsure: NDArray[np.bool_], tolerance: Tolerance) -> str:
-    """What was found about the axes that may be beyond the tolerance, and what to record."""
+def _advise(deviation: Array, sigma: Array, unsure: Mask, blind: Mask) -> str:
+    """What was found about the axes that may be beyond the tolerance, and what to record.
+
+    Args:
+        deviation: (6,) of all axes.
+        sigma: (6,) its standard deviations.
+        unsure: (6,) which may be beyond the tolerance.
+        blind: (6,) which would be unsure without any deviation.
+    """
     found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
-    blind = unsure & (ndtri(CONFIDENCE) * sigma > tolerance.twist)
     if not blind.any():
         advice = "too near to the tolerance to decide: check another recording, of other places"
     elif blind[3:].any():
@@ -170,7 +236,7 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
         return None
     deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
     T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
-    quantile = significant_sigmas(len(cameras))
+    quantile = float(ndtri(1 - tail_of_axis(len(cameras))))
     return find_lidar_motion(deviation, evidence.joint_covariance, T_camera_lidar, wrong, quantile)
 
 
@@ -208,9 +274,7 @@ def find_lidar_motion(
     return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
 
 
-def describe_motion(
-    motion: Array, sigma: Array, which: NDArray[np.bool_], axes: tuple[str, ...]
-) -> str:
+def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, ...]) -> str:
     """A motion about and along some axes, in words.
 
     Args:

@@ -156,7 +156,11 @@ def config_from(config: Path | None, preset_name: str | None, **given: float | N
 
     if config is not None and preset_name is not None:
         raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
-    settings = load_config(config) if config is not None else preset(preset_name or "auto")
+    settings = (
+        load_config(config)
+        if config is not None
+        else preset("auto" if preset_name is None else preset_name)
+    )
     return settings.changed(**{k: v for k, v in given.items() if v is not None})
 
 

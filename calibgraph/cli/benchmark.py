@@ -86,7 +86,7 @@ def paper(
             source,
             frames=_parse_counts("--frames", frames),
             draws=draws or source.default_draws,
-            config=_paper_settings(preset or source.preset, seed),
+            config=_paper_settings(source.preset if preset is None else preset, seed),
             seed=seed,
             jobs=jobs,
             trf=trf,
@@ -189,7 +189,7 @@ def tune(
         source = source_from(data, Displacement(rotation_deg, translation_m))
         tuned = tune(
             source,
-            base=_paper_settings(preset or source.preset, seed),
+            base=_paper_settings(source.preset if preset is None else preset, seed),
             frames=frames,
             samples=samples,
             draws=draws or min(5, source.default_draws),

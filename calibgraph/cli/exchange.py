@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -181,12 +182,15 @@ def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
     """The pairs of a repeated option A=B.
 
     Raises:
-        ValueError: if there is no ``=``.
+        ValueError: if there is no ``=``, or one A twice.
     """
     for text in texts or ():
         if "=" not in text:
             raise ValueError(f"{option} {text!r}: give two names with = between them")
-    pairs = (text.partition("=") for text in texts or ())
+    pairs = [text.partition("=") for text in texts or ()]
+    for name, count in Counter(name for name, _, _ in pairs).items():
+        if count > 1:
+            raise ValueError(f"{option} {name}=...: given {count} times; give it once")
     return {name: value for name, _, value in pairs}
 
 

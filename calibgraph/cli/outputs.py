@@ -165,10 +165,12 @@ def keep_files(
 
     @wraps(command)
     def run(**given: Any) -> None:
-        from calibgraph.outputs import require_free
+        from calibgraph.outputs import require_apart, require_free
 
-        require_free(outputs(given), [path for name in given if name not in WRITTEN
-                                      for path in _files_at(given[name])])  # fmt: skip
+        files, read = outputs(given), [given[name] for name in given if name not in WRITTEN]
+        require_free(files, [path for each in read for path in _files_at(each)])
+        for output in files:
+            require_apart(output.path, (path for each in read for path in _folders_at(each)))
         command(**given)
 
     return run
@@ -188,6 +190,13 @@ def _files_at(value: object) -> Iterator[Path]:
             yield rig
         else:
             yield from (file for suffix in TABLE_SUFFIXES for file in path.glob(f"*{suffix}"))
+
+
+def _folders_at(value: object) -> Iterator[Path]:
+    """The folders that an argument names."""
+    items = value if isinstance(value, (list, tuple)) else [value]
+    named = (Path(item) for item in items if isinstance(item, (str, Path)))
+    yield from (path for path in named if _exists(path) and path.is_dir())
 
 
 def _exists(path: Path) -> bool:

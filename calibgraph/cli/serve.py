@@ -75,12 +75,13 @@ def serve(
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
     """
     from calibgraph.service.app import create_app
-    from calibgraph.service.serve import Address, require_safe
+    from calibgraph.service.serve import Address, require_certificate, require_safe
     from calibgraph.service.serve import serve as serve_app
     from calibgraph.service.settings import Settings
 
     address = Address(host, port, certificate, key)
     require_safe(address, has_tokens=tokens is not None)
+    require_certificate(address)
     counted = {} if jobs is None else {"jobs_at_once": jobs}
     settings = Settings(
         data=data,

@@ -114,6 +114,6 @@ def _rig(name: str) -> Rig:
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 
-    if name not in RIG_NAMES and Path(name).exists():
+    if name and name not in RIG_NAMES and Path(name).exists():
         return load_rig(name)
     return rig_of(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -45,6 +46,7 @@ def view(
     if dataset:
         with checked_arguments():
             loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
     written = []
     with progress_bar("reading") as progress:
         if rerun is not None:

@@ -55,6 +55,8 @@ def read_bytes(uri: str, most: int) -> bytes:
     """
     filesystem, path = locate(uri)
     try:
+        if filesystem.info(path)["type"] not in ("file", "directory"):
+            raise FileError(uri, "is no file that can be read: a pipe, a device or a socket")
         size = filesystem.size(path)
         if size is not None and size > most:
             raise FileError(uri, f"{size} bytes is too large, expected up to {most}")

@@ -9,10 +9,10 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator
+from pydantic import BaseModel, BeforeValidator, StrictBool
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_yaml, sha256
+from calibgraph.files import checked_model, holds_truth_value, read_yaml, sha256
 from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
@@ -25,12 +25,13 @@ from calibgraph.model.result_files import (
     is_calibration_file,
 )
 from calibgraph.model.rig import Finite, Rig
-from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.model.verdict import Check, Doubt, Status, Verdict
 
 Array = NDArray[np.float64]
 Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one
+_ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -58,29 +59,73 @@ def load_calibration(path: Path | str) -> Calibration:
         camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
         **{name: getattr(parts, name) for name in _PLAIN},
     )
-    _require_consistent(path, content, found)
+    _require_consistent(path, content, parts, found)
     return found
 
 
-def _matrix(side: int | None) -> BeforeValidator:
-    """A square matrix of finite numbers as an array; of any side if None."""
+def _square(value: Any) -> Array:
+    """A square matrix of finite numbers as an array.
 
-    def check(value: Any) -> Array:
-        try:
-            found = np.array(value, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError("expected a matrix of numbers") from error
-        rows = len(found) if side is None and found.ndim else side
-        if found.shape != (rows, rows) or not np.isfinite(found).all():
-            raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
-        return found
+    Raises:
+        ValueError: if it is not.
+    """
+    try:
+        found = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError("expected a matrix of numbers") from error
+    if holds_truth_value(value):
+        raise ValueError("expected a matrix of numbers, found a truth value in it")
+    if found.ndim != 2 or len({*found.shape}) != 1 or not np.isfinite(found).all():  # noqa: PLR2004
+        raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
+    return found
 
-    return BeforeValidator(check)
+
+def _of_pose(value: Any) -> Array:
+    """A 4x4 matrix.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    found = _square(value)
+    if len(found) != 4:  # noqa: PLR2004 - homogeneous coordinates
+        raise ValueError(f"expected a 4x4 matrix, found {found.shape}")
+    return found
 
 
-Matrix4 = Annotated[Any, _matrix(4)]
-Matrix6 = Annotated[Any, _matrix(_POSE)]
-Square = Annotated[Any, _matrix(None)]
+def _covariance(value: Any) -> Array:
+    """A covariance of one or more poses: symmetric, without a negative variance in any direction.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    found = _square(value)
+    if len(found) % _POSE:
+        raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
+    variances = np.diag(found)
+    units = np.sqrt(np.where(variances > 0, variances, 1.0))
+    correlations = found / np.outer(units, units)
+    if not np.allclose(correlations, correlations.T, atol=_ROUNDING):
+        raise ValueError("it is not symmetric; the file was edited, write it again")
+    if (variances < 0).any() or np.linalg.eigvalsh(correlations)[0] < -_ROUNDING * len(found):
+        raise ValueError("it has negative variances; the file was edited, write it again")
+    return found
+
+
+def _covariance_of_one(value: Any) -> Array:
+    """A (6, 6) covariance.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    found = _covariance(value)
+    if len(found) != _POSE:
+        raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
+    return found
+
+
+Matrix4 = Annotated[Any, BeforeValidator(_of_pose)]
+Covariance = Annotated[Any, BeforeValidator(_covariance_of_one)]
+JointCovariance = Annotated[Any, BeforeValidator(_covariance)]
 
 
 class _Motion(BaseModel):
@@ -97,6 +142,7 @@ class _FrameEntry(BaseModel):
 
 
 class _Checks(BaseModel):
+    status: Status
     checks: tuple[Check, ...]
     doubt: Doubt | None = None
 
@@ -107,9 +153,9 @@ class _Parts(BaseModel):
     rig: dict[str, Any]
     initial_rig: dict[str, Any]
     config: dict[str, Any]
-    covariance: dict[str, Matrix6 | None]
-    joint_covariance: Square | None
-    bootstrap_covariance: dict[str, Matrix6]
+    covariance: dict[str, Covariance | None]
+    joint_covariance: JointCovariance | None
+    bootstrap_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Matrix4]
     camera_verdicts: dict[str, _Checks]
     residuals: dict[str, Residuals]
@@ -124,20 +170,27 @@ class _Parts(BaseModel):
     versions: dict[str, str]
 
 
-def _require_consistent(path: Path, content: Mapping[str, Any], found: Calibration) -> None:
+def _require_consistent(
+    path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
+) -> None:
     """Check that the verdict is that of its checks, and all parts are of the same cameras.
 
     Raises:
         FileError: if not: the file was edited.
     """
     verdict = content.get("verdict", {})
-    status = verdict.get("status") if isinstance(verdict, dict) else verdict
-    if status != found.verdict.status:
-        raise FileError(
-            path,
-            f"has the verdict {status}, its checks give {found.verdict.status}: it was edited; "
-            "write it again",
-        )
+    stated = {"the rig": verdict.get("status") if isinstance(verdict, dict) else verdict}
+    derived = {"the rig": found.verdict.status}
+    for name, of_camera in parts.camera_verdicts.items():
+        stated[f"camera {name!r}"] = of_camera.status
+        derived[f"camera {name!r}"] = found.camera_verdicts[name].status
+    for what, status in stated.items():
+        if status != derived[what]:
+            raise FileError(
+                path,
+                f"has the verdict {status} of {what}, its checks give {derived[what]}: it was "
+                "edited; write it again",
+            )
     names, joint = set(found.rig.cameras), found.joint_covariance
     right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
     right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
@@ -190,8 +243,8 @@ def is_calibration(content: Mapping[str, Any]) -> bool:
 class _ErrorBars(BaseModel):
     """The keys of a result's file that hold its error bars."""
 
-    covariance: dict[str, Matrix6 | None] = {}
-    error_bar_holds: dict[str, bool] = {}
+    covariance: dict[str, Covariance | None] = {}
+    error_bar_holds: dict[str, StrictBool] = {}
 
 
 def error_bars(path: Path) -> dict[str, Array | None] | None:

@@ -19,6 +19,7 @@ from calibgraph.io.feather import read_feather
 from calibgraph.io.las import read_las
 from calibgraph.io.motion import ScanMotion
 from calibgraph.io.pcd_ply import read_pcd_or_ply
+from calibgraph.model.correspondences import MAX_COORDINATE
 
 Points = tuple[NDArray[Any], NDArray[Any] | None]
 """(n, 3) x y z and (n,) intensities, None if there are none; in any type of number."""
@@ -80,15 +81,24 @@ def check_points(cloud: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
     returned = cloud[~np.isnan(cloud[:, :3]).all(axis=1)]
     if not len(returned):
         raise FileError(path, "holds no point")
-    if not returned[:, :3].any():
+    with np.errstate(invalid="ignore"):  # random bytes are numbers that warn
+        finite = np.isfinite(returned[:, :3])
+        largest = np.abs(returned[:, :3]).max(where=finite, initial=0.0)
+    if finite.all() and not largest:
         raise FileError(path, f"all of its {len(returned)} points lie at the origin")
-    if not np.isfinite(returned[:, :3]).all():
+    if not finite.all():
         bad = ~np.isfinite(cloud[:, :3]).all(axis=1) & ~np.isnan(cloud[:, :3]).all(axis=1)
         row = int(np.flatnonzero(bad)[0])
         raise FileError(
             path,
             f"point {row} is not finite: {cloud[row, :3].tolist()}; record again, or mark points "
             "without a return by NaN in x, y and z",
+        )
+    if largest > MAX_COORDINATE:
+        raise FileError(
+            path,
+            f"holds a coordinate of {largest:.3g}, expected metres, up to {MAX_COORDINATE:g}; "
+            "convert its unit, or mark points without a return by NaN in x, y and z",
         )
     return returned
 

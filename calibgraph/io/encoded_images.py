@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from typing import Any
 
 import cv2
@@ -10,6 +11,10 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 from PIL.PngImagePlugin import PngImageFile
+
+_PNG_MARK = b"\x89PNG\r\n\x1a\n"
+_END = b"\0\0\0\0IEND\xaeB`\x82"
+_AROUND_CHUNK = 12  # bytes of a chunk's length, name and checksum
 
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -33,12 +38,32 @@ def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
         if not is_png(data):
             return _decode_jpeg(data, gray=not kind & cv2.IMREAD_COLOR)
         PngImageFile(io.BytesIO(data)).verify()  # checksums, up to the end mark
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
+        image = cv2.imdecode(np.frombuffer(_pixels_alone(data), np.uint8), kind)
     except (SyntaxError, OSError, ValueError, cv2.error) as error:
         raise ValueError(str(error)) from error
     if image is None:
         raise ValueError("its pixels")
     return np.asarray(image)
+
+
+def _pixels_alone(png: bytes) -> bytes:
+    """A verified PNG without what does not change its pixels.
+
+    libpng prints warnings about profiles and gammas, which OpenCV ignores.
+
+    Raises:
+        ValueError: if its end is damaged, which is not verified.
+    """
+    kept, place = [png[: len(_PNG_MARK)]], len(_PNG_MARK)
+    while kept[-1][4:8] != b"IEND":
+        (length,) = struct.unpack_from(">I", png, place)
+        end = place + length + _AROUND_CHUNK
+        if png[place + 4 : place + 5].isupper() or png[place + 4 : place + 8] == b"tRNS":
+            kept.append(png[place:end])
+        place = end
+    if kept[-1] != _END:
+        raise ValueError("its end mark")
+    return b"".join(kept)
 
 
 def _decode_jpeg(data: bytes, *, gray: bool) -> NDArray[Any]:

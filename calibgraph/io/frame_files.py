@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibgraph.errors import FileError
-from calibgraph.files import is_utf8
+from calibgraph.files import is_utf8, require_file
+
+_PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,12 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
-            if path.stem in files:
-                raise FileError(path, f"and {files[path.stem].name} are the same frame; keep one")
+            stem = path.stem.removesuffix(_PCD) if path.suffix == ".bin" else path.stem
+            if stem in files:
+                raise FileError(path, f"and {files[stem].name} are the same frame; keep one")
             if not is_utf8(path.name):
                 raise FileError(path, "its name is not UTF-8; rename it")
-            files[path.stem] = path
+            files[stem] = require_file(path)
     if not files:
         raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
     return files

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
-from calibgraph.files import checked_model, describe, read_yaml
+from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
 from factors import LossName
 
@@ -22,7 +22,7 @@ Cells = Annotated[int, Field(gt=0, le=100_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
-class Tracking(BaseModel):
+class Tracking(StrictNumbers):
     """Settings of the recalibration while driving.
 
     Attributes:
@@ -49,7 +49,7 @@ class Tracking(BaseModel):
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
 
 
-class Config(BaseModel):
+class Config(StrictNumbers):
     """Settings, with the paper's symbols. The defaults are the preset ``auto``.
 
     Attributes:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame, hash_source
 from calibgraph.model.calibration import Calibration
 
 
@@ -26,7 +27,8 @@ def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
         dataset: the same folders in the same order.
 
     Raises:
-        DatasetError: if the dataset does not have the result's frames.
+        DatasetError: if the dataset does not have the result's frames, or other images or clouds
+            under their names.
     """
     available = {frame.index: frame for frame in dataset.frames}
     names = _frame_names(result)
@@ -38,7 +40,27 @@ def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
                 "give the same folders in the same order",
                 frame=number,
             )
+    for entry in result.frames:
+        _require_same_files(result, entry, available[entry["frame"]])
     return replace(result, frames=tuple(available[number].entry() for number in names))
+
+
+def _require_same_files(result: Calibration, entry: Mapping[str, Any], frame: Frame) -> None:
+    """Check that a frame's cloud and images are those that the result was made from.
+
+    Raises:
+        DatasetError: if one has changed, by its hash.
+    """
+    before = {"cloud": entry["cloud"], **entry["images"]}
+    now = {"cloud": frame.cloud_path, **frame.image_paths}
+    for what in before.keys() & now.keys():
+        recorded = result.inputs.get(before[what])
+        if recorded is not None and recorded != hash_source(now[what]):
+            raise DatasetError(
+                f"{now[what]}: is not what the result was made from ({before[what]}): it has "
+                "another content; give the same recording",
+                frame=frame.index,
+            )
 
 
 def _frame_names(result: Calibration) -> dict[int, str | None]:

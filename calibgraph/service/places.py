@@ -36,6 +36,9 @@ def open_roots(uris: tuple[str, ...]) -> tuple[Root, ...]:
     Raises:
         FileError: if one is no URI that can be read, or a local folder that is not there.
     """
+    for uri in uris:
+        if not uri:
+            raise FileError("--root", "is empty; name a folder, or leave it out")
     return tuple(Root(*_place(uri)) for uri in uris)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -10,7 +11,8 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.files import require_file
 from calibgraph.service.state import Service
 
 _CLOSE_S = 5
@@ -47,6 +49,25 @@ def require_safe(address: Address, *, has_tokens: bool) -> None:
             f"--host {address.host}: others could call; give --tokens FILE (see calibgraph token), "
             "or listen on 127.0.0.1"
         )
+
+
+def require_certificate(address: Address) -> None:
+    """Check that the files for TLS are some.
+
+    Raises:
+        FileError: if one is missing, or both are no certificate and its key.
+    """
+    for path in filter(None, (address.certificate, address.key)):
+        require_file(path)
+    if address.certificate is None:
+        return
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(
+            address.certificate, address.key
+        )
+    except (ssl.SSLError, OSError) as error:
+        why = f"is no PEM certificate that belongs to the key {address.key or 'in it'} ({error})"
+        raise FileError(address.certificate, why) from error
 
 
 def _is_loopback(host: str) -> bool:

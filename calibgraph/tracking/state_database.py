@@ -23,7 +23,12 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder, sync_folder, write_atomically
+from calibgraph.files import (
+    cannot_write,
+    require_place_for_folder,
+    sync_folder,
+    write_atomically,
+)
 from calibgraph.tracking.state_recovery import checksum, log_of, read
 
 DATABASE = "state.sqlite"
@@ -193,8 +198,11 @@ def _create(path: Path) -> None:
         leftover.unlink()
 
     def write(part: Path) -> None:
-        with closing(sqlite3.connect(part, isolation_level=None)) as connection:
-            connection.executescript(_TABLES)
+        try:
+            with closing(sqlite3.connect(part, isolation_level=None)) as connection:
+                connection.executescript(_TABLES)
+        except sqlite3.Error as error:
+            raise _cannot_write(path, error) from error
 
     write_atomically(path, write)
 
@@ -222,5 +230,4 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 def _cannot_write(path: Path, error: sqlite3.Error) -> OSError:
     full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
-    message = f"cannot be written ({error}); free or mend the disk and start again"
-    return OSError(errno.ENOSPC if full else errno.EIO, message, str(path))
+    return cannot_write(path, error, errno.ENOSPC if full else errno.EIO)

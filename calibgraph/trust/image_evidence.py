@@ -71,7 +71,12 @@ class ImageEvidence:
 
 
 def measure_image_evidence(
-    dataset: Dataset, rig: Rig, *, seed: int = 0, progress: Progress | None = None
+    dataset: Dataset,
+    rig: Rig,
+    *,
+    seed: int = 0,
+    extrinsics_only: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, ImageEvidence]:
     """Measure the image evidence on all cameras of a result.
 
@@ -79,6 +84,8 @@ def measure_image_evidence(
         dataset: images and clouds.
         rig: lenses, and the extrinsics in question.
         seed: of the search for the lens.
+        extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
+            take most of the time.
         progress: called as the work goes on.
     """
     report = progress or no_progress
@@ -86,7 +93,7 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_camera, scorer, seed=seed)
+        measure = partial(_measure_extrinsic if extrinsics_only else _measure_camera, scorer, seed)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
             report(f"checking: {name}", index, len(rig.cameras))
@@ -94,7 +101,15 @@ def measure_image_evidence(
     return evidence
 
 
-def _measure_camera(scorer: FrameScorer, name: str, camera: Camera, *, seed: int) -> ImageEvidence:
+def _measure_extrinsic(scorer: FrameScorer, _seed: int, name: str, camera: Camera) -> ImageEvidence:
+    scores = scorer.score_together(scorer.load_images(name, camera), camera, WIDE)
+    groups = len(scores.counts)
+    if groups < MIN_GROUPS:
+        return ImageEvidence(groups)
+    return ImageEvidence(groups, **_compare_with_displaced(scores))
+
+
+def _measure_camera(scorer: FrameScorer, seed: int, name: str, camera: Camera) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
     groups = len(scores.counts)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibgraph.errors import CalibrationError
-from calibgraph.files import write_atomically
+from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
@@ -36,6 +36,7 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
 
     Raises:
         CalibrationError: if rerun-sdk is missing, or an image or cloud cannot be read.
+        OSError: if the file cannot be written.
     """
     rr = _import_rerun()
     path = Path(path)
@@ -45,8 +46,10 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
         recording.save(str(temporary))
         try:
             _log_result(rr, recording, result, progress)
-        finally:
             recording.flush()
+        except RuntimeError as error:  # of its thread that writes
+            raise cannot_write(path, error) from error
+        finally:
             recording.disconnect()
 
     write_atomically(path, write)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -148,3 +150,22 @@ def test_a_rig_that_is_wrong_by_degrees_is_never_ok(degrees: float) -> None:
         deployed = calibgraph.perturb(TRUTH, rotation_deg=degrees, translation_m=0.3, seed=seed)
         audit = calibgraph.check(deployed, data, matcher=StructureMatcher(seed=seed))
         assert "OK" not in {camera.status for camera in audit.cameras.values()}
+
+
+@pytest.mark.slow
+def test_a_camera_that_moved_during_the_recording_is_not_ok(tmp_path: Path) -> None:
+    """The solve leaves the frames after it out, and what is left agrees."""
+    data = Path(shutil.copytree(SAMPLE, tmp_path / "data"))
+    camera = TRUTH.cameras["front_left"]
+    assert not any(camera.distortion)  # a turn of the camera is a homography
+    k = camera.intrinsics_px
+    K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    turned = K @ motion(1, degrees=1.5)[:3, :3] @ np.linalg.inv(K)
+    for path in sorted((data / "cameras" / "front_left").iterdir())[3:]:
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), cv2.warpPerspective(image, turned, image.shape[1::-1]))
+    audit = calibgraph.check(TRUTH, data)
+    moved = audit.cameras["front_left"]
+    assert moved.status == "CANNOT TELL"
+    assert "frames 000003, 000004, 000005 fit another extrinsic better" in moved.reason
+    assert {audit.cameras[name].status for name in ("front_right", "left")} == {"OK"}

@@ -3,11 +3,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.audit.judgement import POWER, Tolerance, detectable, judge_axes, significant_sigmas
+from calibgraph.audit.judgement import (
+    POWER,
+    Quantiles,
+    Tolerance,
+    detectable,
+    judge_axes,
+    tail_of_axis,
+)
 
 TOLERANCE = Tolerance(0.5, 10.0)
 SIGMA = np.repeat([np.radians(0.09), 0.02], 3)
-QUANTILE = significant_sigmas(3)
+KNOWN = Quantiles.of(np.inf, tail_of_axis(3))
+QUANTILE = KNOWN.significant[0]
 
 
 def deviation(axis: int, value: float) -> np.ndarray:
@@ -18,24 +26,24 @@ def deviation(axis: int, value: float) -> np.ndarray:
 
 
 def test_a_significant_deviation_beyond_the_tolerance_is_wrong_and_its_axis_is_named() -> None:
-    status, reason = judge_axes(deviation(1, -0.8), SIGMA, QUANTILE, TOLERANCE)
+    status, reason = judge_axes(deviation(1, -0.8), SIGMA, KNOWN, TOLERANCE)
     assert status == "WRONG"
     assert reason == "turned about y (yaw) by -0.80 deg (sigma 0.09)"
-    status, reason = judge_axes(deviation(5, 15.0), SIGMA, QUANTILE, TOLERANCE)
+    status, reason = judge_axes(deviation(5, 15.0), SIGMA, KNOWN, TOLERANCE)
     assert status == "WRONG"
     assert "moved along z (ahead) by +15.00 cm" in reason
 
 
 def test_a_significant_deviation_within_the_tolerance_is_ok_and_named() -> None:
     sharp = SIGMA / 4
-    status, reason = judge_axes(deviation(0, 0.3), sharp, QUANTILE, TOLERANCE)
+    status, reason = judge_axes(deviation(0, 0.3), sharp, KNOWN, TOLERANCE)
     assert status == "OK"
     assert "within the tolerance, though significant" in reason
     assert "x (pitch) by +0.30 deg" in reason
 
 
 def test_a_deviation_near_the_tolerance_cannot_be_told() -> None:
-    status, reason = judge_axes(deviation(2, 0.45), SIGMA, QUANTILE, TOLERANCE)
+    status, reason = judge_axes(deviation(2, 0.45), SIGMA, KNOWN, TOLERANCE)
     assert status == "CANNOT TELL"
     assert "check another recording" in reason
 
@@ -44,20 +52,35 @@ def test_a_deviation_near_the_tolerance_cannot_be_told() -> None:
 def test_no_deviation_with_a_wide_error_bar_cannot_be_told(axis: int, words: str) -> None:
     wide = SIGMA.copy()
     wide[axis] *= 10
-    status, reason = judge_axes(np.zeros(6), wide, QUANTILE, TOLERANCE)
+    status, reason = judge_axes(np.zeros(6), wide, KNOWN, TOLERANCE)
     assert status == "CANNOT TELL"
     assert words in reason
 
 
 def test_a_large_deviation_that_is_not_significant_is_not_called_wrong() -> None:
     wide = 10 * SIGMA
-    assert judge_axes(deviation(0, 2.0), wide, QUANTILE, TOLERANCE)[0] == "CANNOT TELL"
+    assert judge_axes(deviation(0, 2.0), wide, KNOWN, TOLERANCE)[0] == "CANNOT TELL"
 
 
 def test_one_of_a_thousand_unchanged_rigs_has_a_significant_axis() -> None:
     draws = np.random.default_rng(0).standard_normal((400_000, 6 * 3))
     alarms = np.count_nonzero((np.abs(draws) > QUANTILE).any(axis=1))
     assert abs(alarms - 400) < 4 * np.sqrt(400)  # a Poisson count
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+def test_at_most_one_of_a_thousand_has_one_if_sigma_is_of_few_frames(share: float) -> None:
+    """10 degrees of freedom of a part, beside a part that is known."""
+    rng, rigs, freedom = np.random.default_rng(0), 50_000, 10
+    estimated = share * rng.chisquare(freedom, (rigs, 6)) / freedom
+    variance = estimated + 1 - share
+    known, own = (Quantiles.of(nu, tail_of_axis(1)) for nu in (np.inf, freedom))
+    limit = own.beside_known(estimated / variance, known).significant * np.sqrt(variance)
+    draws = np.abs(rng.standard_normal(variance.shape))
+    assert np.count_nonzero((draws > limit).any(axis=1)) < 50 + 4 * np.sqrt(50)  # Poisson
+    if share >= 0.5:  # by the normal distribution they would be too many
+        by_normal = draws > known.significant * np.sqrt(variance)
+        assert np.count_nonzero(by_normal.any(axis=1)) > 100
 
 
 def test_the_smallest_detectable_change_is_significant_with_the_stated_power() -> None:

@@ -30,6 +30,7 @@ def test_bad_rigs_and_tables_are_one_line(problem: Path, call: Call) -> None:
         "unknown key 'lambda'": ("solve", rig, table, "--config", problem / "config.yaml"),
         "gate_px": ("solve", rig, table, "--config", problem / "negative.yaml"),
         "unknown preset 'best'": ("solve", rig, table, "--preset", "best"),
+        "unknown preset ''": ("solve", rig, table, "--preset", ""),
         "--terms 'all'": ("solve", rig, table, "--terms", "all"),
         "exclude each other": (
             "solve", rig, table, "--preset", "kitti", "--config", problem / "config.yaml",

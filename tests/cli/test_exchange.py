@@ -7,10 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 
 from calibgraph import MatcherErrors, export_calibration, load_rig, simulate_correspondences, solve
-from calibgraph.cli.exchange import export, import_
+from calibgraph.cli.exchange import export, import_, parse_names
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.formats.rig_export import CAMERA_FRAME
 from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
@@ -155,3 +156,8 @@ def test_defaults_on_the_command_line_are_the_librarys() -> None:
     assert of_import["relative_sigma_deg"].default == RELATIVE_SIGMA_DEG
     assert of_import["relative_sigma_cm"].default == RELATIVE_SIGMA_CM
     assert inspect.signature(export).parameters["camera_frame"].default == CAMERA_FRAME
+
+
+def test_a_name_that_is_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="--mount cam0=...: given 2 times; give it once"):
+        parse_names("--mount", ["cam0=front", "cam1=left", "cam0=rear"])

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from benchmarks.fleet.tables import write_fleet
 from calibgraph import FileError
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
-from calibgraph.fleet.uris import fetch, fingerprint, join
+from calibgraph.fleet.uris import fetch, fingerprint, join, read_bytes
 
 
 @pytest.fixture
@@ -75,3 +76,9 @@ def test_tables_in_an_archive_are_fetched_solved_and_removed(
     assert errors == [f"zip://none.parquet::{archive}: nothing is there"]
     assert sum(summary.verdicts.values()) == 2
     assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fleet.csv")
+    with pytest.raises(FileError, match="is no file that can be read"):
+        read_bytes(str(tmp_path / "fleet.csv"), 1000)

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from calibgraph import FileError, load_calibration
+from calibgraph.io.calibrations import error_bars
 from tests.conftest import CommandRun
 
 WRONG: dict[str, Any] = {
@@ -50,3 +51,47 @@ def test_a_missing_part_is_named(calibrated_sample: CommandRun, tmp_path: Path) 
     path.write_text(yaml.safe_dump(content, sort_keys=False))
     with pytest.raises(FileError, match="'covariance' is missing"):
         load_calibration(path)
+
+
+def edited(change: dict[str, Any], result: CommandRun, folder: Path) -> Path:
+    """The sample's result with some keys replaced."""
+    path = Path(shutil.copy(result.folder / "calibration.yaml", folder))
+    content = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**content, **change}, sort_keys=False))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [((0, 1), 1.0, "not symmetric"), ((2, 2), -1e-6, "negative variances"),
+     ((0, 0), True, "truth value")],
+)  # fmt: skip
+def test_a_covariance_that_is_none_is_refused(
+    place: tuple[int, int], value: Any, words: str, calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    covariance = yaml.safe_load((calibrated_sample.folder / "calibration.yaml").read_text())[
+        "covariance"
+    ]
+    covariance["left"][place[0]][place[1]] = value
+    path = edited({"covariance": covariance}, calibrated_sample, tmp_path)
+    for read in (load_calibration, error_bars):
+        with pytest.raises(FileError, match=f"covariance.left: .*{words}"):
+            read(path)
+
+
+def test_a_camera_whose_verdict_was_edited_is_named(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    content = yaml.safe_load((calibrated_sample.folder / "calibration.yaml").read_text())
+    verdicts = content["camera_verdicts"]
+    verdicts["left"]["status"] = {"PASS": "WARN"}.get(verdicts["left"]["status"], "PASS")
+    with pytest.raises(FileError, match="of camera 'left', its checks give .* edited"):
+        load_calibration(edited({"camera_verdicts": verdicts}, calibrated_sample, tmp_path))
+
+
+def test_whether_an_error_bar_holds_is_true_or_false(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    path = edited({"error_bar_holds": {"left": "yes"}}, calibrated_sample, tmp_path)
+    with pytest.raises(FileError, match="error_bar_holds.left"):
+        error_bars(path)

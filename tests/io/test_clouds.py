@@ -148,3 +148,22 @@ def test_pcd_and_ply_clouds_are_read_or_refused(
         path.write_bytes(part)
         with pytest.raises(FileError, match=path.name):
             load_cloud(path)
+
+
+@pytest.mark.parametrize("largest", [1e9, 1e37])
+def test_coordinates_that_are_no_metres_are_named_with_the_cloud(
+    largest: float, tmp_path: Path
+) -> None:
+    far = CLOUD.copy()
+    far[3, 1] = -largest
+    np.save(tmp_path / "far.npy", far)
+    with pytest.raises(FileError, match=r"far.npy: holds a coordinate of 1e\+\d+, expected metres"):
+        load_cloud(tmp_path / "far.npy")
+
+
+def test_random_bytes_are_refused_without_a_warning(tmp_path: Path) -> None:
+    """Warnings are errors here; signalling NaNs are numbers that cause some."""
+    data = np.random.default_rng(0).integers(0, 256, 16 * 50_000, np.uint8)
+    (tmp_path / "random.bin").write_bytes(data.tobytes())
+    with pytest.raises(FileError, match=r"random.bin: (point \d+ is not finite|holds a coord)"):
+        load_cloud(tmp_path / "random.bin")

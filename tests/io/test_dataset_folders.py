@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calibgraph import DatasetError, FileError, load_dataset
@@ -79,3 +81,30 @@ def test_a_frame_in_two_formats_is_ambiguous(sample: Path) -> None:
     shutil.copy(sample / "lidar" / "000000.npy", sample / "lidar" / "000000.bin")
     with pytest.raises(FileError, match="the same frame"):
         load_dataset(sample)
+
+
+def test_what_is_no_file_is_named_and_not_waited_for(sample: Path) -> None:
+    """A pipe that nobody writes to would be read for ever."""
+    image = sample / "cameras" / "left" / "000003.jpg"
+    image.unlink()
+    os.mkfifo(image)
+    with pytest.raises(FileError, match=r"000003.jpg: is no file that can be read: a pipe"):
+        load_dataset(sample)
+    image.unlink()
+    image.symlink_to(image)
+    with pytest.raises(FileError, match=r"000003.jpg: "):
+        load_dataset(sample)
+
+
+def test_clouds_of_nuscenes_have_the_stem_of_their_images(sample: Path) -> None:
+    """``NAME.pcd.bin``: five float32 a point."""
+    for path in sorted((sample / "lidar").iterdir()):
+        cloud = np.load(path)[:, :4].astype(np.float32)
+        rows = np.column_stack([cloud, np.zeros(len(cloud), np.float32)])
+        rows.tofile(path.with_name(f"{path.stem}.pcd.bin"))
+        path.unlink()
+    data = load_dataset(sample)
+    assert [frame.name for frame in data.frames] == [f.name for f in load_dataset(SAMPLE).frames]
+    np.testing.assert_array_equal(
+        data.frames[0].load_cloud(), load_dataset(SAMPLE).frames[0].load_cloud()
+    )

@@ -106,3 +106,24 @@ def test_an_image_that_16_bits_make_black_is_named(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.full((camera.height_px, camera.width_px), 200, np.uint16))
     with pytest.raises(FileError, match="16 bits, of which only the lower 8"):
         load_image(path, camera)
+
+
+def test_profiles_in_a_png_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Libpng's warnings would be lines on a user's terminal; the pixels do not depend on them."""
+    camera = make_camera()
+    pixels = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3))
+    image = Image.fromarray(pixels.astype(np.uint8))
+    image.save(tmp_path / "bad.png", icc_profile=b"no profile" * 20)
+    np.testing.assert_array_equal(load_image(tmp_path / "bad.png", camera), pixels[:, :, ::-1])
+    assert capfd.readouterr().err == ""
+
+
+def test_a_png_may_be_followed_by_other_bytes(tmp_path: Path) -> None:
+    camera = make_camera()
+    data = png(
+        camera.width_px, camera.height_px, bytes((3 * camera.width_px + 1) * camera.height_px)
+    )
+    (tmp_path / "more.png").write_bytes(data + b"more")
+    (tmp_path / "plain.png").write_bytes(data)
+    more, plain = (load_image(tmp_path / f"{name}.png", camera) for name in ("more", "plain"))
+    np.testing.assert_array_equal(more, plain)

@@ -24,3 +24,13 @@ def test_a_dataset_that_has_moved_is_found(sample_result: Calibration, tmp_path:
     assert relocate_frames(replace(sample_result, frames=()), dataset).frames == found.frames
     with pytest.raises(DatasetError, match="has no frame number 3 named '000003'"):
         relocate_frames(sample_result, dataset.select("0:3"))
+
+
+def test_another_recording_with_the_same_names_is_refused(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    other = Path(shutil.copytree(SAMPLE, tmp_path / "other"))
+    first, second = sorted((other / "cameras" / "left").iterdir())[:2]
+    shutil.copy(second, first)
+    with pytest.raises(DatasetError, match=f"{first}: is not what the result was made from"):
+        relocate_frames(sample_result, calibgraph.load_dataset(other))

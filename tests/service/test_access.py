@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.service.access import add_token, load_tokens
-from calibgraph.service.serve import Address, require_safe
+from calibgraph.service.places import open_roots
+from calibgraph.service.serve import Address, require_certificate, require_safe
 from calibgraph.service.shield import STRICT_HEADERS
 from tests.service.conftest import Make, Problem, make_tokens
 
@@ -116,3 +117,17 @@ def test_without_tokens_only_loopback_is_listened_on() -> None:
     for host in ("0.0.0.0", "192.168.1.4", "example.org"):
         with pytest.raises(CalibrationError, match="--tokens"):
             require_safe(Address(host), has_tokens=False)
+
+
+def test_files_that_are_no_certificate_are_named(tmp_path: Path) -> None:
+    missing, garbage = tmp_path / "none.pem", tmp_path / "garbage.pem"
+    garbage.write_text("no certificate")
+    with pytest.raises(FileError, match="none.pem: no such file"):
+        require_certificate(Address("127.0.0.1", 8000, missing, missing))
+    with pytest.raises(FileError, match="garbage.pem: is no PEM certificate"):
+        require_certificate(Address("127.0.0.1", 8000, garbage, garbage))
+
+
+def test_an_empty_root_is_not_the_working_folder() -> None:
+    with pytest.raises(FileError, match="--root: is empty"):
+        open_roots(("",))

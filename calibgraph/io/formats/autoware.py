@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
-from calibgraph.files import checked_model
+from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport, frame_id
@@ -47,7 +47,7 @@ def _angles(T: NDArray[np.float64]) -> dict[str, float]:
     return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True))
 
 
-class _Pose(BaseModel):
+class _Pose(StrictNumbers):
     model_config = ConfigDict(extra="forbid")
 
     x: Finite

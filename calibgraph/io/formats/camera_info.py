@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
-from calibgraph.files import checked_model
-from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients, lens_model
+from calibgraph.files import StrictNumbers, checked_model
+from calibgraph.io.formats.lenses import CameraLens, lens_model, listed_coefficients
 from calibgraph.io.formats.part import Part
 from calibgraph.model.rig import Finite, Positive, Size
 
@@ -17,15 +15,15 @@ _Nine = tuple[
 ]  # fmt: skip
 
 
-class _Matrix(BaseModel):
+class _Matrix(StrictNumbers):
     data: _Nine
 
 
-class _Coefficients(BaseModel):
+class _Coefficients(StrictNumbers):
     data: tuple[Finite, ...] = ()
 
 
-class _CameraInfo(BaseModel):
+class _CameraInfo(StrictNumbers):
     image_width: Size
     image_height: Size
     camera_name: str = ""
@@ -53,7 +51,7 @@ def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> P
     info = checked_model(_CameraInfo, content, path)
     fx, _, cx, _, fy, cy, *_ = info.camera_matrix.data
     model = lens_model(info.distortion_model, path)
-    coefficients = fitted_coefficients(info.distortion_coefficients.data, model, path)
+    coefficients = listed_coefficients(info.distortion_coefficients.data, model, path)
     size = (info.image_width, info.image_height)
     lens = CameraLens(model, size, (fx, fy, cx, cy), coefficients)
     given = info.camera_name.strip("/").replace("/", "_")  # narrow_stereo/left: no folder's name

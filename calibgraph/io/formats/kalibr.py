@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model
+from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.lenses import (
     CameraLens,
     carried_coefficients,
-    fitted_coefficients,
     lens_model,
+    listed_coefficients,
     no_place_for,
     unified_coefficients,
 )
@@ -89,12 +89,12 @@ def _distortion(name: str, camera: Camera) -> dict[str, Any]:
     return {"distortion_model": "radtan", "distortion_coeffs": coefficients}
 
 
-class _Own(BaseModel):
+class _Own(StrictNumbers):
     camera: str | None = None
     T_cn_cnm1: str = ""
 
 
-class _Camera(BaseModel):
+class _Camera(StrictNumbers):
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     camera_model: str
@@ -107,15 +107,15 @@ class _Camera(BaseModel):
     calibgraph: _Own = _Own()
 
 
-class _Focal(BaseModel):
+class _Focal(StrictNumbers):
     intrinsics: tuple[Positive, Positive, Finite, Finite]
 
 
-class _Unified(BaseModel):
+class _Unified(StrictNumbers):
     intrinsics: tuple[Finite, Positive, Positive, Finite, Finite]
 
 
-class _Camchain(BaseModel):
+class _Camchain(StrictNumbers):
     cameras: Annotated[dict[str, _Camera], Field(min_length=1)]
 
 
@@ -168,7 +168,7 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
     if camera.camera_model != "pinhole":
         model = lens_model(camera.camera_model, path)  # raises: ds, eucm
     focal = checked_model(_Focal, {"intrinsics": camera.intrinsics}, path)
-    coefficients = fitted_coefficients(camera.distortion_coeffs, model, path)
+    coefficients = listed_coefficients(camera.distortion_coeffs, model, path)
     return CameraLens(model, camera.resolution, focal.intrinsics, coefficients)
 
 

@@ -7,16 +7,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_text
+from calibgraph.files import StrictNumbers, checked_model, read_text
 from calibgraph.io.formats.comments import stated_json
 from calibgraph.io.formats.lenses import (
     CameraLens,
     carried_coefficients,
-    fitted_coefficients,
     lens_model,
+    listed_coefficients,
     no_place_for,
     unified_coefficients,
 )
@@ -62,34 +60,34 @@ def _projection(name: str, camera: RigCamera) -> dict[str, Any]:
     return {"camera_model": model, "intrinsics": intrinsics, "distortion_coeffs": coefficients}
 
 
-class _Camera(BaseModel):
+class _Camera(StrictNumbers):
     camera_model: str
     intrinsics: tuple[Finite, ...]
     distortion_coeffs: tuple[Finite, ...] = ()
 
 
-class _Focal(BaseModel):
+class _Focal(StrictNumbers):
     intrinsics: tuple[Positive, Positive, Finite, Finite]
 
 
-class _Unified(BaseModel):
+class _Unified(StrictNumbers):
     intrinsics: tuple[Positive, Positive, Finite, Finite, Finite]
 
 
-class _Panorama(BaseModel):
+class _Panorama(StrictNumbers):
     intrinsics: tuple[Positive, Positive]
 
 
 _Pose = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite]
 
 
-class _Results(BaseModel):
+class _Results(StrictNumbers):
     T_lidar_camera: _Pose | None = None
     init_T_lidar_camera: _Pose | None = None
     init_T_lidar_camera_auto: _Pose | None = None
 
 
-class _Calibration(BaseModel):
+class _Calibration(StrictNumbers):
     camera: _Camera
     meta: dict[str, Any] = {}
     results: _Results = _Results()
@@ -128,7 +126,7 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
         fx, fy, cx, cy = focal
         return CameraLens(model, None, (fx, fy, cx, cy), unified_coefficients(xi, given, path))
     intrinsics = checked_model(_Focal, values, path).intrinsics
-    return CameraLens(model, None, intrinsics, fitted_coefficients(given, model, path))
+    return CameraLens(model, None, intrinsics, listed_coefficients(given, model, path))
 
 
 def _content(path: Path) -> Any:

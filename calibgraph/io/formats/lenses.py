@@ -91,6 +91,22 @@ def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -
     )
 
 
+def listed_coefficients(values: Sequence[float], model: LensModel, path: Path) -> tuple[float, ...]:
+    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does.
+
+    Raises:
+        FileError: if there are more or fewer than the model has.
+    """
+    fewest = min((count for count in COEFFICIENTS[model] if count), default=0)
+    if 0 < len(values) < fewest:
+        raise FileError(
+            path,
+            f"{len(values)} distortion coefficients, the lens model {model} has {ORDERS[model]}; "
+            "add those that are missing, zero if they are",
+        )
+    return fitted_coefficients(values, model, path)
+
+
 def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> list[float]:
     """A pinhole's coefficients, ``most`` of them, in OpenCV's order.
 

@@ -9,14 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_text
+from calibgraph.files import StrictNumbers, checked_model, read_text
 from calibgraph.io.formats.lenses import (
     CameraLens,
-    fitted_coefficients,
     lens_model,
+    listed_coefficients,
     unified_coefficients,
 )
 from calibgraph.io.formats.part import Part
@@ -64,13 +63,13 @@ def write_opencv(export: RigExport) -> str:
     return str(file.releaseAndGetString())
 
 
-class _Matrix(BaseModel):
+class _Matrix(StrictNumbers):
     rows: int
     cols: int
     data: tuple[Finite, ...]
 
 
-class _Camera(BaseModel):
+class _Camera(StrictNumbers):
     camera_matrix: _Matrix
     distortion: _Matrix | None = None
     width: int | None = None
@@ -83,7 +82,7 @@ class _Camera(BaseModel):
     T_camera_lidar: _Matrix | None = None
 
 
-class _Diagonal(BaseModel):
+class _Diagonal(StrictNumbers):
     focal_lengths: tuple[Positive, Positive]
 
 
@@ -149,7 +148,7 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
     coefficients = () if camera.distortion is None else camera.distortion.data
     intrinsics = (fx, fy, float(K[0, 2]), float(K[1, 2]))
     if camera.xi is None:
-        return CameraLens(model, size, intrinsics, fitted_coefficients(coefficients, model, path))
+        return CameraLens(model, size, intrinsics, listed_coefficients(coefficients, model, path))
     xi = camera.xi
     xi = _array(xi, (1, 1), "xi", path).item() if isinstance(xi, _Matrix) else xi
     return CameraLens(model, size, intrinsics, unified_coefficients(xi, coefficients, path))

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from pydantic import BaseModel
-
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model
+from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
@@ -101,7 +99,7 @@ def _stamped(export: RigExport, name: str) -> dict[str, Any]:
     }
 
 
-class _Vector(BaseModel):
+class _Vector(StrictNumbers):
     x: Finite
     y: Finite
     z: Finite
@@ -111,22 +109,22 @@ class _Quaternion(_Vector):
     w: Finite
 
 
-class _Transform(BaseModel):
+class _Transform(StrictNumbers):
     translation: _Vector
     rotation: _Quaternion
 
 
-class _Header(BaseModel):
+class _Header(StrictNumbers):
     frame_id: str
 
 
-class _Stamped(BaseModel):
+class _Stamped(StrictNumbers):
     header: _Header
     child_frame_id: str
     transform: _Transform
 
 
-class _Message(BaseModel):
+class _Message(StrictNumbers):
     transforms: list[_Stamped]
 
 
