@@ -122,7 +122,9 @@ def test_a_followed_file_that_stays_unreadable_is_refused_once(tmp_path: Path) -
     messages = sorted(str(following.next()).removeprefix(f"{tmp_path}/") for _ in range(3))
     assert time.monotonic() - start >= streams.QUIET_S - streams.POLL_S
     for message, expected in zip(
-        messages, ["a.parquet: cannot", "b.parquet: no such", "c.parquet: is a folder"], strict=True
+        messages,
+        ["a.parquet: cannot", "b.parquet: is no file", "c.parquet: is a folder"],
+        strict=True,
     ):
         assert message.startswith(expected)
     assert following.next(seconds=0.1) is None
