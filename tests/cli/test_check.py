@@ -34,6 +34,7 @@ def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> No
         assert max(map(abs, camera["deviation_deg"])) < 0.1
 
 
+@pytest.mark.slow
 def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
     call: Call, tmp_path: Path
 ) -> None:

@@ -38,6 +38,7 @@ def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: 
     assert described["config"]["max_r"] == 1.0
 
 
+@pytest.mark.slow
 def test_untrained_weights_fail_on_the_command_line(
     weights: Path, tmp_path: Path, call: Call
 ) -> None:

@@ -34,6 +34,7 @@ class Thinned(Simulated):
         return replace(draw, table=draw.table.select(few))
 
 
+@pytest.mark.slow
 def test_bench_writes_every_row_and_metric(tmp_path: Path, call: Call) -> None:
     code, _, text = call("bench", "paper", "kitti", "--frames", 5, "--draws", 2, "--out", tmp_path)
     assert code == 0, text

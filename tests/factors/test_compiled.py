@@ -112,6 +112,7 @@ def test_kernels_in_a_read_only_folder_are_used(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
+@pytest.mark.slow
 def test_damaged_files_are_compiled_anew(tmp_path: Path, damage: bytes | None) -> None:
     run(LENS, NUMBA_CACHE_DIR=str(tmp_path))
     (file,) = tmp_path.glob("loss_and_weight-*.kernel")
@@ -121,6 +122,7 @@ def test_damaged_files_are_compiled_anew(tmp_path: Path, damage: bytes | None) -
     assert run(LENS, NUMBA_CACHE_DIR=str(tmp_path)) == (f"{HUBER} 1", "")
 
 
+@pytest.mark.slow
 def test_a_change_of_a_callee_or_a_constant_is_noticed(tmp_path: Path) -> None:
     """Both are in another file than the kernel, whose own file stays the same."""
     folder, cache = tmp_path / "kernels", str(tmp_path / "cache")
@@ -134,6 +136,7 @@ def test_a_change_of_a_callee_or_a_constant_is_noticed(tmp_path: Path) -> None:
         assert found == (f"{factor * 3.0 + offset} {hits}", "")  # the first version is kept too
 
 
+@pytest.mark.slow
 def test_few_versions_of_a_kernel_are_kept(tmp_path: Path) -> None:
     folder = tmp_path / "kernels"
     folder.mkdir()

@@ -30,6 +30,7 @@ def test_size_and_date_of_a_change_are_measured(fitted: Fitted) -> None:
         assert abs(drift.change[0] - np.radians(0.15) / 1e5) < 3.5 * drift.sigma[0]
 
 
+@pytest.mark.slow
 def test_a_fleet_in_which_nothing_happened_has_no_findings() -> None:
     truth = simulate_fleet(np.random.default_rng(1), 150, change_deg=0.0)
     model = fit_fleet(observe(truth.rows))

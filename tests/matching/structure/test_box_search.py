@@ -21,6 +21,7 @@ def test_displacement_inverts_transforms() -> None:
     assert box.excess(np.full((1, 6), 0.6)) == pytest.approx(3.0)  # three angles, twice as far
 
 
+@pytest.mark.slow
 def test_the_search_finds_where_the_maps_agree() -> None:
     """Groups whose maps have one peak each: half where the true pose puts them, half anywhere."""
     rng = np.random.default_rng(1)

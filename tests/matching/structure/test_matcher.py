@@ -158,6 +158,7 @@ class TestRounds:
         assert error.rotation_error_deg < pixel_deg
         assert error.translation_error_cm < 10
 
+    @pytest.mark.slow
     def test_a_long_drive_is_thinned_unless_all_frames_are_requested(self, truth: Rig) -> None:
         drive = with_frames_repeated(calibgraph.load_dataset(SAMPLE, truth), 100)
         seen = []
@@ -189,6 +190,7 @@ class TestRounds:
         for name in ("pixels_px", "points_lidar_m", "information_px", "frame"):
             np.testing.assert_array_equal(*(getattr(table, name) for table in tables))
 
+    @pytest.mark.slow
     def test_a_seed_determines_the_result(self) -> None:
         data = calibgraph.load_dataset(SAMPLE).select("0:2")
         one, two = (
