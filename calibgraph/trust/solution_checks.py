@@ -34,7 +34,7 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     if estimate.residuals is None:
         text = (
             f"{estimate.used} usable correspondences, too few: determined by other cameras alone, "
-            "through relative_poses or what they see in common"
+            "through relative_poses, which have to be right, or what they see in common"
         )
         return [Check("correspondences", "WARN", text, estimate.used)]
     return [check for function in ESTIMATE_CHECKS for check in function(estimate)]
