@@ -5,8 +5,8 @@
     python -m benchmarks.accuracy.probability --tune out/tune.jsonl --count out/count.jsonl
 
 The weights come from the first files, the tables from the others, which share no recordings (but
-for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package; a model of which
-no case is given keeps its own.
+for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package; a
+model of which no case is given keeps its own.
 
 A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in
 the fit; the intercept is then moved, and the tables are weighted, to where one result in ten is
@@ -55,8 +55,8 @@ VOTE = {"PASS": 0.005, "WARN": 0.1, "FAIL": 0.9}
 BINS = (0.0, 0.002, 0.005, 0.02, 0.1, 0.2, 0.5, 0.9, 1.0)
 FILE = ROOT / "calibgraph" / "trust" / "probability.json"
 AMBIGUOUS = ("two_poses_45",)
-"""Kinds in which the matches cannot tell which of two extrinsics is right: a FAIL is wanted, although
-the result is right. They take no part in the fit, and are counted as what they are."""
+"""Kinds in which the matches cannot tell which of two extrinsics is right: a FAIL is wanted,
+although the result is right. They take no part in the fit, and are counted as what they are."""
 UNCOUNTED = (*table_cases.UNDETECTABLE, *data_cases.UNDETECTABLE)
 
 
