@@ -93,6 +93,14 @@ def roll_shutter(image: Array, index: int, camera: Camera, rng: Rng) -> Array:
     return cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
 
 
+def shear(image: Array, index: int, camera: Camera, rng: Rng) -> Array:
+    """A skew of 3 % of fx, which no lens of a rig has."""
+    k = camera.intrinsics_px
+    lean = 0.03 * k.fx / k.fy
+    matrix = np.array([[1, lean, -lean * k.cy], [0, 1, 0]])
+    return cv2.warpAffine(image, matrix, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
+
+
 def pass_truck(image: Array, index: int, camera: Camera, rng: Rng) -> Array:
     """A truck fills half of the view, each frame elsewhere; the clouds do not have it."""
     height, width = image.shape[:2]
@@ -207,6 +215,7 @@ KINDS: dict[str, Callable[[Scene, Rng], Case]] = {
     "dirty_lens": partial(painted, paint=soil, one_camera=True),
     "defocused": partial(painted, paint=defocus, one_camera=True),
     "rolling_shutter": partial(painted, paint=roll_shutter, one_camera=False),
+    "sheared": partial(painted, paint=shear, one_camera=False),
     "truck": partial(painted, paint=pass_truck, one_camera=False),
     "moved_halfway": moved_halfway,
     "frozen": frozen,

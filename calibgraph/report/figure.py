@@ -62,7 +62,7 @@ def to_data_uri(figure: Figure) -> str:
     buffer = io.BytesIO()
     # This method keeps colours that few pixels have: outliers are orange, and few.
     small = rgb.quantize(_PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    small.save(buffer, "PNG", optimize=True)
+    small.save(buffer, "PNG")
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 

@@ -128,7 +128,7 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
-    log_focal, radial, centre, log_aspect = found.lens
+    log_focal, radial, centre, log_aspect, skew = found.lens
     focal, aspect = math.expm1(log_focal), math.expm1(log_aspect)
     longer = "longer" if focal > 0 else "shorter"
     larger = "larger" if aspect > 0 else "smaller"
@@ -151,6 +151,11 @@ def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
             threshold("aspect_ratio"), aspect, found.lens_sigmas[3],
             f"a ratio fx / fy {abs(aspect):.1%} {larger}: check fx and fy, and whether the images "
             "were scaled",
+        ),
+        _check_lens(
+            threshold("skew"), skew, found.lens_sigmas[4],
+            f"a skew of {skew:+.1%} of fx, which a rig cannot have: check whether the images were "
+            "sheared, or undistort them with the skew that their intrinsics have",
         ),
     )  # fmt: skip
 

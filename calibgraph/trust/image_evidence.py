@@ -47,7 +47,7 @@ class ImageEvidence:
         groups: groups of windows that were scored; with fewer than MIN_GROUPS all else is NaN.
         lens: change of the lens that fits best: of the logarithm of the focal length, the first
             radial coefficient, the principal point along the longer side of the image (in focal
-            lengths), and the logarithm of fx / fy.
+            lengths), the logarithm of fx / fy, and the skew (in parts of fx).
         lens_sigmas: standard deviations of these by the scatter of the frames, lower bounds.
         gain: see :class:`calibgraph.trust.lens_evidence.LensEvidence`.
         displaced_z_score: score at the result less the mean score of the displaced poses, in

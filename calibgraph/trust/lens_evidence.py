@@ -1,8 +1,9 @@
 """Whether another lens fits the images better, with the pose free.
 
-A change of the lens is (4,): what is added to the logarithm of the focal length, to the first
+A change of the lens is (5,): what is added to the logarithm of the focal length, to the first
 radial coefficient, to the principal point along the longer side of the image (in focal lengths),
-and to the logarithm of fx / fy. Across that side, a principal point cannot be told from a rotation.
+to the logarithm of fx / fy, and to the skew (in parts of fx; half of it is a rotation about the
+axis). Across that side, a principal point cannot be told from a rotation.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 
 Array = NDArray[np.float64]
+Pair = tuple[float, float]
 
-UNKNOWN = (math.nan,) * 4
+UNKNOWN = (math.nan,) * 5
 SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
 SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
 MAX_RADIAL = 0.3
-_THREE, _FOUR = 3, 4  # numbers of the lens that are free: all but fx / fy, and all
+_SIZE, _ASPECT, _SKEW = 3, 4, 5  # numbers of the lens that are free: the first so many
 SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
 SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
@@ -38,8 +40,8 @@ class LensEvidence:
     """The lens that fits the images best.
 
     Attributes:
-        change: (4,) of the lens, see above; NaN where the images do not determine it.
-        sigmas: (4,) standard deviations by the scatter of the frames, lower bounds.
+        change: (5,) of the lens, see above; NaN where the images do not determine it.
+        sigmas: (5,) standard deviations by the scatter of the frames, lower bounds.
         gain: of the summed score at the best pose nearby with its own lens over that at the result,
             in standard deviations of chance agreement.
     """
@@ -63,8 +65,8 @@ def measure_lens(
     """
     if camera.model == "equirectangular":  # the format determines it: the pose alone is free
         return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
-    best, gain = _search(camera, scores, _THREE, seed)
-    aspect, aspect_sigma = _aspect_ratio(camera, scores, seed)
+    best, gain = _search(camera, scores, _SIZE, seed)
+    shape, shape_sigmas = _shape(camera, scores, seed)
     rough = _fit_at_peaks(camera, scores, best)
     if rough is None:
         return LensEvidence(gain=gain)
@@ -72,8 +74,8 @@ def measure_lens(
     fine = _fit_at_peaks(refined, scorer.score_together(images, refined, FINER), np.zeros(9))
     if fine is None:
         return LensEvidence(gain=gain)
-    change = (*(rough.values + fine.values).tolist(), aspect)
-    return LensEvidence(change, (*fine.sigmas.tolist(), aspect_sigma), gain)
+    change = (*(rough.values + fine.values).tolist(), *shape)
+    return LensEvidence(change, (*fine.sigmas.tolist(), *shape_sigmas), gain)
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[Array, float]:
@@ -89,19 +91,23 @@ def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[
     return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
 
 
-def _aspect_ratio(camera: Camera, scores: ShiftScores, seed: int) -> tuple[float, float]:
-    """Change of the logarithm of fx / fy, and its standard deviation.
+def _shape(camera: Camera, scores: ShiftScores, seed: int) -> tuple[Pair, Pair]:
+    """Changes of the logarithm of fx / fy and of the skew, and their standard deviations.
 
-    Measured apart from the others, which it would make less certain, and without a finer fit: on
-    KITTI right ones are then nearer to zero.
+    Measured apart from the others, which they would make less certain, and without a finer fit: on
+    KITTI right ones are then nearer to zero. A skew moves pixels too little to be searched for.
     """
-    best, _ = _search(camera, scores, _FOUR, seed)
-    fit = _fit_at_peaks(camera, scores, best)
-    return (math.nan, math.nan) if fit is None else (float(fit.values[3]), float(fit.sigmas[3]))
+    best, _ = _search(camera, scores, _ASPECT, seed)
+    fits = _fit_at_peaks(camera, scores, best), _fit_at_peaks(camera, scores, np.append(best, 0.0))
+    values, sigmas = zip(
+        *[(f.values[-1], f.sigmas[-1]) if f is not None else (math.nan, math.nan) for f in fits],
+        strict=True,
+    )
+    return values, sigmas
 
 
 def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(n, 2, 4) derivatives of the pixels of points (n, 3) by a change of the lens [px]."""
+    """(n, 2, 5) derivatives of the pixels of points (n, 3) by a change of the lens [px]."""
     T, k = camera.T_camera_lidar, camera.intrinsics_px
     pixels, _ = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
     focal = np.array([k.fx, k.fy])
@@ -109,11 +115,12 @@ def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
     radius = np.linalg.norm(off_centre / focal, axis=1, keepdims=True)
     centre = np.broadcast_to(focal * _longer_side(camera), off_centre.shape)
     aspect = off_centre * [0.5, -0.5]
-    return np.stack([off_centre, radius**2 * off_centre, centre, aspect], axis=2)
+    skew = 0.5 * off_centre[:, ::-1] * (focal / focal[::-1])
+    return np.stack([off_centre, radius**2 * off_centre, centre, aspect, skew], axis=2)
 
 
 def change_lens(camera: Camera, change: Array) -> Camera:
-    """The camera with its lens changed by (4,), see above."""
+    """The camera with its lens changed by (4,), see above: no lens of a rig has a skew."""
     k = camera.intrinsics_px
     of_x, of_y = np.exp(change[0] + change[3] * np.array([0.5, -0.5])).tolist()
     shift = change[2] * _longer_side(camera)
@@ -133,7 +140,7 @@ def change_lens(camera: Camera, change: Array) -> Camera:
 
 
 def _fit_at_peaks(camera: Camera, scores: ShiftScores, start: Array) -> AugmentedFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (9,) or (10,)."""
+    """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
     if not len(scores.counts):
         return None
     lens = len(start) - 6

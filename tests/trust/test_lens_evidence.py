@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Camera, Rig
+from calibgraph import Camera, Dataset, Rig
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
 from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
@@ -22,7 +25,9 @@ from calibgraph.trust.lens_evidence import (
 from tests.conftest import KANNALA, RADTAN5, SAMPLE, make_camera, points_in_front
 
 NAME = "front_left"
-LENS_CHECKS = ("focal length", "radial distortion", "principal point", "ratio of fx and fy")
+LENS_CHECKS = (
+    "focal length", "radial distortion", "principal point", "ratio of fx and fy", "skew",
+)  # fmt: skip
 
 NAMES = {n: f"{n:06}" for n in range(6)}
 
@@ -32,8 +37,8 @@ def truth() -> Camera:
     return calibgraph.load_rig(SAMPLE / "reference.yaml").cameras[NAME]
 
 
-def measure(camera: Camera) -> LensEvidence:
-    dataset = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
+def measure(camera: Camera, dataset: Dataset | None = None) -> LensEvidence:
+    dataset = dataset or calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(dataset, dataset.frames, pool)
         images = scorer.load_images(NAME, camera)
@@ -79,6 +84,27 @@ def test_a_wrong_lens_is_named_and_measured(
     assert all(status[other] == "PASS" for other in LENS_CHECKS if other != name)
 
 
+@pytest.mark.parametrize("skew", [-0.03, 0.03])
+def test_sheared_images_are_named_and_measured(truth: Camera, tmp_path: Path, skew: float) -> None:
+    k = truth.intrinsics_px
+    lean = skew * k.fx / k.fy
+    shear = np.array([[1.0, lean, -lean * k.cy], [0.0, 1.0, 0.0]])
+    # As in a calibration: half of a skew is a rotation.
+    turned = apply_twist(truth, np.array([0.0, 0.0, skew / 2, 0.0, 0.0, 0.0]))
+    dataset = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: turned}))
+    frames = []
+    for frame in dataset.frames:
+        image = frame.load_image(NAME, truth)
+        path = tmp_path / f"{frame.index}.png"
+        cv2.imwrite(str(path), cv2.warpAffine(image, shear, image.shape[1::-1]))
+        frames.append(replace(frame, image_paths={NAME: path}))
+    found = measure(turned, replace(dataset, frames=tuple(frames)))
+    assert found.change[4] == pytest.approx(skew, abs=0.007)
+    status = statuses(found)
+    assert status["skew"] != "PASS"
+    assert status["radial distortion"] == status["principal point"] == "PASS"
+
+
 @pytest.mark.parametrize(
     "camera",
     [
@@ -99,3 +125,15 @@ def test_the_jacobian_of_the_lens_is_its_derivative(camera: Camera) -> None:
             project_with_jacobian(plus, points)[0] - project_with_jacobian(minus, points)[0]
         )
         np.testing.assert_allclose(difference / (2 * step), jacobian[:, :, index], atol=1e-3)
+
+
+def test_a_skew_moves_a_pixel_by_its_height_less_a_rotation() -> None:
+    camera = make_camera()
+    k = camera.intrinsics_px
+    points = points_in_front(np.random.default_rng(0), 200)
+    off = project_with_jacobian(camera, points)[0] - [k.cx, k.cy]
+    sheared = np.column_stack([off[:, 1] * k.fx / k.fy, np.zeros(len(off))])
+    x, y = off[:, 0] / k.fx, off[:, 1] / k.fy
+    turned = np.column_stack([k.fx * y, -k.fy * x])
+    expected = sheared - 0.5 * turned
+    np.testing.assert_allclose(lens_jacobian_px(camera, points)[:, :, 4], expected, atol=1e-9)
