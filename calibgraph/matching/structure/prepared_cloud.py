@@ -97,6 +97,14 @@ class PreparedCloud:
             return make()
         return self.tables.get((self, spacing_rad, stride_spacings, fine), make)
 
+    def count_windows(
+        self, camera: Camera, spacing_rad: float, stride_spacings: float, *, most: int
+    ) -> int:
+        """How many fine windows have structure, of so many at most that are tried, all around."""
+        everywhere = np.ones(len(self.points_lidar_m), np.bool_)
+        table = self.windows(camera, everywhere, spacing_rad, stride_spacings, fine=True)
+        return len(table.cut(everywhere, everywhere, max_covered=1.0, max_windows=most).rays_m)
+
 
 def _ranks(values: Array) -> Array:
     """Ranks from 1; equal values share the mean of theirs. scipy.stats takes 0.3 s to import."""

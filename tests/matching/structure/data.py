@@ -29,14 +29,14 @@ def never() -> bool:
     return False
 
 
-def with_points_shuffled(data: Dataset, folder: Path) -> Dataset:
-    """The dataset with the points of every cloud in another order."""
+def with_points_shuffled(data: Dataset, folder: Path, most: int | None = None) -> Dataset:
+    """The dataset with the points of every cloud in another order, or so many of them."""
     rng = np.random.default_rng(0)
     frames = []
     for frame in data.frames:
         cloud = np.load(frame.cloud_path)
         path = folder / frame.cloud_path.name
-        np.save(path, cloud[rng.permutation(len(cloud))])
+        np.save(path, cloud[rng.permutation(len(cloud))[:most]])
         frames.append(replace(frame, cloud_path=path))
     return replace(data, frames=tuple(frames))
 

@@ -13,6 +13,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig, StructureMatcher
+from calibgraph.errors import DatasetError
 from calibgraph.matching.protocol import Start
 from calibgraph.matching.structure import global_search, pose_search
 from calibgraph.matching.structure.schedule import LEVELS
@@ -32,6 +33,15 @@ from tests.matching.structure.data import (
 
 def locate(data: calibgraph.Dataset, rig: Rig) -> Start:
     return StructureMatcher().locate(data, rig, out_of_time=never, progress=no_progress)
+
+
+@pytest.mark.parametrize("most", [1, 2000])
+def test_clouds_with_too_few_points_are_refused_before_the_search(
+    most: int, truth: Rig, tmp_path: Path
+) -> None:
+    thinned = with_points_shuffled(calibgraph.load_dataset(SAMPLE, truth), tmp_path, most)
+    with pytest.raises(DatasetError, match="points have .* neighbourhoods with structure"):
+        locate(thinned, truth)
 
 
 class TestSearch:
