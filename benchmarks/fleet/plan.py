@@ -62,7 +62,7 @@ class _AtOnce:
     def submit(self, task: Task) -> Future[Outcome]:
         numbers = tuple(np.random.default_rng(task.job.row).random(36).tolist())
         cameras = tuple(
-            CameraResult(f"c{i}", "PASS", False, (), numbers[:16], numbers) for i in range(6)
+            CameraResult(f"c{i}", "PASS", False, 0.001, (), numbers[:16], numbers) for i in range(6)
         )
         future: Future[Outcome] = Future()
         future.set_result(

@@ -118,11 +118,12 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
     return tuple(
         CameraResult(
             camera=name,
-            verdict=result.camera_verdicts[name].status,
-            cannot_tell=result.camera_verdicts[name].cannot_tell,
-            reasons=tuple(result.camera_verdicts[name].reasons),
-            T_camera_lidar=tuple(T.ravel().tolist()),
+            verdict=verdict.status,
+            cannot_tell=verdict.cannot_tell,
+            probability=None if verdict.doubt is None else verdict.doubt.probability,
+            reasons=tuple(verdict.reasons),
+            T_camera_lidar=tuple(result.T_camera_lidar[name].ravel().tolist()),
             covariance=None if (c := covariance[name]) is None else tuple(c.ravel().tolist()),
         )
-        for name, T in result.T_camera_lidar.items()
+        for name, verdict in result.camera_verdicts.items()
     )

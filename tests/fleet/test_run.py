@@ -101,6 +101,9 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
         row = fleet.rows[name, camera]
         assert row["verdict"] == result.camera_verdicts[camera].status
         assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
+        doubt = result.camera_verdicts[camera].doubt
+        assert doubt is not None
+        assert row["probability"] == pytest.approx(doubt.probability, rel=1e-3)
         # The sums of one thread and of several differ in their rounding.
         np.testing.assert_allclose(np.reshape(row["T_camera_lidar"], (4, 4)), T, atol=1e-9)
         np.testing.assert_allclose(
