@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.fleet.rows import SCHEMA, bucket_of
-from calibgraph.fleet.uris import fingerprint, join, read_bytes
+from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
 from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.yaml_text import parse_yaml
 
@@ -158,7 +157,7 @@ def _read(uri: str) -> pa.Table:
     suffix = Path(uri).suffix
     try:
         if suffix == ".parquet":
-            table = parquet.read_table(io.BytesIO(content))
+            table = parquet.read_table(in_arrow(content))
             table.validate(full=True)  # texts may be other bytes
             return table
         if suffix == ".csv":
@@ -166,8 +165,7 @@ def _read(uri: str) -> pa.Table:
                 column_types=dict.fromkeys((*_OWN, "model", "batch"), pa.string()),
                 strings_can_be_null=True,
             )
-            alone = csv.ReadOptions(use_threads=False)  # its threads may abort an early exit
-            return csv.read_csv(io.BytesIO(content), alone, convert_options=strings)
+            return csv.read_csv(in_arrow(content), convert_options=strings)
         if suffix in (".yaml", ".yml"):
             return _from_yaml(uri, content)
     except (pa.ArrowException, UnicodeDecodeError, OverflowError) as error:

@@ -20,7 +20,7 @@ from pyarrow import compute, parquet
 
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_place_for_folder, write_bytes
-from calibgraph.fleet.uris import is_local, locate
+from calibgraph.fleet.uris import in_arrow, is_local, locate
 
 FLEET_FORMAT = "calibgraph-fleet/1"
 BUCKETS = 256
@@ -93,7 +93,7 @@ def _is_hidden(name: str, folder: str) -> bool:
 
 def _read_file(filesystem: Any, path: str) -> pa.Table:
     """A whole file at once: a run may replace it meanwhile."""
-    return parquet.ParquetFile(pa.BufferReader(filesystem.cat_file(path))).read()
+    return parquet.ParquetFile(in_arrow(filesystem.cat_file(path))).read()
 
 
 def bucket_of(vehicle: str) -> int:
@@ -132,14 +132,14 @@ class RowStore:
         path = self._file(bucket)
         if not self._filesystem.exists(path):
             return None
-        with self._filesystem.open(path, "rb") as stored:
-            try:
-                file = parquet.ParquetFile(stored)
-                found = (file.schema_arrow.metadata or {}).get(b"format", b"").decode()
-                if found == FLEET_FORMAT:
-                    return file.read(columns=None if columns is None else list(columns))
-            except (pa.ArrowException, OSError) as error:
-                found = str(error)
+        content = in_arrow(self._filesystem.cat_file(path))
+        try:
+            file = parquet.ParquetFile(content)
+            found = (file.schema_arrow.metadata or {}).get(b"format", b"").decode()
+            if found == FLEET_FORMAT:
+                return file.read(columns=None if columns is None else list(columns))
+        except (pa.ArrowException, OSError) as error:
+            found = str(error)
         raise FileError(
             path, f"is not of a fleet of format {FLEET_FORMAT} ({found or 'no format'}); "
             "choose another --out"

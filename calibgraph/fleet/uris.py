@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import sha256
 
@@ -31,6 +33,17 @@ def locate(uri: str) -> tuple[Any, str]:
     except (ImportError, ValueError, OSError) as error:
         raise FileError(uri, f"cannot be opened ({error})") from error
     return filesystem, str(path)
+
+
+def in_arrow(content: bytes) -> pa.BufferReader:
+    """A reader of a copy that Arrow owns.
+
+    Arrow's threads drop what they read after a call has returned. If that is Python's, and Python
+    is ending by then, it is aborted.
+    """
+    buffer = pa.allocate_buffer(len(content))
+    memoryview(buffer).cast("B")[:] = content
+    return pa.BufferReader(buffer)
 
 
 def is_local(filesystem: Any) -> bool:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import fsspec
@@ -11,7 +12,7 @@ from benchmarks.fleet.tables import write_fleet
 from calibgraph import FileError
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
-from calibgraph.fleet.uris import fetch, fingerprint, join, read_bytes
+from calibgraph.fleet.uris import fetch, fingerprint, in_arrow, join, read_bytes
 
 
 @pytest.fixture
@@ -82,3 +83,13 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fleet.csv")
     with pytest.raises(FileError, match="is no file that can be read"):
         read_bytes(str(tmp_path / "fleet.csv"), 1000)
+
+
+def test_what_arrow_reads_is_none_of_pythons() -> None:
+    """Its threads would need the interpreter to drop it, which may have ended by then."""
+    content = os.urandom(100)
+    before = sys.getrefcount(content)
+    reader = in_arrow(content)
+    assert sys.getrefcount(content) == before
+    assert reader.read() == content
+    assert in_arrow(b"").read() == b""
