@@ -107,6 +107,17 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
             )
 
 
+def _construct_number(loader: Any, node: yaml.ScalarNode) -> Any:
+    """An int or float; ``10:40``, to YAML 1.1 a number of base 60, is a text, as to YAML 1.2."""
+    if ":" in node.value:
+        return loader.construct_yaml_str(node)
+    if node.tag.endswith(":int"):
+        return loader.construct_yaml_int(node)
+    return loader.construct_yaml_float(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:float", _construct_number)
 # OpenCV's matrices: mappings with the keys rows, cols, dt and data.
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
 

@@ -15,6 +15,7 @@ from calibgraph import (
 )
 from calibgraph.files import read_yaml, write_atomically, write_yaml
 from calibgraph.model.config import load_config
+from calibgraph.yaml_text import parse_yaml
 from tests.model.test_rig import written
 
 
@@ -141,3 +142,11 @@ def test_an_input_that_cannot_be_read_meanwhile_keeps_its_name(tmp_path: Path) -
     with pytest.raises(FileNotFoundError) as caught:
         write_atomically(tmp_path / "copy", lambda _: (tmp_path / "gone").read_bytes() and None)
     assert caught.value.filename == str(tmp_path / "gone")
+
+
+def test_numbers_of_base_60_are_texts() -> None:
+    text = "frames: 10:40\nnegative: -1:30.5\nplain: [12, -3, 1.5e-3, 0x10, .inf]\n"
+    found = parse_yaml(text, "rig.yaml")
+    assert found["frames"] == "10:40"
+    assert found["negative"] == "-1:30.5"
+    assert found["plain"] == [12, -3, 1.5e-3, 16, float("inf")]
