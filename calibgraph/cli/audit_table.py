@@ -26,7 +26,8 @@ def print_audit(console: Console, audit: Audit) -> None:
     console.print(
         "deviation: motion of the camera from where it is deployed, about and along its own axes; "
         "sigma: its standard deviation; detectable: what would have been seen with 90 % "
-        "probability, at one false alarm in 1000 rigs; changed intrinsics look like a motion"
+        "probability, at one false alarm in 1000 rigs; changed intrinsics, and distances in the "
+        "clouds that are all too long or too short, look like a motion"
     )
     time = f"{sum(audit.timings_s.values()):.1f} s"
     text = f"tolerance {audit.tolerance_deg:g} deg, {audit.tolerance_cm:g} cm per axis"

@@ -155,6 +155,13 @@ class Calibration:
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else degrees_and_centimetres(covariance)
 
+    @property
+    def not_included(self) -> str:
+        """What the error bars leave out, in words: relative poses show the scale of the clouds."""
+        if self.rig.relative_poses:
+            return "errors of the intrinsics are not included"
+        return "errors of the intrinsics, and of the clouds' scale, are not included"
+
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.
 
