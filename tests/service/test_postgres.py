@@ -30,8 +30,9 @@ class Postgres:
         self._folder, self._programs, self._port = folder, programs, free_port()
         self._user = {"user": "postgres"} if os.getuid() == 0 else {}
         if self._user:
-            for path in (folder, *folder.parents[:3]):
-                path.chmod(0o755)
+            for path in (folder, *folder.parents):  # who may not enter one of them enters none
+                if not (mode := path.stat().st_mode) & 0o001:
+                    path.chmod(mode | 0o055)
             shutil.chown(folder, "postgres")
         self._run("initdb", "--auth=trust", "--username=calibgraph", "-D", str(folder / "data"))
 

@@ -58,7 +58,8 @@ def check_true_poses(result: Calibration, table: Correspondences, dataset: Datas
     for error in evaluate(result.rig, load_rig(SAMPLE / "reference.yaml")).cameras.values():
         assert error.rotation_error_deg < 1e-3
         assert error.translation_error_cm < 0.02
-    assert result.verdict.status == "PASS"
+    assert all(check.status == "PASS" for check in result.verdict.checks)
+    assert result.verdict.status != "FAIL"  # WARN for 0.8 %: tables of five frames are no better
     assert table.point_index is not None
     rows = np.flatnonzero(table.frame == 3)[::500]
     cloud = dataset.frames[3].load_cloud()
@@ -110,7 +111,9 @@ def test_a_network_that_has_memorised_its_rig_fails(
     replace_networks(monkeypatch, truth.T_camera_lidar, memorised=True)
     result = calibgraph.calibrate(sample.select("0:5"), truth, matcher=matcher)
     assert result.verdict.status == "FAIL"
-    assert all("even without the image" in reason for reason in result.verdict.reasons)
+    probability, *reasons = result.verdict.reasons
+    assert probability.startswith("off by more than")
+    assert all("even without the image" in reason for reason in reasons)
 
 
 @pytest.mark.slow
