@@ -182,7 +182,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("skew", "skew", "at most", 0.022, 0.08, "",
               "Are the images sheared, by which part of fx?",
               "KITTI 00, 05 to 08, raw 0005 and other recordings: right up to 2 %, in the median "
-              "0.5 %; sheared by 2 % 0.2 to 2.7 %, on rendered streets 1.8 to 2.3 %."),
+              "0.5 %; sheared by 2 % 0.2 to 2.7 %, on rendered streets 2.1 %."),
     Threshold("score_gain", "score gain of the best extrinsic nearby", "at most", 1.0, 6.0,
               "sigma", "Does an extrinsic nearby fit the images better, by how many standard "
               "deviations of chance agreement?",
