@@ -120,7 +120,7 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
             camera=name,
             verdict=verdict.status,
             cannot_tell=verdict.cannot_tell,
-            probability=None if verdict.doubt is None else verdict.doubt.probability,
+            probability_off=None if verdict.doubt is None else verdict.doubt.probability,
             reasons=tuple(verdict.reasons),
             T_camera_lidar=tuple(result.T_camera_lidar[name].ravel().tolist()),
             covariance=None if (c := covariance[name]) is None else tuple(c.ravel().tolist()),

@@ -36,7 +36,7 @@ SCHEMA = pa.schema(
         ("status", pa.string()),
         ("verdict", pa.string()),
         ("cannot_tell", pa.bool_()),
-        ("probability", pa.float64()),
+        ("probability_off", pa.float64()),
         ("reasons", pa.list_(pa.string())),
         ("T_camera_lidar", pa.list_(pa.float64(), 16)),
         ("covariance", pa.list_(pa.float64(), 36)),
@@ -49,9 +49,9 @@ SCHEMA = pa.schema(
     ],
     metadata={"format": FLEET_FORMAT},
 )
-"""probability: that it is off by more than the tolerance. T_camera_lidar: (4, 4) by rows, null when
-failed; covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, null without an error bar. A
-vehicle that failed before its cameras were known has one row with an empty camera."""
+"""probability_off: by more than the tolerance. T_camera_lidar: (4, 4) by rows, null when failed;
+covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, null without an error bar. A vehicle
+that failed before its cameras were known has one row with an empty camera."""
 
 
 def read_rows(uri: str, storage_options: Mapping[str, Any] | None = None) -> pa.Table:

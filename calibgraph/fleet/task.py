@@ -62,7 +62,7 @@ class CameraResult:
         camera: its name.
         verdict: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
-        probability: that it is off by more than the tolerance.
+        probability_off: that it is off by more than the tolerance.
         reasons: of the verdict.
         T_camera_lidar: 16 numbers by rows.
         covariance: 36 numbers by rows; None without an error bar.
@@ -71,7 +71,7 @@ class CameraResult:
     camera: str
     verdict: str
     cannot_tell: bool
-    probability: float | None
+    probability_off: float | None
     reasons: tuple[str, ...]
     T_camera_lidar: tuple[float, ...]
     covariance: tuple[float, ...] | None

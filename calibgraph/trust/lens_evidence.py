@@ -24,13 +24,13 @@ from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 
 Array = NDArray[np.float64]
-Pair = tuple[float, float]
+Pair = tuple[float, ...]
 
 UNKNOWN = (math.nan,) * 5
 SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
 SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
 MAX_RADIAL = 0.3
-_SIZE, _ASPECT, _SKEW = 3, 4, 5  # numbers of the lens that are free: the first so many
+_TO_CENTRE, _TO_ASPECT = 3, 4  # numbers of the lens that are searched: the first so many
 SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
 SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
@@ -65,7 +65,7 @@ def measure_lens(
     """
     if camera.model == "equirectangular":  # the format determines it: the pose alone is free
         return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
-    best, gain = _search(camera, scores, _SIZE, seed)
+    best, gain = _search(camera, scores, _TO_CENTRE, seed)
     shape, shape_sigmas = _shape(camera, scores, seed)
     rough = _fit_at_peaks(camera, scores, best)
     if rough is None:
@@ -97,13 +97,12 @@ def _shape(camera: Camera, scores: ShiftScores, seed: int) -> tuple[Pair, Pair]:
     Measured apart from the others, which they would make less certain, and without a finer fit: on
     KITTI right ones are then nearer to zero. A skew moves pixels too little to be searched for.
     """
-    best, _ = _search(camera, scores, _ASPECT, seed)
-    fits = _fit_at_peaks(camera, scores, best), _fit_at_peaks(camera, scores, np.append(best, 0.0))
-    values, sigmas = zip(
-        *[(f.values[-1], f.sigmas[-1]) if f is not None else (math.nan, math.nan) for f in fits],
-        strict=True,
-    )
-    return values, sigmas
+    best, _ = _search(camera, scores, _TO_ASPECT, seed)
+    aspect = _fit_at_peaks(camera, scores, best)
+    skew = _fit_at_peaks(camera, scores, np.append(best, 0.0))
+    if aspect is None or skew is None:
+        return UNKNOWN[:2], UNKNOWN[:2]
+    return (aspect.values[-1], skew.values[-1]), (aspect.sigmas[-1], skew.sigmas[-1])
 
 
 def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:

@@ -103,7 +103,7 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
         assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
         doubt = result.camera_verdicts[camera].doubt
         assert doubt is not None
-        assert row["probability"] == pytest.approx(doubt.probability, rel=1e-3)
+        assert row["probability_off"] == pytest.approx(doubt.probability, rel=1e-3)
         # The sums of one thread and of several differ in their rounding.
         np.testing.assert_allclose(np.reshape(row["T_camera_lidar"], (4, 4)), T, atol=1e-9)
         np.testing.assert_allclose(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import rankdata
 
 import calibgraph
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
@@ -14,3 +15,11 @@ def test_it_is_detected_whether_a_cloud_was_seen_from_its_origin() -> None:
     raised, camera = PreparedCloud.from_points(cloud), make_camera((1.0, 2.0, 3.0))
     assert not raised.seen_from_origin
     np.testing.assert_allclose(raised.viewpoint_lidar_m(camera), [1.0, 2.0, 3.0], atol=1e-12)
+
+
+def test_ranks_of_intensities_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    cloud = np.column_stack([rng.normal(0, 20, (500, 3)), rng.integers(0, 30, 500)])
+    cloud = cloud[np.linalg.norm(cloud[:, :3], axis=1) > 2.0].astype(np.float32)
+    ranks = PreparedCloud.from_points(cloud).intensity_rank
+    np.testing.assert_allclose(ranks, rankdata(cloud[:, 3]) / len(cloud))
