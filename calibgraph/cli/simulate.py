@@ -64,6 +64,14 @@ def simulate(
             rich_help_panel=_STREET,
         ),
     ] = None,
+    sensor_errors: Annotated[
+        float | None,
+        typer.Option(
+            help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
+            "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.simulation.recording import simulate_street
@@ -80,12 +88,14 @@ def simulate(
                 seed=seed,
                 rotation_deg=rotation_deg,
                 translation_m=translation_m,
+                sensor_errors=0.0 if sensor_errors is None else sensor_errors,
                 progress=progress,
             )
         else:
-            _refuse_options_of_street(
-                scenario, {"--rig": rig, "--beams": beams, "--step-m": step_m}
-            )
+            of_street = {
+                "--rig": rig, "--beams": beams, "--step-m": step_m, "--sensor-errors": sensor_errors
+            }  # fmt: skip
+            _refuse_options_of_street(scenario, of_street)
             written = simulate_table(
                 out,
                 scenario,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.simulation.world import World, cast, find_albedos
+from calibgraph.simulation.scan_errors import ScanErrors, bias_of_range, cast_beams
+from calibgraph.simulation.world import World, find_albedos
 
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -31,6 +32,7 @@ class Lidar:
         ring_spread: standard deviation of the beams' gains, about 1.
         dropout: share of shots that are lost at random.
         weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
+        errors: none, or those of a real sensor.
     """
 
     elevations_deg: tuple[float, ...]
@@ -43,6 +45,7 @@ class Lidar:
     ring_spread: float = 0.05
     dropout: float = 0.01
     weakest: float = 0.06
+    errors: ScanErrors = ScanErrors()
 
 
 _ELEVATIONS_DEG = {16: (15.0, -15.0), 32: (10.0, -25.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
@@ -78,7 +81,7 @@ def scan(
 ) -> Points:
     """Scan the world in one instant, as a moving sensor after motion compensation.
 
-    A shot has no width: every point lies on a surface.
+    Without ``errors`` a shot has no width, and every point lies on a surface.
 
     Args:
         world: surfaces.
@@ -91,18 +94,28 @@ def scan(
         (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in random order.
     """
     shots = shot_directions(lidar)
-    directions = (shots @ T_world_lidar[:3, :3].T).astype(np.float32)
-    hits = cast(world, T_world_lidar[:3, 3], directions)
+    fired = shot_directions(as_fired(lidar))
+    directions, hits = cast_beams(world, lidar.errors, T_world_lidar, fired)
     albedo, incidence = find_albedos(world, directions, hits)
     gain = np.repeat(gains, len(shots) // len(gains))
     intensity = albedo[:, 3] * (0.55 + 0.45 * incidence) * gain
     intensity += rng.normal(0, lidar.intensity_noise, len(shots))
     distance = hits.distance_m + rng.normal(0, lidar.range_noise_m, len(shots))
+    distance += bias_of_range(lidar.errors, albedo[:, 3] * incidence)
     kept = (distance > lidar.min_range_m) & (distance < lidar.max_range_m)
     kept &= rng.random(len(shots)) < return_chance(lidar, albedo[:, 3] * incidence, distance)
     order = rng.permutation(np.flatnonzero(kept))
     xyz = shots[order] * distance[order, None]
     return np.column_stack([xyz, intensity[order].clip(0, 1)]).astype(np.float32)
+
+
+def as_fired(lidar: Lidar) -> Lidar:
+    """The sensor with the elevations at which its beams are, in place of those it reports."""
+    wrong = lidar.errors.elevations_deg
+    if not wrong:
+        return lidar
+    elevations = np.add(lidar.elevations_deg, wrong)
+    return replace(lidar, elevations_deg=tuple(elevations.tolist()))
 
 
 def shot_directions(lidar: Lidar) -> Array:

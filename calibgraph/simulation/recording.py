@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -24,6 +24,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
+from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
 from calibgraph.simulation.street import LANE_Y_M, Centreline, build_street, winding_line
 from calibgraph.simulation.world import World, build_world
@@ -36,8 +37,9 @@ MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
+_MAX_SENSOR_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE = range(5)  # each has its own random stream
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR = range(6)  # each has its own random stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +65,13 @@ def simulate_street(
     seed: int = 0,
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
+    sensor_errors: float = 0.0,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate a drive along a procedural street and write it as a dataset.
 
-    All data of a frame are of one instant: no rolling shutter, no motion during a scan. The same
-    arguments give the same files.
+    All data of a frame are of one instant: no rolling shutter, no motion during a scan but that of
+    ``sensor_errors``. The same arguments give the same files.
 
     Args:
         out: folder to write: ``rig.yaml`` (the guess), ``reference.yaml`` (the truth), ``lidar``
@@ -80,6 +83,8 @@ def simulate_street(
         seed: of the street, the drive, the noise and the guess.
         rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
         translation_m: its translation error.
+        sensor_errors: 0 for an ideal LiDAR, 1 for errors as real ones have them, drawn by the seed:
+            elevations of beams, width of beams, motion during a turn, ranges on dark surfaces.
         progress: called with the stage, its steps done, and their number.
 
     Returns:
@@ -92,12 +97,17 @@ def simulate_street(
     """
     out, lidar = Path(out), lidar_of(beams)
     _require_range(frames, step_m)
+    if not 0 <= sensor_errors <= _MAX_SENSOR_ERRORS:
+        raise ValueError(f"sensor errors of {sensor_errors}: 0 to {_MAX_SENSOR_ERRORS:g} expected")
     _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
     drive = build_drive(frames=frames, step_m=step_m, seed=seed)
+    if sensor_errors:
+        rng = np.random.default_rng([seed, _SENSOR])
+        lidar = replace(lidar, errors=draw_scan_errors(beams, sensor_errors, rng))
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
