@@ -24,7 +24,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
-from calibgraph.simulation.scan_errors import draw_scan_errors
+from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
 from calibgraph.simulation.street import LANE_Y_M, Centreline, build_street, winding_line
 from calibgraph.simulation.world import World, build_world
@@ -65,7 +65,7 @@ def simulate_street(
     seed: int = 0,
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
-    sensor_errors: float = 0.0,
+    sensor_errors: float | ScanErrors = 0.0,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate a drive along a procedural street and write it as a dataset.
@@ -83,8 +83,9 @@ def simulate_street(
         seed: of the street, the drive, the noise and the guess.
         rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
         translation_m: its translation error.
-        sensor_errors: 0 for an ideal LiDAR, 1 for errors as real ones have them, drawn by the seed:
-            elevations of beams, width of beams, motion during a turn, ranges on dark surfaces.
+        sensor_errors: of the LiDAR; or their size, 0 for an ideal one, 1 for what real ones have:
+            elevations of beams, width of beams, motion during a turn, ranges on dark surfaces, as
+            the seed draws them.
         progress: called with the stage, its steps done, and their number.
 
     Returns:
@@ -97,21 +98,17 @@ def simulate_street(
     """
     out, lidar = Path(out), lidar_of(beams)
     _require_range(frames, step_m)
-    if not 0 <= sensor_errors <= _MAX_SENSOR_ERRORS:
-        raise ValueError(f"sensor errors of {sensor_errors}: 0 to {_MAX_SENSOR_ERRORS:g} expected")
+    errors = _draw_errors(sensor_errors, beams, seed)
     _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
     drive = build_drive(frames=frames, step_m=step_m, seed=seed)
-    if sensor_errors:
-        rng = np.random.default_rng([seed, _SENSOR])
-        lidar = replace(lidar, errors=draw_scan_errors(beams, sensor_errors, rng))
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
-        _write_scans(made / "lidar", lidar, drive, seed, progress)
+        _write_scans(made / "lidar", replace(lidar, errors=errors), drive, seed, progress)
         _write_images(made / "cameras", rig, drive, seed, progress)
         rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
@@ -119,6 +116,15 @@ def simulate_street(
             (made / name).rename(out / name)
     sync_folder(out)
     return [out / name for name in reversed(_WRITTEN)]
+
+
+def _draw_errors(wanted: float | ScanErrors, beams: int, seed: int) -> ScanErrors:
+    if isinstance(wanted, ScanErrors):
+        return wanted
+    if not 0 <= wanted <= _MAX_SENSOR_ERRORS:
+        raise ValueError(f"sensor errors of {wanted}: 0 to {_MAX_SENSOR_ERRORS:g} expected")
+    rng = np.random.default_rng([seed, _SENSOR])
+    return draw_scan_errors(beams, wanted, rng) if wanted else ScanErrors()
 
 
 def build_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
