@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.thresholds import threshold
 
 Array = NDArray[np.float64]
+
+BLAME_SIGMAS = 1.0
+"""By so much more the one camera of a pair must disagree with its other neighbours than the other
+one with its own, to be taken for the one that is wrong."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +58,43 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     own = evidence.of_correspondences
     if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
         return {}
-    checks: dict[str, list[Check]] = {name: [] for name in own.cameras}
-    for fit in own.pair_fits:
-        if own.fitted_blocks.keys() >= {fit.a, fit.b}:
-            found = pair_agreement(own.solution.solved_rig, fit, own.pair_covariance)
-            for name in (fit.a, fit.b):
-                checks[name].append(_check_agreement(found))
-    return checks
+    found = [
+        pair_agreement(own.solution.solved_rig, fit, own.pair_covariance)
+        for fit in own.pair_fits
+        if own.fitted_blocks.keys() >= {fit.a, fit.b}
+    ]
+    return {
+        name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
+        for name in own.cameras
+    }
 
 
-def _check_agreement(found: PairAgreement) -> Check:
+def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
+    """The check of one camera of a pair, which other pairs may show to be the other's fault.
+
+    Args:
+        found: the pair.
+        camera: one of its two.
+        all_found: all pairs of the rig.
+    """
     row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
-    status = row.grade(found.sigmas)
+    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
     text = (
         f"the {name} differs from that by the correspondences by {found.degrees:.2g} deg, "
         f"{found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
     )
-    text += "" if status == "PASS" else f": {row.advice}"
-    return row.describe(found.sigmas, status, text, name=name)
+    own, of_other = (_elsewhere(one, found, all_found) for one in (camera, other))
+    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
+        text += "" if status == "PASS" else f": {row.advice}"
+        return row.describe(found.sigmas, status, text, name=name)
+    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
+    return row.describe(own, "WARN", text, name=name)
+
+
+def _elsewhere(camera: str, pair: PairAgreement, found: Sequence[PairAgreement]) -> float:
+    """By how many sigmas a camera disagrees with others than that of a pair; 0 without others."""
+    others = [one for one in found if one is not pair and camera in (one.a, one.b)]
+    return max((one.sigmas for one in others), default=0.0)
 
 
 def pair_agreement(rig: Rig, fit: PairFit, covariance: Array | None) -> PairAgreement:

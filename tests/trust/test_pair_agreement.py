@@ -12,7 +12,7 @@ from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_corres
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.solver.pair_refinement import fit_pairs
-from calibgraph.trust.pair_agreement import PairAgreement, pair_agreement
+from calibgraph.trust.pair_agreement import PairAgreement, check_agreement, pair_agreement
 from factors import pose_sigmas
 from tests.solver.test_camera_pairs import simulated_pairs
 from tests.trust.conftest import named
@@ -120,3 +120,24 @@ def test_what_the_correspondences_say_alone_is_checked_without_the_pairs(pair: R
 def test_without_camera_matches_there_is_no_check(pair: Rig) -> None:
     for matches in (None, CameraMatches.empty(tuple(pair.cameras))):
         assert named(judged(pair, pair, matches), "left", "by images") == []
+
+
+def disagreement(a: str, b: str, sigmas: float) -> PairAgreement:
+    return PairAgreement(a, b, 0.3, 10.0, sigmas, 1.0, 0.5, 100)
+
+
+def test_a_camera_that_disagrees_with_all_its_neighbours_is_the_one_that_is_wrong() -> None:
+    found = [disagreement("a", "b", 4.2), disagreement("b", "c", 3.8), disagreement("c", "d", 0.5)]
+    blamed, spared = (check_agreement(found[0], name, found) for name in ("b", "a"))
+    assert blamed.status == "FAIL" and blamed.severity > 2
+    assert spared.status == "WARN" and spared.severity == 1.0  # never PASS: nobody vouches for it
+    assert "by its other pairs (3.8 sigma) it is b that is wrong" in spared.text
+    assert check_agreement(found[1], "c", found).severity == 1.0
+    assert check_agreement(found[2], "d", found).status == "PASS"
+
+
+def test_of_two_cameras_either_may_be_wrong() -> None:
+    found = [disagreement("a", "b", 4.2)]
+    assert [check_agreement(found[0], name, found).status for name in "ab"] == ["FAIL", "FAIL"]
+    nearly = [*found, disagreement("b", "c", 1.5)]  # a neighbour of b agrees
+    assert check_agreement(nearly[0], "a", nearly).status == "FAIL"

@@ -33,8 +33,9 @@ REFINEMENT = (
 search is accurate to about a degree and some decimetres."""
 
 HOPELESS = 8.0
-"""Below this z-score at its first level a refinement is given up. On KITTI, `surround6` and rendered
-streets, right poses had 14 and more there, and all that led to 10.6 at the last level 11."""
+"""Below this z-score at its first level a refinement is given up. On KITTI, `surround6` and
+rendered streets right poses had 14 and more there, and all that led to 10.6 at the last level 11.
+"""
 
 GAIN = 1.05  # by which the z-score must grow for another refinement
 MAX_REFINEMENTS = 4
