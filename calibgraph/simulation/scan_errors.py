@@ -102,13 +102,14 @@ def _foremost(hits: list[Hits]) -> Hits:
     distances = np.stack([part.distance_m for part in hits])
     order = np.argsort(distances, axis=0)
     ranked = np.take_along_axis(distances, order, axis=0)
-    with np.errstate(invalid="ignore"):
-        ends = np.diff(ranked[1:], axis=0) > _ONE_SURFACE_M
+    with np.errstate(invalid="ignore"):  # infinite ones, of parts that meet nothing
+        gaps = np.diff(ranked, axis=0) > _ONE_SURFACE_M
+    ends = gaps[1:]
     last = 1 + np.where(ends.any(axis=0), ends.argmax(axis=0), len(hits) - 2)
-    first = (ranked[1] - ranked[0] > _ONE_SURFACE_M).astype(np.int64)
+    first = gaps[0].astype(np.int64)
     rank = np.arange(len(hits))[:, None]
     inside = (rank >= first) & (rank <= last)
-    mean = np.where(inside, ranked, 0.0).sum(axis=0) / inside.sum(axis=0)
+    mean = np.where(inside & np.isfinite(ranked), ranked, 0.0).sum(axis=0) / inside.sum(axis=0)
     one = order[1], np.arange(distances.shape[1])
     return Hits(
         distance_m=np.where(np.isfinite(ranked[1]), mean, np.inf).astype(np.float32),

@@ -74,6 +74,7 @@ def test_the_command_writes_a_table_and_a_guess_that_is_off(
         (("walkley", "--rotation-deg", 200), "expected an angle within"),
         (("kitti", "--beams", 16, "--rig", "fisheye"), "--rig and --beams would change nothing"),
         (("walkley", "--step-m", 0), "--step-m would change nothing"),
+        (("walkley", "--sensor-errors", 0), "--sensor-errors would change nothing"),
         (("nowhere", "--beams", 16), "unknown scenario 'nowhere'"),
     ],
 )
