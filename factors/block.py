@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import RobustBlock, check_shape, join_roots, rows_of_root
+from factors.block_arrays import RobustBlock, check_shape, contiguous, join_roots, rows_of_root
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.compiled import one_at_a_time
 from factors.kernel import (
@@ -136,7 +136,7 @@ class ProjectionBlock(RobustBlock):
 
     def gradients_at_each(self, poses: Sequence[gtsam.Pose3]) -> Array:
         """(p, 6) b of the whole block at each of some T_lidar_camera."""
-        each = np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4)
+        each = contiguous(np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4))
         gradients: Array = gradients_alone(
             self.lens.kind, self.lens.packed, each, self._columns, self._whitening,
             loss_id(self.loss), self.scale * self.sigma,
@@ -146,7 +146,7 @@ class ProjectionBlock(RobustBlock):
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
         costs: Array = costs_alone(
-            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
             self._whitening, loss_id(self.loss), self.scale * self.sigma,
         )  # fmt: skip
         return costs / self.sigma**2
@@ -177,8 +177,8 @@ class ProjectionBlock(RobustBlock):
         scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
-            self._whitening, loss_id(self.loss), scales * self.sigma, runs,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), scales * self.sigma, contiguous(runs),
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
 
@@ -198,8 +198,8 @@ class ProjectionBlock(RobustBlock):
         shared = len(self) >= _WORTH_SHARING
         run = one_at_a_time(residuals_shared) if shared else residuals_alone
         residuals, projectable = run(
-            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
-            runs,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            contiguous(runs),
         )  # fmt: skip
         return residuals, projectable
 
@@ -216,8 +216,8 @@ class ProjectionBlock(RobustBlock):
             factor: by which both are multiplied.
         """
         norms: Array = norms_alone(
-            self.lens.kind, self.lens.packed, np.ascontiguousarray(T_camera_lidar), self._columns,
-            self._whitening, factor, self._chunks if runs is None else runs,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, factor, self._chunks if runs is None else contiguous(runs),
         )  # fmt: skip
         return norms
 
@@ -234,7 +234,7 @@ class ProjectionBlock(RobustBlock):
 
 def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
-    return np.stack([edges[:-1], edges[1:]], axis=1)
+    return contiguous(np.stack([edges[:-1], edges[1:]], axis=1))
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
@@ -263,4 +263,4 @@ def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
-    return np.ascontiguousarray(T_lidar_camera.inverse().matrix())
+    return contiguous(T_lidar_camera.inverse().matrix())

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_Number = TypeVar("_Number", bound=np.generic)
 
 
 class RobustBlock:
@@ -42,11 +43,20 @@ class RobustBlock:
             object.__setattr__(self, name, read_only(value) if array else value)
 
 
-def read_only(array: Array) -> Array:
+def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
     """A view that cannot be written."""
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def contiguous(array: NDArray[_Number]) -> NDArray[_Number]:
+    """An array in C order, as a view that cannot be written.
+
+    Every array that a kernel only reads is given to it in this form: for arrays that can be
+    written, it would be compiled a second time.
+    """
+    return read_only(np.ascontiguousarray(array))
 
 
 def check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:

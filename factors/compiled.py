@@ -51,12 +51,14 @@ os.register_at_fork(  # no child is made while another thread holds it
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function without Python objects (``numba.njit``) when it is first called.
 
+    It runs without Python's lock, and divides as numpy does.
+
     Args:
         options: of ``numba.njit``, but for ``cache``.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
+        kernel = numba.njit(nogil=True, error_model="numpy", **options)(function)
         if isinstance(kernel, Dispatcher):  # with NUMBA_DISABLE_JIT it is the function
             kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return kernel

@@ -44,7 +44,7 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     return np.where(known, values[:, 0], 0.0)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
     """(n + 1,) error and the transposed (n, n + 1) Jacobian, see ``block_sums.square_root``."""
     n = len(gradient)

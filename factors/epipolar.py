@@ -146,7 +146,7 @@ def epipolar_residual(
     return value * over, over * (derivative - value / square * half_of_square)
 
 
-@compiled(nogil=True)
+@compiled()
 def _form(R, t, x, y, derivative):  # type: ignore[no-untyped-def]
     """C(x, y); its derivative goes into ``derivative``, (6,)."""
     p0 = R[0, 0] * y[0] + R[0, 1] * y[1] + R[0, 2] * y[2]
@@ -165,7 +165,7 @@ def _form(R, t, x, y, derivative):  # type: ignore[no-untyped-def]
     return m0 * p0 + m1 * p1 + m2 * p2
 
 
-@compiled(nogil=True)
+@compiled()
 def _sampson(R, t, row, jacobian, scratch):  # type: ignore[no-untyped-def]
     """The residual of a feature; its derivative goes into ``jacobian``; ``scratch`` is (2, 6)."""
     ray_a, ray_b = row[0:3], row[9:12]
@@ -189,7 +189,7 @@ def _sampson(R, t, row, jacobian, scratch):  # type: ignore[no-untyped-def]
     return value * over
 
 
-@compiled(nogil=True)
+@compiled()
 def _accumulate(R, t, rays, loss, scale, edges):  # type: ignore[no-untyped-def]
     """(segments, 28) sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
     out = np.zeros((len(edges) - 1, 28))
@@ -209,7 +209,7 @@ def _accumulate(R, t, rays, loss, scale, edges):  # type: ignore[no-untyped-def]
     return out
 
 
-@compiled(nogil=True)
+@compiled()
 def _residuals(R, t, rays):  # type: ignore[no-untyped-def]
     out = np.empty(len(rays))
     jacobian, scratch = np.empty(6), np.empty((2, 6))

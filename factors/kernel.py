@@ -34,7 +34,7 @@ from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _project_with_derivatives(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Fill in a tile, for any lens and any points."""
     if kind == PINHOLE:
@@ -43,7 +43,7 @@ def _project_with_derivatives(kind, lens, T, columns, start, n, tile):  # type: 
         project(kind, lens, T, columns, start, n, tile)
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _accumulate(kind, lens, T, columns, whitening, loss, scale, first, end, sums):  # type: ignore[no-untyped-def]
     """Add a run of correspondences to (28,) sums: 21 of H, 6 of b, 1 of c."""
     tile = np.empty((ROWS, TILE))
@@ -80,11 +80,11 @@ def _accumulate_runs(kind, lens, poses, columns, whitening, loss, scales, runs):
     return out
 
 
-accumulate_alone = compiled(nogil=True, error_model="numpy")(_accumulate_runs)
-accumulate_shared = compiled(nogil=True, parallel=True, error_model="numpy")(_accumulate_runs)
+accumulate_alone = compiled()(_accumulate_runs)
+accumulate_shared = compiled(parallel=True)(_accumulate_runs)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def linearize_alone(kind, lens, T, columns, whitening, loss, scale, sigma, runs):  # type: ignore[no-untyped-def]
     """(7,) error and transposed (6, 7) Jacobian of the block factor, see ``block.square_root``.
 
@@ -105,7 +105,7 @@ def linearize_alone(kind, lens, T, columns, whitening, loss, scale, sigma, runs)
     return compiled_square_root(hessian, sums[21:27], sums[27])
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def costs_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ignore[no-untyped-def]
     """(p,) costs c of all correspondences at each of (p, 4, 4) T_camera_lidar."""
     out, tile = np.zeros(len(poses)), np.empty((ROWS, TILE))
@@ -119,7 +119,7 @@ def costs_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ig
     return out
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def gradients_alone(kind, lens, poses, columns, whitening, loss, scale):  # type: ignore[no-untyped-def]
     """(p, 6) gradients b of all correspondences at each of (p, 4, 4) T_camera_lidar."""
     out, tile = np.zeros((len(poses), 6)), np.empty((ROWS, TILE))
@@ -141,7 +141,7 @@ def gradients_alone(kind, lens, poses, columns, whitening, loss, scale):  # type
     return out
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _project_any(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Fill in the residuals of a tile; whether all points lie where the fast ways hold."""
     ahead = (kind == PINHOLE and project_rays(lens, T, columns, start, n, tile)) or (
@@ -152,7 +152,7 @@ def _project_any(kind, lens, T, columns, start, n, tile):  # type: ignore[no-unt
     return ahead
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _evaluate(kind, lens, T, columns, first, end, residuals, valid):  # type: ignore[no-untyped-def]
     """Fill in the residuals of a run of correspondences, and whether each point is projectable."""
     tile = np.empty((ROWS, TILE))
@@ -179,11 +179,11 @@ def _residuals(kind, lens, poses, columns, runs):  # type: ignore[no-untyped-def
     return residuals, valid
 
 
-residuals_alone = compiled(nogil=True, error_model="numpy")(_residuals)
-residuals_shared = compiled(nogil=True, parallel=True, error_model="numpy")(_residuals)
+residuals_alone = compiled()(_residuals)
+residuals_shared = compiled(parallel=True)(_residuals)
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def _norms_of_tile(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
     """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
     ru, rv = tile[RU], tile[RV]
@@ -203,7 +203,7 @@ def _norms_of_tile(whitening, start, n, tile, factor, norms):  # type: ignore[no
         whitened[i] = factor * math.sqrt(u * u + v * v)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def norms_alone(kind, lens, poses, columns, whitening, factor, runs):  # type: ignore[no-untyped-def]
     """(1, n) norms of the residuals [px] times a factor, and, with whitening, (2, n) those of both.
 

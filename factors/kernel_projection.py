@@ -12,7 +12,7 @@ from factors.lens_kernels import MIN_DEPTH_M, project_one, subtract_columns
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals of a pinhole, x/z, y/z and 1/z. False, if a point is too near for these to hold."""
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
@@ -35,7 +35,7 @@ def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-d
     return too_near == 0.0
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for a pinhole without distortion: no branch, so that it vectorizes."""
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
@@ -58,7 +58,7 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         rx[i], ry[i], rz[i] = x, y, z
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for radial-tangential distortion, without branches, as ``lens._radtan_inside``.
 
@@ -101,7 +101,7 @@ def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped
     return outside == 0.0
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals, their derivatives by the point, and the point in the camera frame."""
     for i in range(n):

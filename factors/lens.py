@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.block_arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
@@ -141,19 +142,19 @@ class Lens:
             (n, 2) pixels, and (n,) whether each is a real projection (in front of the camera and
             inside the injective domain of the lens). It may still lie outside the image.
         """
-        points = np.ascontiguousarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
+        points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
         pixels, valid = _project_many(self.kind, self.packed, points)
         return pixels, valid
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
-        points = np.ascontiguousarray(points_lidar_m, dtype=np.float64)
-        T = np.ascontiguousarray(T_camera_lidar)
+        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
+        T = contiguous(T_camera_lidar)
         return np.asarray(_are_projectable(self.kind, self.packed, T, points))
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
-        points = np.ascontiguousarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
+        points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
         pixels, jacobians = _project_many_with_jacobian(self.kind, self.packed, points)
         return pixels, jacobians
 
@@ -198,7 +199,7 @@ def _fisheye_limit(coefficients: Array) -> float:
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
 
 
-@compiled(nogil=True)
+@compiled()
 def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
     valid = np.empty(len(points), dtype=np.bool_)
     for i in range(len(points)):
@@ -210,7 +211,7 @@ def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
     return valid
 
 
-@compiled(nogil=True)
+@compiled()
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
     for k in range(len(points)):
@@ -221,7 +222,7 @@ def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
     return pixels, valid
 
 
-@compiled(nogil=True)
+@compiled()
 def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
     pixels = np.empty((n, 2))

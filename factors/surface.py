@@ -90,7 +90,7 @@ class SurfaceBlock(RobustBlock):
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the features, stacked."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         packed = _accumulate(
-            self.lens_b.kind, self.lens_b.packed, *_pose(T_lidar_a), *_pose(T_lidar_b), self.rays_a,
+            self.lens_b.kind, self.lens_b.packed, *_poses(T_lidar_a, T_lidar_b), self.rays_a,
             self.planes_lidar_per_m, self.pixels_b_px, loss_id(self.loss), self.scale * self.sigma,
             edges,
         )  # fmt: skip
@@ -101,7 +101,7 @@ class SurfaceBlock(RobustBlock):
     ) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) residuals [px], not divided by sigma; (n,) whether B's lens can see the point."""
         residuals, projectable = _residuals(
-            self.lens_b.kind, self.lens_b.packed, *_pose(T_lidar_a), *_pose(T_lidar_b), self.rays_a,
+            self.lens_b.kind, self.lens_b.packed, *_poses(T_lidar_a, T_lidar_b), self.rays_a,
             self.planes_lidar_per_m, self.pixels_b_px,
         )  # fmt: skip
         return residuals, projectable
@@ -150,16 +150,21 @@ def _skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def _pose(pose: gtsam.Pose3) -> tuple[Array, Array]:
-    return np.ascontiguousarray(pose.rotation().matrix()), np.asarray(pose.translation())
+def _poses(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, ...]:
+    """R_lidar_a and A's centre; R_b_a and A's centre in B's frame."""
+    (R_a, c_a), (R_b, c_b) = (
+        (pose.rotation().matrix(), pose.translation()) for pose in (T_lidar_a, T_lidar_b)
+    )
+    parts = R_a, c_a, R_b.T @ R_a, R_b.T @ (c_a - c_b)
+    return tuple(map(np.ascontiguousarray, parts))
 
 
-@compiled(nogil=True)
+@compiled()
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled(nogil=True)
+@compiled()
 def _predict(R_a, c_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-def]
     """Fill in y and g = R_a^T q; return w and k."""
     for i in range(3):
@@ -173,7 +178,7 @@ def _predict(R_a, c_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-d
     return w, k
 
 
-@compiled(nogil=True)
+@compiled()
 def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian):  # type: ignore[no-untyped-def]
     """(2, 12) derivatives of the pixel by both poses."""
     turn0 = (ray[1] * g[2] - ray[2] * g[1]) / k
@@ -198,13 +203,12 @@ def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian):  # type: ig
         j[9], j[10], j[11] = -w * d0, -w * d1, -w * d2
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
-    kind, lens, R_a, c_a, R_b, c_b, rays, planes, pixels, loss, scale, edges
+    kind, lens, R_a, c_a, R_b_a, t, rays, planes, pixels, loss, scale, edges
 ):
     """(segments, 91) sums over runs of features."""
     out = np.zeros((len(edges) - 1, 91))
-    R_b_a, t = R_b.T @ R_a, R_b.T @ (c_a - c_b)
     y, g, jacobian = np.empty(3), np.empty(3), np.empty((2, 12))
     for segment in range(len(edges) - 1):
         sums = out[segment]
@@ -226,12 +230,11 @@ def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
     return out
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
-    kind, lens, R_a, c_a, R_b, c_b, rays, planes, pixels
+    kind, lens, R_a, c_a, R_b_a, t, rays, planes, pixels
 ):
     residuals, valid = np.empty((len(rays), 2)), np.empty(len(rays), np.bool_)
-    R_b_a, t = R_b.T @ R_a, R_b.T @ (c_a - c_b)
     y, g = np.empty(3), np.empty(3)
     for n in range(len(rays)):
         w, _ = _predict(R_a, c_a, R_b_a, t, rays[n], planes[n], y, g)

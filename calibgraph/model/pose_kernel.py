@@ -15,11 +15,12 @@ from factors.compiled import compiled
 _SMALL_ANGLE = 1e-2  # rad
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
     """Fill (f, 4, 4) ``out`` with exp(twist) T of (f, 6) twists and (f, 4, 4) transforms."""
     for i in range(len(twists)):
-        x, y, z, u, v, w = twists[i]
+        x, y, z = twists[i, 0], twists[i, 1], twists[i, 2]
+        u, v, w = twists[i, 3], twists[i, 4], twists[i, 5]
         angle = math.sqrt(x * x + y * y + z * z)
         squared = angle * angle
         if angle < _SMALL_ANGLE:
@@ -32,31 +33,22 @@ def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
         # R = I + first [w]x + second [w]x^2,  t = (I + second [w]x + third [w]x^2) v.
         xy, xz, yz = second * x * y, second * x * z, second * y * z
         p, q, r = first * x, first * y, first * z
-        R = np.array(
-            [
-                [1.0 - second * (y * y + z * z), xy - r, xz + q],
-                [xy + r, 1.0 - second * (x * x + z * z), yz - p],
-                [xz - q, yz + p, 1.0 - second * (x * x + y * y)],
-            ]
-        )
+        r00, r01, r02 = 1.0 - second * (y * y + z * z), xy - r, xz + q
+        r10, r11, r12 = xy + r, 1.0 - second * (x * x + z * z), yz - p
+        r20, r21, r22 = xz - q, yz + p, 1.0 - second * (x * x + y * y)
         a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
-        t = (
-            u + second * a + third * (y * c - z * b),
-            v + second * b + third * (z * a - x * c),
-            w + second * c + third * (x * b - y * a),
-        )
-        for row in range(3):
-            for column in range(4):
-                out[i, row, column] = (
-                    R[row, 0] * T[i, 0, column]
-                    + R[row, 1] * T[i, 1, column]
-                    + R[row, 2] * T[i, 2, column]
-                )
-            out[i, row, 3] += t[row]
-        out[i, 3] = (0.0, 0.0, 0.0, 1.0)
+        for column in range(4):
+            t0, t1, t2 = T[i, 0, column], T[i, 1, column], T[i, 2, column]
+            out[i, 0, column] = r00 * t0 + r01 * t1 + r02 * t2
+            out[i, 1, column] = r10 * t0 + r11 * t1 + r12 * t2
+            out[i, 2, column] = r20 * t0 + r21 * t1 + r22 * t2
+            out[i, 3, column] = 1.0 if column == 3 else 0.0  # noqa: PLR2004
+        out[i, 0, 3] += u + second * a + third * (y * c - z * b)
+        out[i, 1, 3] += v + second * b + third * (z * a - x * c)
+        out[i, 2, 3] += w + second * c + third * (x * b - y * a)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _rotation_vector(R):  # type: ignore[no-untyped-def]
     """The logarithm of a rotation matrix, by its quaternion."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -77,7 +69,7 @@ def _rotation_vector(R):  # type: ignore[no-untyped-def]
     return q[:3] * (2.0 * math.atan2(sine, q[3]) / sine)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def logarithms(steps):  # type: ignore[no-untyped-def]
     """(f, 6) twists of (f, 4, 4) transforms."""
     out = np.empty((len(steps), 6))

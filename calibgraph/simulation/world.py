@@ -180,7 +180,7 @@ def _noise_texture(rng: np.random.Generator) -> Floats:
     return np.asarray(texture / texture.std(), dtype=np.float32)
 
 
-@compiled(nogil=True)
+@compiled()
 def _shadow_starts(origin, directions, distance, triangle, surfaces, sun):  # type: ignore[no-untyped-def]
     """Points just off the surfaces that face the sun, and the indices of their hits."""
     starts = np.empty((len(triangle), 3), np.float32)
@@ -199,7 +199,7 @@ def _shadow_starts(origin, directions, distance, triangle, surfaces, sun):  # ty
     return starts[:count], facing[:count]
 
 
-@compiled(nogil=True)
+@compiled()
 def _albedos(directions, triangle, within, surfaces, paints, grain):  # type: ignore[no-untyped-def]
     albedo = np.zeros((len(triangle), 4))
     incidence = np.zeros(len(triangle))
@@ -211,7 +211,7 @@ def _albedos(directions, triangle, within, surfaces, paints, grain):  # type: ig
     return albedo, incidence
 
 
-@compiled(nogil=True)
+@compiled()
 def _fill_sky(colour, directions):  # type: ignore[no-untyped-def]
     """The sky in every direction, darker and bluer above."""
     for i in range(len(colour)):
@@ -220,7 +220,7 @@ def _fill_sky(colour, directions):  # type: ignore[no-untyped-def]
             colour[i, c] = _HORIZON[c] * (1 - rise) + _ZENITH[c] * rise
 
 
-@compiled(nogil=True)
+@compiled()
 def _fill_surfaces(  # type: ignore[no-untyped-def]
     colour, directions, width, triangle, within, lit, surfaces, paints, grain, sun
 ):
@@ -237,7 +237,7 @@ def _fill_surfaces(  # type: ignore[no-untyped-def]
             colour[i, c] = albedo[c] * (_SUNLIGHT[c] * sunny + _SKYLIGHT[c] * (0.7 + 0.3 * z))
 
 
-@compiled(nogil=True)
+@compiled()
 def _add_haze(colour, distance):  # type: ignore[no-untyped-def]
     """Blend far surfaces into the colour of the horizon."""
     for i in range(len(colour)):
@@ -247,7 +247,7 @@ def _add_haze(colour, distance):  # type: ignore[no-untyped-def]
                 colour[i, c] = colour[i, c] * clear + _HORIZON[c] * (1 - clear)
 
 
-@compiled(nogil=True)
+@compiled()
 def _facing_normal(row, direction):  # type: ignore[no-untyped-def]
     """The normal on the side of the ray's origin, and the cosine of the angle of incidence."""
     along = row[0] * direction[0] + row[1] * direction[1] + row[2] * direction[2]
@@ -255,7 +255,7 @@ def _facing_normal(row, direction):  # type: ignore[no-untyped-def]
     return sign * row[0], sign * row[1], sign * row[2], abs(along)
 
 
-@compiled(nogil=True)
+@compiled()
 def _albedo(row, paints, within, grain, clear):  # type: ignore[no-untyped-def]
     """The painted albedo at a place on a triangle; ``clear`` scales the grain."""
     u = row[3] + within[0] * row[5] + within[1] * row[7]
@@ -265,7 +265,7 @@ def _albedo(row, paints, within, grain, clear):  # type: ignore[no-untyped-def]
     return paint_one(paints[int(row[13])], float(u), float(v), light, base)
 
 
-@compiled(nogil=True)
+@compiled()
 def _noise(grain, u, v):  # type: ignore[no-untyped-def]
     """The grain at a place, bilinear between texels."""
     x, y = u / _TEXEL_M, v / _TEXEL_M

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20
 _CONVERGED = 1e-4  # largest change of an error in a step, in units of the loss' scale
-_MIN_EIGENVALUE = 1e-10  # of a unit-diagonal matrix; smaller ones are rounding errors
+_LEAST_SHARE = 1e-10  # of an unknown's column, squared; smaller ones are rounding errors
 _LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
 
 
@@ -123,7 +123,7 @@ class LinearRows:
             which,
             0.0 if loss_scale is None else float(loss_scale),
             _LOSS_MEDIANS,
-            (_MAX_ITERATIONS, _CONVERGED, _MIN_EIGENVALUE),
+            (_MAX_ITERATIONS, _CONVERGED, _LEAST_SHARE),
         )
         return (solution, normal, weights) if regular else None
 

@@ -261,7 +261,7 @@ def falling_logarithms(spreads: Array, counts: NDArray[np.int64]) -> Array:
     return falling
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _order_of(confidence):  # type: ignore[no-untyped-def]
     """(n,) stable ascending order of positive numbers, in single precision.
 

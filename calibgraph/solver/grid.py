@@ -81,7 +81,7 @@ def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> N
     return np.concatenate([[0], np.flatnonzero(new) + 1, [len(frame)]])
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
     """(n,) number of the cell that each pixel lies in; pixels outside belong to the edge cells."""
     cells, columns = np.empty(len(camera), dtype=np.int64), np.int64(shape[0])
@@ -93,7 +93,7 @@ def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
     return cells
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-untyped-def]
     """As ``_best_of_equal_keys``, where the rows of each run differ by their cell alone.
 
@@ -113,7 +113,7 @@ def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-unt
     return keep
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _best_of_equal_keys(camera, frame, cell, confidence, among):  # type: ignore[no-untyped-def]
     """(n,) which rows have the largest confidence, the first of them, among those of equal keys.
 

@@ -5,15 +5,18 @@ Every row has two parts, those of a pixel's u and v. Columns are (m, 2, n), cont
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from calibgraph.solver.spread_kernel import median
 from factors.compiled import compiled
 
 _TILE = 256  # rows whose columns stay in the first-level cache
 _FAST = {"reassoc", "contract", "nsz"}
 
 
-@compiled(nogil=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST)
 def combine(columns, which, factors):  # type: ignore[no-untyped-def]
     """(2, n) sum of some columns times their factors."""
     n = columns.shape[2]
@@ -29,7 +32,7 @@ def combine(columns, which, factors):  # type: ignore[no-untyped-def]
     return out
 
 
-@compiled(nogil=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST)
 def weighted_products(columns, which, weights):  # type: ignore[no-untyped-def]
     """(k, k) sums over the rows of the products of each two of k columns, times (n,) weights."""
     k, n = len(which), columns.shape[2]
@@ -56,7 +59,7 @@ def weighted_products(columns, which, weights):  # type: ignore[no-untyped-def]
     return out
 
 
-@compiled(nogil=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST)
 def _reweighted_products(columns, which, errors, scale):  # type: ignore[no-untyped-def]
     """As ``weighted_products``, with the Cauchy weights of (2, n) errors; and (n,) weights."""
     u, v, over = errors[0], errors[1], 1.0 / (scale * scale)
@@ -66,14 +69,51 @@ def _reweighted_products(columns, which, errors, scale):  # type: ignore[no-unty
     return weighted_products(columns, which, weights), weights
 
 
-@compiled(nogil=True, error_model="numpy")
-def _is_singular(normal, least):  # type: ignore[no-untyped-def]
-    """Whether an unknown's column is nearly a combination of the others, whatever its unit."""
-    units = np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
-    return np.linalg.eigvalsh(normal / np.outer(units, units))[0] < least
+@compiled()
+def _factorize(products, least, units, root):  # type: ignore[no-untyped-def]
+    """Cholesky's root of k normal equations in units of a unit diagonal; whether it exists.
+
+    Written out, as ``_solve``: numba compiles a call of LAPACK for several seconds.
+
+    Args:
+        products: (k + 1, k + 1): the normal matrix, and in its last column the right side.
+        least: smallest share of an unknown's column that those before it must leave.
+        units: (k,), filled: a row of the normal matrix is units[i] root[i] root^T units.
+        root: (k, k), filled below the diagonal.
+    """
+    for i in range(len(units)):
+        units[i] = math.sqrt(max(products[i, i], np.finfo(np.float64).tiny))
+        for j in range(i + 1):
+            rest = products[i, j] / (units[i] * units[j])
+            for m in range(j):
+                rest -= root[i, m] * root[j, m]
+            if j < i:
+                root[i, j] = rest / root[j, j]
+            elif rest >= least:
+                root[i, i] = math.sqrt(rest)
+            else:
+                return False
+    return True
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
+def _solve(products, units, root, solution):  # type: ignore[no-untyped-def]
+    """Fill in the (k,) solution of the equations of :func:`_factorize`."""
+    k = len(solution)
+    for i in range(k):
+        rest = products[i, k] / units[i]
+        for j in range(i):
+            rest -= root[i, j] * solution[j]
+        solution[i] = rest / root[i, i]
+    for i in range(k - 1, -1, -1):
+        for j in range(i + 1, k):
+            solution[i] -= root[j, i] * solution[j]
+        solution[i] /= root[i, i]
+    for i in range(k):
+        solution[i] /= units[i]
+
+
+@compiled()
 def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: ignore[no-untyped-def]
     """Iteratively reweighted least squares with a Cauchy loss on the norm of each row's error.
 
@@ -82,34 +122,41 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
         which: numbers of the columns of the k unknowns, and last that of the errors at zero.
         loss_scale: of the loss; 0: ``medians`` times the median of the errors.
         medians: see there.
-        limits: iterations; largest change of an error, in units of the loss' scale; least
-            eigenvalue of a unit-diagonal normal matrix.
+        limits: iterations; largest change of an error, in units of the loss' scale; smallest
+            share of an unknown's column that is no combination of those before it.
 
     Returns:
         (k,) solution; (k, k) normal matrix; (n,) weights; whether that matrix is regular.
     """
-    k = len(which) - 1
-    factors = np.zeros(k + 1)
+    k, n = len(which) - 1, columns.shape[2]
+    factors, step = np.zeros(k + 1), np.empty(k)
     factors[k] = -1.0
-    normal, weights = np.zeros((k, k)), np.zeros(columns.shape[2])
+    products, weights, squares = np.zeros((k + 1, k + 1)), np.zeros(n), np.empty(n)
+    units, root, solution = np.empty(k), np.empty((k, k)), np.empty(k)
     for _ in range(limits[0]):
         errors = combine(columns, which, factors)
         scale = loss_scale
         if scale == 0.0:
-            scale = medians * np.sqrt(np.median(errors[0] ** 2 + errors[1] ** 2)) + 1e-12
+            for i in range(n):
+                squares[i] = errors[0, i] * errors[0, i] + errors[1, i] * errors[1, i]
+            scale = medians * math.sqrt(median(squares)) + 1e-12
         products, weights = _reweighted_products(columns, which, errors, scale)
-        normal = products[:k, :k].copy()
-        if _is_singular(normal, limits[2]):
-            return factors[:k], normal, weights, False
-        solution = np.linalg.solve(normal, products[:k, k].copy())
-        moved = combine(columns, which[:k], solution - factors[:k])
-        factors[:k] = solution
-        if np.abs(moved).max() < limits[1] * scale:
+        if not _factorize(products, limits[2], units, root):
+            return factors[:k], products[:k, :k], weights, False
+        _solve(products, units, root, solution)
+        for j in range(k):
+            step[j] = solution[j] - factors[j]
+            factors[j] = solution[j]
+        moved = combine(columns, which[:k], step)
+        largest = 0.0
+        for i in range(n):
+            largest = max(largest, abs(moved[0, i]), abs(moved[1, i]))
+        if largest < limits[1] * scale:
             break
-    return factors[:k], normal, weights, True
+    return factors[:k], products[:k, :k], weights, True
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def grouped_gradients(columns, which, errors, weights, group, count):  # type: ignore[no-untyped-def]
     """(count, k) sums of weighted columns times (2, n) errors, over the rows of each group."""
     out, gradient = np.zeros((count, len(which))), np.empty(len(weights))

@@ -12,7 +12,7 @@ _ITERATIONS = 100
 _CONVERGED = 1e-12  # rad: far below any rotation that matters
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def median_rotation(quaternions, start):  # type: ignore[no-untyped-def]
     """Quaternion of the least sum of angles to (n, 4) unit quaternions x y z w, from a start.
 

@@ -18,13 +18,14 @@ _LEAST, _LARGEST = 1023 - 16, 1023 + 16  # biased exponents: smaller and larger 
 _FINE_FROM = 8192  # values from which an octave has 256 bins instead of 16
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _fill_bins(values, bits, work, edges):  # type: ignore[no-untyped-def]
     """Put the finite values into ``work`` by bins, and where these begin into ``edges``."""
     raw = values.view(np.int64)
     first, last = _LEAST << bits, (_LARGEST << bits) + 1
     shift = _MANTISSA - bits
-    edges[:] = 0
+    for b in range(len(edges)):
+        edges[b] = 0
     for i in range(len(values)):
         if values[i] < math.inf:
             edges[min(max(raw[i] >> shift, first), last) - first + 1] += 1
@@ -38,15 +39,29 @@ def _fill_bins(values, bits, work, edges):  # type: ignore[no-untyped-def]
             place[b] += 1
 
 
-@compiled(error_model="numpy")
+@compiled()
+def _sort(values):  # type: ignore[no-untyped-def]
+    """Sort in place, by Shell's method; numpy's own takes ten times longer to compile."""
+    gap = len(values)
+    while gap > 1:
+        gap = max(1, 5 * gap // 11)
+        for i in range(gap, len(values)):
+            value, j = values[i], i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+
+
+@compiled()
 def _order_statistic(work, edges, k):  # type: ignore[no-untyped-def]
     """The value number ``k`` in ascending order; its bin is sorted."""
     b = np.searchsorted(edges, k, side="right") - 1
-    work[edges[b] : edges[b + 1]].sort()
+    _sort(work[edges[b] : edges[b + 1]])
     return work[k]
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped-def]
     """The quantile of the values up to a limit, interpolated; NaN without any."""
     last = edges[-1] - 1
@@ -66,13 +81,27 @@ def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped
     return below + (place - low) * (above - below)
 
 
-@compiled(error_model="numpy")
-def _spread(values, start, half, cut):  # type: ignore[no-untyped-def]
-    """See ``residual_scale.robust_spread``: ``start`` is a quantile and a factor."""
+@compiled()
+def _bin(values):  # type: ignore[no-untyped-def]
+    """The finite values by bins, where these begin, and the bins' bits."""
     bits = 8 if len(values) >= _FINE_FROM else 4
     edges = np.empty((((_LARGEST - _LEAST) << bits) + 3), dtype=np.int64)
     work = np.empty(len(values))
     _fill_bins(values, bits, work, edges)
+    return work, edges, bits
+
+
+@compiled()
+def median(values):  # type: ignore[no-untyped-def]
+    """The median of (n,) values of zero and more; NaN without any that are finite."""
+    work, edges, bits = _bin(values)
+    return _quantile_below(work, edges, bits, math.inf, 0.5)
+
+
+@compiled()
+def _spread(values, start, half, cut):  # type: ignore[no-untyped-def]
+    """See ``residual_scale.robust_spread``: ``start`` is a quantile and a factor."""
+    work, edges, bits = _bin(values)
     if edges[-1] == 0:
         return math.inf
     spread = start[1] * _quantile_below(work, edges, bits, math.inf, start[0])
@@ -93,5 +122,5 @@ def _spreads(values, runs, start, half, cut):  # type: ignore[no-untyped-def]
     return out
 
 
-spreads_alone = compiled(nogil=True, error_model="numpy")(_spreads)
-spreads_shared = compiled(nogil=True, parallel=True, error_model="numpy")(_spreads)
+spreads_alone = compiled()(_spreads)
+spreads_shared = compiled(parallel=True)(_spreads)

@@ -14,6 +14,7 @@ from factors import (
     Lens,
     ProjectionBlock,
     block_factor,
+    kernel,
     projection_factor,
     square_root,
 )
@@ -371,3 +372,20 @@ def test_threads_get_the_sums_of_their_own_pose() -> None:
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda k: factor.error(at(many[k % 20])), range(400)))
     assert found == [alone[k % 20] for k in range(400)]
+
+
+def test_kernels_are_compiled_once_whether_or_not_their_arrays_can_be_written() -> None:
+    block = world(LENSES["radtan"], 50)
+    T = TRUTH.inverse().matrix()
+    T.flags.writeable = False
+    for pose in (T, T.copy(), np.asfortranarray(T)):
+        runs = np.array([[0, 20], [20, 50]])
+        runs.flags.writeable = pose.flags.writeable
+        block.run_sums(pose[None], runs)
+        block.run_residuals(pose[None], runs)
+        block.run_norms(pose[None], runs)
+        block.costs_at_each(pose[None])
+        block.lens.are_projectable(block.points_lidar_m, pose)
+    for one in (kernel.accumulate_alone, kernel.residuals_alone, kernel.norms_alone,
+                kernel.costs_alone):  # fmt: skip
+        assert len(one.signatures) == 1, one.signatures

@@ -96,7 +96,7 @@ def _maximize_once(
     )
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
     """Add bilinearly interpolated scores; shifts outside the grid count 0. unknowns: (k, n).
 

@@ -15,7 +15,7 @@ HALF_PI, PI = np.float32(math.pi / 2), np.float32(math.pi)
 TRANSFORMS_AT_ONCE = 16  # whose grids of shifts stay in the second-level cache
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _atan2(y, x):  # type: ignore[no-untyped-def]
     """The angle of (x, y), to 1e-5 rad, without branches, so that loops vectorize.
 
@@ -34,7 +34,7 @@ def _atan2(y, x):  # type: ignore[no-untyped-def]
     return -angle if y < 0 else angle
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _project_to_cells(transforms, point, grid, us, vs):  # type: ignore[no-untyped-def]
     """Places (column, row) of a point in the maps, for transforms (12, n)."""
     px, py, pz = np.float32(point[0]), np.float32(point[1]), np.float32(point[2])
@@ -48,7 +48,7 @@ def _project_to_cells(transforms, point, grid, us, vs):  # type: ignore[no-untyp
         vs[i] = (_atan2(y, np.sqrt(x * x + z * z)) - top) / step
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def sum_z_scores(maps, variances, points, transforms, grid, least, out):  # type: ignore[no-untyped-def]
     """Per transform the sum of bilinearly interpolated scores, over its standard deviation.
 
@@ -82,7 +82,7 @@ def sum_z_scores(maps, variances, points, transforms, grid, least, out):  # type
         out[i] /= np.sqrt(variance[i])
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def find_best_shifts(maps, variances, points, transforms, grid, least, reach, out):  # type: ignore[no-untyped-def]
     """Per transform (z-score, cells right, cells down) of the best shift of all groups together.
 
@@ -119,7 +119,7 @@ def find_best_shifts(maps, variances, points, transforms, grid, least, reach, ou
             _find_best_shift(totals[i], variance[i], least, reach, out[start + i])
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _find_best_shift(total, variance, least, reach, out):  # type: ignore[no-untyped-def]
     rows, columns = total.shape
     for row in range(rows):

@@ -55,7 +55,7 @@ def thin(directions: Array, cell_rad: float) -> Rows:
     return nearest[nearest >= 0]
 
 
-@compiled(nogil=True)
+@compiled()
 def _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest):  # type: ignore[no-untyped-def]
     """The direction nearest to the centre of each cell; its squared distance is in cells."""
     least = np.empty(len(nearest))

@@ -71,7 +71,7 @@ def score_windows(
     )  # fmt: skip
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, grids, shares):  # type: ignore[no-untyped-def]
     """See :func:`score_windows`; sums and factors: room for intermediate values."""
     height, width = shape
@@ -122,7 +122,7 @@ def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, gr
         _take_logarithms(factors, grids[group[-1]])
 
 
-@compiled(nogil=True)
+@compiled()
 def _find_extent(places, n):  # type: ignore[no-untyped-def]
     """The least and largest u, then v, of the first n places."""
     left, top = places[0, 0], places[0, 1]
@@ -133,7 +133,7 @@ def _find_extent(places, n):  # type: ignore[no-untyped-def]
     return left, right, top, bottom
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: ignore[no-untyped-def]
     """Over a window's points, at each shift k: sums of basis[p] v, of v and of v^2.
 
@@ -186,7 +186,7 @@ def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: i
                 trend_v[k] += d0 * v0
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _add_shares(sums, at, n, chance, grid):  # type: ignore[no-untyped-def]
     """Add the share of explained variance at each shift of a row."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
@@ -200,7 +200,7 @@ def _add_shares(sums, at, n, chance, grid):  # type: ignore[no-untyped-def]
         grid[k] += (explained + by_chance) / variation - chance
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _multiply_factors(sums, at, n, chance, factors):  # type: ignore[no-untyped-def]
     """Multiply by the residual share at each shift of a row."""
     depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
@@ -213,7 +213,7 @@ def _multiply_factors(sums, at, n, chance, factors):  # type: ignore[no-untyped-
         factors[k] *= np.float32(1) - share / np.float32(1 + MIN_RESIDUAL_SHARE)
 
 
-@compiled(fastmath=True, nogil=True, error_model="numpy")
+@compiled(fastmath=True)
 def _take_logarithms(factors, grid):  # type: ignore[no-untyped-def]
     """Subtract the logarithms of the factors from a grid; the factors become 1."""
     for row in range(grid.shape[0]):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
+from factors.block_arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import EQUIRECTANGULAR, is_projectable, project_one, subtract_columns
 
@@ -29,8 +30,8 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
         (k,) their rows; (k, 2) view angles [rad], see :func:`directions.view_angles`; (k,)
         distances from the camera [m].
     """
-    lens, T = camera.lens, np.ascontiguousarray(camera.T_camera_lidar, dtype=np.float64)
-    points = np.ascontiguousarray(points_lidar_m, dtype=np.float64)
+    lens, T = camera.lens, contiguous(camera.T_camera_lidar)
+    points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
     rows = np.empty(len(points), np.intp)
     views = np.empty((len(points), 3))
     count = _find_in_view(
@@ -60,13 +61,13 @@ def find_places(
     rays_m: NDArray[np.float32], viewpoint_lidar_m: Array, camera: Camera, scale: Array
 ) -> NDArray[np.int32]:
     """(w, l, 2) nearest pixels, of an image scaled by (2,), to the ends of rays (w, l, 3)."""
-    lens, T = camera.lens, np.ascontiguousarray(camera.T_camera_lidar, dtype=np.float64)
+    lens, T = camera.lens, contiguous(camera.T_camera_lidar)
     places = np.empty((*rays_m.shape[:2], 2), np.int32)
     _find_places(lens.kind, lens.packed, T, viewpoint_lidar_m, scale, rays_m, places)
     return places
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
     for w in range(rays_m.shape[0]):
         for p in range(rays_m.shape[1]):
@@ -85,7 +86,7 @@ def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: igno
             places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: ignore[no-untyped-def]
     count = 0
     for i in range(len(points)):

@@ -14,7 +14,7 @@ SILHOUETTE_SHARE, SILHOUETTE_RATIO = 0.5, 1.25
 SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one line
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis, reliability):  # type: ignore[no-untyped-def]
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
@@ -59,7 +59,7 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
         reliability[w] = max(depth, shade)
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     """The inverse range of the near side of a window's silhouette; 0 if it has none.
 
@@ -80,7 +80,7 @@ def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     return near if wide and near > SILHOUETTE_RATIO * far else 0.0
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def]
     """Fill an orthonormal basis of the linear functions of direction in a window.
 
@@ -113,7 +113,7 @@ def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def
         trend_u[i], trend_v[i] = (cos * v - sin * u) * of_minor, (cos * u + sin * v) * of_major
 
 
-@compiled(nogil=True, error_model="numpy")
+@compiled()
 def _normalize(values, n, trend_u, trend_v, other, by_other, noise):  # type: ignore[no-untyped-def]
     """Centre and normalise values in place, orthogonal to the trend and to another column.
 
