@@ -1,16 +1,19 @@
-"""The search of `structure` where there is nothing to find: images with the clouds of other places.
+r"""The search of `structure` with nothing to find: images with the clouds of other places.
 
-    calibgraph simulate street --rig sample --frames 2 --seed 1 --out out/scenes/scene_1   # ...
-    python -m benchmarks.accuracy.false_acceptance --scenes out/scenes
+    calibgraph simulate street --vary-layout --rig sample --frames 3 --seed 1 \
+        --out out/scenes/scene_1   # ...
+    python -m benchmarks.accuracy.false_acceptance --scenes out/scenes --whole
     python -m benchmarks.accuracy.false_acceptance --recordings
 
 Guesses are drawn uniformly within 20 deg and 1.5 m per axis. A camera that the search accepts all
-the same is accepted falsely; the rate that acceptance is built for stands beside it.
+the same is accepted falsely; the rate that acceptance is built for stands beside it. ``--whole``
+calibrates such a rig to the end: what the verdict of its accepted cameras is.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -22,7 +25,7 @@ from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import OTHER, Folders, with_images
 from benchmarks.tables import ROOT, Table, add_record_option
-from calibgraph import Dataset, StructureMatcher, perturb
+from calibgraph import Dataset, StructureMatcher, calibrate, perturb
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.progress import no_progress
 
@@ -39,7 +42,8 @@ def main() -> None:
         for seed in range(arguments.first, arguments.first + arguments.starts)
         for kind, data in _sources(arguments, folders, seed)
     ]
-    records = ledger.records_of(arguments, cases, partial(run_case, folders=folders))
+    work = partial(run_case, folders=folders, whole=arguments.whole)
+    records = ledger.records_of(arguments, cases, work)
     ledger.publish_cases(
         "accuracy.false_acceptance", [report(records)], records, record=arguments.record
     )
@@ -56,6 +60,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--recordings", action="store_true", help="KITTI's sequences")
     parser.add_argument("--starts", type=int, default=5, help="other clouds and guesses per scene")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--whole", action="store_true", help="calibrate where one is accepted")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "false_acceptance.jsonl")
@@ -77,8 +82,8 @@ def _sources(arguments: argparse.Namespace, folders: Folders, seed: int) -> list
     return found
 
 
-def run_case(case: Key, folders: Folders) -> Record:
-    """Search for the cameras of one scene in the clouds of another."""
+def run_case(case: Key, folders: Folders, *, whole: bool) -> Record:
+    """Search for the cameras of one scene in the clouds of another; calibrate if one is found."""
     images, clouds = case.data.split("/")
     data, truth = folders.load(images)
     wrong = _with_clouds_of(data, folders.load(clouds)[0])
@@ -89,7 +94,12 @@ def run_case(case: Key, folders: Folders) -> Record:
     start = StructureMatcher(seed=case.seed).locate(
         wrong, guess, out_of_time=never, progress=no_progress
     )
-    return {"found": dict(start.findings.found), "missed": dict(start.findings.missed)}
+    found = dict(start.findings.found)
+    record: Record = {"found": found, "missed": dict(start.findings.missed)}
+    if found and whole:
+        result = calibrate(wrong, guess, StructureMatcher(seed=case.seed))
+        record |= ledger.to_record(result, truth)
+    return record
 
 
 def _with_clouds_of(data: Dataset, other: Dataset) -> Dataset:
@@ -106,17 +116,21 @@ def report(records: list[Record]) -> Table:
         done = [r for r in records if r["kind"] == kind and "found" in r]
         accepted = [z for r in done for z in r["found"].values()]
         z_scores = accepted + [z for r in done for z in r["missed"].values()]
-        seconds = [r["seconds"] for r in done]
+        seconds = [r["seconds"] for r in done if "cameras" not in r]
+        verdicts = Counter(
+            r["cameras"][name]["status"] for r in done if "cameras" in r for name in r["found"]
+        )
         rows.append(
             (
                 kind, str(len(done)), str(len(z_scores)), str(len(accepted)),
                 f"{len(z_scores) * FALSE_ACCEPTANCE:.2f}", f"{np.median(z_scores):.1f}",
                 f"{max(z_scores):.1f}", f"{np.median(seconds):.0f}",
+                ", ".join(f"{verdicts[status]} {status}" for status in sorted(verdicts)) or "-",
             )
         )  # fmt: skip
     columns = (
         "data", "searches", "cameras", "accepted", "expected", "best z-score, median", "highest",
-        "time, median [s]",
+        "time, median [s]", "accepted, by the verdict",
     )  # fmt: skip
     return Table("Images with clouds of other places", columns, tuple(rows))
 

@@ -72,6 +72,15 @@ def simulate(
             rich_help_panel=_STREET,
         ),
     ] = None,
+    vary_layout: Annotated[
+        bool,
+        typer.Option(
+            "--vary-layout",
+            help="Draw also the street's width, curves, gardens and heights by the seed; "
+            "otherwise all streets are laid out alike.",
+            rich_help_panel=_STREET,
+        ),
+    ] = False,
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.simulation.recording import simulate_street
@@ -89,11 +98,13 @@ def simulate(
                 rotation_deg=rotation_deg,
                 translation_m=translation_m,
                 sensor_errors=0.0 if sensor_errors is None else sensor_errors,
+                vary_layout=vary_layout,
                 progress=progress,
             )
         else:
             of_street = {
-                "--rig": rig, "--beams": beams, "--step-m": step_m, "--sensor-errors": sensor_errors
+                "--rig": rig, "--beams": beams, "--step-m": step_m,
+                "--sensor-errors": sensor_errors, "--vary-layout": vary_layout or None,
             }  # fmt: skip
             _refuse_options_of_street(scenario, of_street)
             written = simulate_table(

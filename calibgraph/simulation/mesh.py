@@ -78,9 +78,9 @@ def ribbon(
     """A band of ground along a line, its v on the paint across, its u along the line.
 
     Args:
-        line_m: (k, 4) points x, y of the line and the unit vector to its left.
+        line_m: (k, 4) points x, y of the line and a vector to its left.
         along_m: (k,) their distances along the line.
-        edges_m: two edges, each its distance to the left of the line and its height.
+        edges_m: two edges, each its distance to the left of the line, in vectors, and its height.
         albedo: under the paint.
         paint: on the band; v is the distance to the left, plus the height.
     """

@@ -26,7 +26,14 @@ from calibgraph.simulation.cameras import camera_rays, render
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
 from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
-from calibgraph.simulation.street import LANE_Y_M, Centreline, build_street, winding_line
+from calibgraph.simulation.street import (
+    LANE_Y_M,
+    Centreline,
+    Layout,
+    build_street,
+    draw_layout,
+    winding_line,
+)
 from calibgraph.simulation.world import World, build_world
 
 Array = NDArray[np.float64]
@@ -39,7 +46,7 @@ _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
 _MAX_SENSOR_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR = range(6)  # each has its own random stream
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT = range(7)  # each has its own random stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +62,7 @@ class Drive:
     T_world_lidar: tuple[Array, ...]
 
 
-def simulate_street(
+def simulate_street(  # noqa: PLR0913 - each of its own
     out: Path | str,
     rig: Rig,
     *,
@@ -66,6 +73,7 @@ def simulate_street(
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
     sensor_errors: float | ScanErrors = 0.0,
+    vary_layout: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate a drive along a procedural street and write it as a dataset.
@@ -86,6 +94,8 @@ def simulate_street(
         sensor_errors: of the LiDAR; or their size, 0 for an ideal one, 1 for what real ones have:
             elevations of beams, width of beams, motion during a turn, ranges on dark surfaces, as
             the seed draws them.
+        vary_layout: draw the street's width, curves, gardens, heights and what stands in it by the
+            seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
         progress: called with the stage, its steps done, and their number.
 
     Returns:
@@ -104,7 +114,7 @@ def simulate_street(
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
-    drive = build_drive(frames=frames, step_m=step_m, seed=seed)
+    drive = build_drive(frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout)
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
@@ -127,11 +137,14 @@ def _draw_errors(wanted: float | ScanErrors, beams: int, seed: int) -> ScanError
     return draw_scan_errors(beams, wanted, rng) if wanted else ScanErrors()
 
 
-def build_drive(*, frames: int, step_m: float = 4.0, seed: int = 0) -> Drive:
+def build_drive(
+    *, frames: int, step_m: float = 4.0, seed: int = 0, vary_layout: bool = False
+) -> Drive:
     """Build a street and drive along it; see :func:`simulate_street`."""
     rng = np.random.default_rng([seed, _WORLD])
     length_m = (frames - 1) * step_m * (1 + _SWAY_STEP)
-    line = winding_line(length_m, rng)
+    drawn = draw_layout(np.random.default_rng([seed, _LAYOUT])) if vary_layout else Layout()
+    line = winding_line(length_m, drawn, rng)
     world = build_world(build_street(line, length_m, rng), _draw_sun(rng), rng)
     return Drive(world, _draw_stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
 

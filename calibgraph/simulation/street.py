@@ -56,57 +56,106 @@ from calibgraph.simulation.solids import (
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 
-MARGIN_M = 70.0
-"""Length of the street behind the first stop and beyond the last."""
 LANE_Y_M = -LANE_M / 2
 _PAVEMENT_Y_M, _GROUND_Y_M = 9.36, 24.0
 _WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wavelength [m]
 _STEP_M = 1.0
-_PARKED, _ONCOMING, _GAP, _BALCONIES, _GABLE, _ROADSIDE_TREE = 0.6, 0.35, 0.15, 0.4, 0.6, 0.45
+_BALCONIES, _GABLE = 0.4, 0.6
 _CLEAR_M = 14.0
 _KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """What streets may differ in; by default, all are laid out alike.
+
+    Attributes:
+        width: factor of all distances across: of lanes, kerbs, pavements, houses' fronts.
+        winding: factor of how much it winds.
+        spacing: factor of the distances between furniture along it.
+        margin_m: its length behind the first stop and beyond the last.
+        marks_from_m: where along it the markings of the road begin.
+        setback_m: of the houses on the left and on the right, beyond the usual one.
+        storeys: fewest and most.
+        parked: share of the bays that are taken.
+        oncoming: chance of an oncoming car every 12 m.
+        gap: chance of a gap between houses.
+        tree: chance of a tree in every stretch of pavement.
+    """
+
+    width: float = 1.0
+    winding: float = 1.0
+    spacing: float = 1.0
+    margin_m: float = 70.0
+    marks_from_m: float = 0.0
+    setback_m: tuple[float, float] = (0.0, 0.0)
+    storeys: tuple[int, int] = (2, 4)
+    parked: float = 0.6
+    oncoming: float = 0.35
+    gap: float = 0.15
+    tree: float = 0.45
+
+
+def draw_layout(rng: Rng) -> Layout:
+    """A layout between a lane with houses at its edge and a wide, green avenue."""
+    lowest = int(rng.integers(1, 5))
+    return Layout(
+        width=float(np.exp(rng.uniform(np.log(0.7), np.log(1.6)))),
+        winding=rng.uniform(0.0, 1.5),
+        spacing=rng.uniform(0.7, 2.5),
+        margin_m=rng.uniform(50, 100),
+        marks_from_m=rng.uniform(0, 1000),
+        setback_m=(rng.uniform(0, 10), rng.uniform(0, 10)),
+        storeys=(lowest, lowest + int(rng.integers(1, 4))),
+        parked=rng.uniform(0.0, 1.0),
+        oncoming=rng.uniform(0.0, 0.6),
+        gap=rng.uniform(0.0, 0.6),
+        tree=rng.uniform(0.0, 0.9),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Centreline:
-    """The centreline of a street.
+    """The centreline of a street, with its layout.
 
     Attributes:
         along_m: (k,) distances s along it, rising.
         xy_m: (k, 2) in the world.
         heading_rad: (k,) directions, unwrapped.
+        layout: distances to the left of the line are of a street of the usual width.
     """
 
     along_m: Array
     xy_m: Array
     heading_rad: Array
+    layout: Layout
 
     def at(self, s_m: float, y_m: float) -> tuple[tuple[float, float], float]:
         """The place (x, y) [m] that is ``y_m`` to the left of the line, and the heading [deg]."""
         x, y = (np.interp(s_m, self.along_m, column) for column in self.xy_m.T)
-        heading = np.interp(s_m, self.along_m, self.heading_rad)
-        place_m = float(x - y_m * np.sin(heading)), float(y + y_m * np.cos(heading))
+        heading, left_m = np.interp(s_m, self.along_m, self.heading_rad), y_m * self.layout.width
+        place_m = float(x - left_m * np.sin(heading)), float(y + left_m * np.cos(heading))
         return place_m, float(np.degrees(heading))
 
     @property
     def with_left(self) -> Array:
-        """(k, 4) the places, and the unit vectors to the left."""
-        left = [-np.sin(self.heading_rad), np.cos(self.heading_rad)]
-        return np.column_stack([self.xy_m, *left])
+        """(k, 4) the places, and vectors to the left, whose length is the street's width."""
+        left = np.stack([-np.sin(self.heading_rad), np.cos(self.heading_rad)])
+        return np.column_stack([self.xy_m, *(self.layout.width * left)])
 
 
-def winding_line(length_m: float, rng: Rng) -> Centreline:
-    """A line that winds about the x axis, from ``MARGIN_M`` behind 0 to as much beyond."""
-    along = np.arange(-MARGIN_M, length_m + MARGIN_M + _STEP_M, _STEP_M)
+def winding_line(length_m: float, layout: Layout, rng: Rng) -> Centreline:
+    """A line that winds about the x axis, from the layout's margin behind 0 to as much beyond."""
+    along = np.arange(-layout.margin_m, length_m + layout.margin_m + _STEP_M, _STEP_M)
     phases = rng.uniform(0, 2 * np.pi, len(_WINDING))
-    heading = sum(
+    heading = layout.winding * sum(
         amplitude * np.sin(2 * np.pi * along / wavelength + phase)
         for (amplitude, wavelength), phase in zip(_WINDING, phases, strict=True)
     )
     steps = _STEP_M * np.column_stack([np.cos(heading), np.sin(heading)])
     xy = np.cumsum(steps, axis=0) - steps / 2
     xy -= xy[np.searchsorted(along, 0.0)]
-    return Centreline(along, xy, np.asarray(heading))
+    return Centreline(along, xy, np.asarray(heading), layout)
 
 
 def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
@@ -139,7 +188,8 @@ def _band(
     albedo: Albedo,
     paint: Paint,
 ) -> Mesh:
-    return ribbon(line.with_left, line.along_m, edges_m, albedo, paint)
+    marks_m = line.along_m + line.layout.marks_from_m
+    return ribbon(line.with_left, marks_m, edges_m, albedo, paint)
 
 
 def _place(
@@ -160,11 +210,11 @@ def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
     first, last = line.along_m[[0, -1]]
     places = [(length_m + _CLEAR_M + 6, LANE_Y_M, 0.0), (-_CLEAR_M, LANE_Y_M, 0.0)]
     for s in np.arange(first, last, 12.0):
-        if rng.random() < _ONCOMING:
+        if rng.random() < line.layout.oncoming:
             places.append((s + rng.uniform(-3, 3), -LANE_Y_M, 180.0))
     for side in (1, -1):
         for s in np.arange(first, last, 6.0):
-            if rng.random() < _PARKED:
+            if rng.random() < line.layout.parked:
                 places.append((s + 3 + rng.normal(0, 0.3), side * 4.75, 0.0))
     for s, y, yaw_deg in places:
         kind = _KINDS[rng.choice(len(_KINDS), p=_KIND_SHARES)]
@@ -174,18 +224,20 @@ def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
 
 def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
     """Rows of houses; in the gaps there are fences and hedges."""
-    s, turned = line.along_m[0], 0.0 if side > 0 else 180.0
+    layout, s, turned = line.layout, line.along_m[0], 0.0 if side > 0 else 180.0
+    (fewest, most), setback_m = layout.storeys, layout.setback_m[0 if side > 0 else 1]
     while s < line.along_m[-1]:
-        bays, storeys = int(rng.integers(3, 6)), int(rng.integers(2, 5))
+        bays, storeys = int(rng.integers(3, 6)), int(rng.integers(fewest, most + 1))
         front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * BAY_M / 2
-        if rng.random() < _GAP:
+        front += setback_m / layout.width
+        if rng.random() < layout.gap:
             yield from _place(line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK)
             yield from _place(line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK)
             s += 11
             continue
         parts, body = list(_house(bays, storeys, rng)), _draw_colour(rng)
         yield from _place(line, parts, middle, side * front, yaw_deg=turned, body=body)
-        s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < _GAP else 0)
+        s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < layout.gap else 0)
 
 
 def _house(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
@@ -216,12 +268,13 @@ def _balconies(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
 def _roadside(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
     """Furniture of the pavements, and people on them."""
     turned = 0.0 if side > 0 else 180.0
-    for s in np.arange(line.along_m[0], line.along_m[-1], STRETCH_M) + rng.uniform(-1, 1):
+    stretch_m = STRETCH_M * line.layout.spacing
+    for s in np.arange(line.along_m[0], line.along_m[-1], stretch_m) + rng.uniform(-1, 1):
         colour, body = _draw_colour(rng), _draw_colour(rng)
         yield from _place(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
         person, person_y = s + rng.uniform(-5, 5), side * (KERB_Y_M + rng.uniform(1.2, 2.8))
         yield from _place(line, PERSON, person, person_y, yaw_deg=0, body=body)
-        if rng.random() < _ROADSIDE_TREE:
+        if rng.random() < line.layout.tree:
             yaw, tree_y = rng.uniform(0, 360), side * (_PAVEMENT_Y_M - 0.5)
             yield from _place(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
 

@@ -11,7 +11,9 @@ import pytest
 from calibgraph import CalibrationError, Camera, Rig, load_dataset, load_rig
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.simulation.lidar import scan
+from calibgraph.simulation.paints import KERB, KERB_Y_M
 from calibgraph.simulation.recording import build_drive, simulate_street
+from calibgraph.simulation.street import Layout, build_street, draw_layout, winding_line
 from tests.simulation.conftest import SCAN
 
 pytest.importorskip(
@@ -19,8 +21,9 @@ pytest.importorskip(
 )
 
 
-def test_stops_are_apart_and_the_lane_is_free() -> None:
-    drive = build_drive(frames=6, step_m=5.0, seed=1)
+@pytest.mark.parametrize(("seed", "vary_layout"), [(1, False), (1, True), (2, True), (3, True)])
+def test_stops_are_apart_and_the_lane_is_free(seed: int, vary_layout: bool) -> None:
+    drive = build_drive(frames=6, step_m=5.0, seed=seed, vary_layout=vary_layout)
     places = np.array([T[:3, 3] for T in drive.T_world_lidar])
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     # Along the line 5 m +- 15 %; across, each stop sways by 0.25 m, which adds under 5 %.
@@ -46,6 +49,24 @@ def test_a_recording_is_a_dataset_with_its_truth(recording: Path, rig: Rig) -> N
     assert 0.5 * 16 * 1800 < len(cloud) < 16 * 1800
     assert cloud[:, 3].min() >= 0
     assert cloud[:, 3].max() <= 1
+
+
+def test_streets_are_of_one_width_unless_their_layout_varies() -> None:
+    def kerb_m(layout: Layout) -> float:
+        """Distance of the kerbs from the centreline: of the nearest corners 0.15 m high."""
+        rng = np.random.default_rng(0)
+        line = winding_line(20.0, layout, rng)
+        mesh = build_street(line, 20.0, rng)
+        kerbs = mesh.corners_m[np.all(mesh.albedo == KERB, axis=1)].reshape(-1, 3)
+        raised = kerbs[np.isclose(kerbs[:, 2], 0.15), :2]
+        return float(np.min(np.linalg.norm(raised[:, None] - line.xy_m, axis=2)))
+
+    layouts = [draw_layout(np.random.default_rng(seed)) for seed in range(4)]
+    assert kerb_m(Layout()) == pytest.approx(KERB_Y_M, rel=1e-3)
+    assert [kerb_m(one) for one in layouts] == pytest.approx(
+        [KERB_Y_M * one.width for one in layouts], rel=0.02
+    )
+    assert np.ptp([one.width for one in layouts]) > 0.2
 
 
 def test_the_same_seed_gives_the_same_files(recording: Path, rig: Rig, tmp_path: Path) -> None:
