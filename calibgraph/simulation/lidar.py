@@ -47,6 +47,11 @@ class Lidar:
     weakest: float = 0.06
     errors: ScanErrors = ScanErrors()
 
+    def __post_init__(self) -> None:
+        found, beams = len(self.errors.elevations_deg), len(self.elevations_deg)
+        if found not in (0, beams):
+            raise ValueError(f"errors of {found} elevations for {beams} beams: one per beam, or ()")
+
 
 _ELEVATIONS_DEG = {16: (15.0, -15.0), 32: (10.0, -25.0), 64: (2.0, -24.8), 128: (15.0, -25.0)}
 _SECTOR_BEAMS = 32

@@ -106,9 +106,9 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         FileError: if the folder holds a recording.
         CalibrationError: if Open3D is missing.
     """
-    out, lidar = Path(out), lidar_of(beams)
+    out = Path(out)
+    lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
     _require_range(frames, step_m)
-    errors = _draw_errors(sensor_errors, beams, seed)
     _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
@@ -118,7 +118,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
-        _write_scans(made / "lidar", replace(lidar, errors=errors), drive, seed, progress)
+        _write_scans(made / "lidar", lidar, drive, seed, progress)
         _write_images(made / "cameras", rig, drive, seed, progress)
         rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)

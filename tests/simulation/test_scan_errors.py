@@ -104,4 +104,7 @@ def test_the_size_scales_them_and_none_changes_nothing(tmp_path: Path) -> None:
     assert clouds[2].shape != clouds[0].shape or not np.allclose(clouds[2], clouds[0])
     with pytest.raises(ValueError, match="sensor errors of -1"):
         simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, sensor_errors=-1)
+    three = ScanErrors(elevations_deg=(0.1, 0.0, 0.1))
+    with pytest.raises(ValueError, match="errors of 3 elevations for 16 beams"):
+        simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, sensor_errors=three)
     assert not (tmp_path / "wrong").exists()
