@@ -144,7 +144,7 @@ def _free(name: str, fit: AugmentedFit, camera: Camera) -> FreedParameter:
 
 
 def _check_freed(freed: FreedParameter) -> Check:
-    """How far a significant lens parameter moves the camera.
+    """How far a significant lens parameter turns or moves the camera, whichever is worse.
 
     A value as small as intrinsics are known by is at most a warning; so is a principal point, which
     is hard to distinguish from a rotation. An aspect ratio or skew as no lens has it is one also if
@@ -153,8 +153,8 @@ def _check_freed(freed: FreedParameter) -> Check:
     min_sigmas, fail_size = _LIMITS[freed.name]
     significant = freed.significance > min_sigmas
     degrees, centimetres = (freed.moved_deg, freed.moved_cm) if significant else (0.0, 0.0)
-    rotation, translation = threshold("lens_rotation"), threshold("lens_translation")
-    statuses = {rotation.grade(degrees), translation.grade(centimetres)}
+    moves = {threshold("lens_rotation"): degrees, threshold("lens_translation"): centimetres}
+    statuses = {row.grade(move) for row, move in moves.items()}
     warn = statuses != {"PASS"} or (significant and freed.is_misshapen)
     fail = freed.largest > fail_size and ("FAIL" in statuses or (warn and freed.is_misshapen))
     text = (
@@ -163,9 +163,13 @@ def _check_freed(freed: FreedParameter) -> Check:
     )
     if warn:
         text += "; check the intrinsics, and that images are not undistorted twice"
-    name = f"{freed.name}: {translation.name}"
-    check = translation.describe(centimetres, grade(warn, fail), text, name=name)
-    return replace(check, kind=f"lens_{freed.name.replace(' ', '_')}")
+    status = grade(warn, fail)
+    checks = [
+        row.describe(move, status, text, name=f"{freed.name}: {row.name}")
+        for row, move in moves.items()
+    ]
+    worse = max(checks, key=lambda check: check.severity)
+    return replace(worse, kind=f"lens_{freed.name.replace(' ', '_')}")
 
 
 def _check_sensitivity(camera: Camera, twist: Array) -> Check:

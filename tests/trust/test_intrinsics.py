@@ -74,6 +74,8 @@ def test_a_shifted_principal_point_is_a_warning(pair: Rig) -> None:
     result = solve(with_lens(pair, cx=20.0), simulated(pair))
     (check,) = named(result, "left", "principal point")
     assert check.status == "WARN"
+    assert check.unit == "deg"  # it turns the camera by a degree, and moves it by millimetres
+    assert check.severity > 1.9  # noqa: PLR2004
     (found,) = re.findall(r"off by \((-[0-9.]+), ", check.text)
     assert abs(float(found) + 20) < 1
 
