@@ -12,6 +12,7 @@ A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the ot
 the fit; the intercept is then moved, and the tables are weighted, to where one result in ten is
 off: as if users made so many mistakes. Weights are the most probable ones under a normal prior
 about values that are the same for all checks: one that has seen too little keeps nearly those.
+A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from benchmarks.accuracy import data_cases, ledger, table_cases
 from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import class_of
 from benchmarks.tables import ROOT, Table, add_record_option
-from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.model.verdict import FAIL_ABOVE, Check, Doubt, Verdict
 from calibgraph.trust.probability import (
     STRUCTURE,
     TABLES,
@@ -134,10 +135,13 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B",
                      options={"maxiter": 5000, "maxfun": 20000}).x  # fmt: skip
     weights = found[1:].reshape(-1, 3).round(3)
+    intercept = round(float(found[0] + logit(SHARE_OFF)), 3)
+    first, _, last = USUAL.tolist()
+    to_fail = round(float(logit(FAIL_ABOVE)) - intercept - first, 3)  # at the limit of WARN
     return {
-        "intercept": round(float(found[0] + np.log(SHARE_OFF / (1 - SHARE_OFF))), 3),
+        "intercept": intercept,
         "weights": {kind: weights[i].tolist() for i, kind in enumerate(kinds)},
-        "other": USUAL.tolist(),
+        "other": [first, to_fail, last],
     }
 
 
