@@ -17,9 +17,12 @@ from benchmarks.accuracy.rig_changes import (
     compose_extrinsics,
     derangement,
     invert_extrinsics,
+    random_offset,
     random_sign,
     to_transform,
     with_focal,
+    with_focal_y,
+    with_principal_point,
     with_stereo,
 )
 from benchmarks.accuracy.scenes import (
@@ -103,6 +106,19 @@ def focal(scene: Scene, rng: Rng, share: float) -> Case:
     return scene.data, with_focal(scene.guess(), factor), {"factor": factor}
 
 
+def focal_y(scene: Scene, rng: Rng) -> Case:
+    """The rig's fy alone is 3 to 5 % wrong."""
+    factor = 1 + random_sign(rng) * rng.uniform(0.03, 0.05)
+    return scene.data, with_focal_y(scene.guess(), factor), {"factor": factor}
+
+
+def principal(scene: Scene, rng: Rng) -> Case:
+    """The rig's principal points are wrong by 15 to 40 px."""
+    offset_px = random_offset(rng, 15, 40)
+    guess = with_principal_point(scene.guess(), offset_px)
+    return scene.data, guess, {"offset_px": offset_px.tolist()}
+
+
 def mirrored(scene: Scene, rng: Rng) -> Case:
     """The clouds are mirrored: y is -y."""
     return with_clouds(scene, lambda cloud: cloud * [1, -1, 1, 1]), scene.guess(), {}
@@ -155,6 +171,8 @@ KINDS: dict[str, Callable[[Scene, Rng], Case]] = {
     "shifted": shifted,
     "focal_5": partial(focal, share=0.05),
     "focal_3": partial(focal, share=0.03),
+    "focal_y": focal_y,
+    "principal": principal,
     "mirrored": mirrored,
     "other": other,
     "covered": partial(covered, blurred=False),

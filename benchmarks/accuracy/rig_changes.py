@@ -37,6 +37,33 @@ def with_focal(rig: Rig, factor: float) -> Rig:
     return with_lenses(rig, change)
 
 
+def with_focal_y(rig: Rig, factor: float) -> Rig:
+    """The rig with fy alone wrong by a factor."""
+
+    def change(camera: Camera) -> dict[str, Any]:
+        k = camera.intrinsics_px
+        return {"intrinsics_px": k.model_copy(update={"fy": factor * k.fy})}
+
+    return with_lenses(rig, change)
+
+
+def with_principal_point(rig: Rig, offset_px: Array) -> Rig:
+    """The rig with principal points that are wrong by an offset (2,)."""
+
+    def change(camera: Camera) -> dict[str, Any]:
+        k = camera.intrinsics_px
+        moved = {"cx": k.cx + offset_px[0], "cy": k.cy + offset_px[1]}
+        return {"intrinsics_px": k.model_copy(update=moved)}
+
+    return with_lenses(rig, change)
+
+
+def random_offset(rng: Rng, least: float, most: float) -> Array:
+    """(2,) of a random size between two bounds, in a random direction."""
+    size, angle = rng.uniform(least, most), rng.uniform(0, 2 * np.pi)
+    return size * np.array([np.cos(angle), np.sin(angle)])
+
+
 def with_half_resolution(rig: Rig) -> Rig:
     """The rig with the intrinsics of images of half the size."""
 

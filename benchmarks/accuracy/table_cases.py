@@ -14,14 +14,16 @@ from benchmarks.accuracy.rig_changes import (
     compose_extrinsics,
     derangement,
     invert_extrinsics,
+    random_offset,
     random_sign,
     to_transform,
     with_focal,
     with_lenses,
+    with_principal_point,
     with_stereo,
 )
 from benchmarks.accuracy.worlds import RIGS, Problem, World
-from calibgraph import Camera, Correspondences, Rig, concatenate, perturb, solve
+from calibgraph import Correspondences, Rig, concatenate, perturb, solve
 from calibgraph.model.geometry import invert
 
 Array = np.ndarray
@@ -95,15 +97,9 @@ def focal(world: World, rng: Rng, share: float) -> Case:
 
 def principal(world: World, rng: Rng) -> Case:
     """The rig's principal points are wrong by 15 to 40 px."""
-    size, angle = rng.uniform(15, 40), rng.uniform(0, 2 * np.pi)
-
-    def change(camera: Camera) -> dict[str, Any]:
-        k = camera.intrinsics_px
-        moved = {"cx": k.cx + size * np.cos(angle), "cy": k.cy + size * np.sin(angle)}
-        return {"intrinsics_px": k.model_copy(update=moved)}
-
-    drawn = {"offset_px": size, "angle_deg": np.degrees(angle)}
-    return with_lenses(world.guess(), change), world.table(), drawn
+    offset_px = random_offset(rng, 15, 40)
+    guess = with_principal_point(world.guess(), offset_px)
+    return guess, world.table(), {"offset_px": offset_px.tolist()}
 
 
 def distorted(world: World, rng: Rng) -> Case:
