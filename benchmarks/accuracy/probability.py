@@ -6,7 +6,7 @@
 
 The weights come from the first files, the tables from the others, which share no recordings (but
 for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package; a
-model of which no case is given keeps its own.
+model of which no case is given keeps its own. Without ``--tune`` the package's weights are judged.
 
 A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in
 the fit; the intercept is then moved, and the tables are weighted, to where one result in ten is
@@ -57,7 +57,8 @@ BINS = (0.0, 0.002, 0.005, 0.02, 0.1, 0.2, 0.5, 0.9, 1.0)
 FILE = ROOT / "calibgraph" / "trust" / "probability.json"
 AMBIGUOUS = ("two_poses_45",)
 """Kinds in which the matches cannot tell which of two extrinsics is right: a FAIL is wanted,
-although the result is right. They take no part in the fit, and are counted as what they are."""
+although the result is right. They take no part in the fit nor in how well the probability holds;
+verdicts are counted with them."""
 UNCOUNTED = (*table_cases.UNDETECTABLE, *data_cases.UNDETECTABLE)
 
 
@@ -163,31 +164,44 @@ def status_of(sample: Sample, p: float) -> str:
 
 
 def judged(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[Table]:
-    """How well the probability holds, beside the vote."""
+    """Verdicts beside those of a vote, and how well the probability holds."""
+    clear = [sample for sample in samples if sample.kind not in AMBIGUOUS]
+    return [
+        cuts(name, model, samples),
+        *reliability(f"{name}, without {', '.join(AMBIGUOUS)}", model, clear),
+    ]
+
+
+def cuts(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> Table:
+    """How many results of each class get each verdict."""
+    classes = ["off" if s.off else "right" if s.right else "between" for s in samples]
+    p, rows = probabilities(model, samples), []
+    for how, statuses in (("vote", [s.vote for s in samples]),
+                          ("probability", [*map(status_of, samples, p)])):  # fmt: skip
+        found = Counter(zip(classes, statuses, strict=True))
+        rows.append((how, *(str(found[c, s]) for c in ("off", "between", "right") for s in VOTE)))
+    columns = ("", *(f"{c}: {s}" for c in ("off", "between", "right") for s in VOTE))
+    return Table(f"{name}: results", columns, tuple(rows))
+
+
+def reliability(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[Table]:
+    """The mean squared error of the probability, and how often results are off by it."""
     p, off = probabilities(model, samples), np.array([s.off for s in samples])
     votes = np.array([VOTE[s.vote] for s in samples])
     count = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
     brier = [f"{np.average((values - off) ** 2, weights=count):.4f}" for values in (votes, p)]
-    reliability = []
+    rows = []
     for low, high in zip(BINS[:-1], BINS[1:], strict=True):
         inside = (p >= low) & ((p < high) | (high == 1))
         if inside.any():
             mean, found = (np.average(v[inside], weights=count[inside]) for v in (p, off))
             row = (inside.sum(), f"{mean:.4f}", f"{found:.4f}")
-            reliability.append((f"{low:g} to {high:g}", *map(str, row)))
-    classes = ["off" if s.off else "right" if s.right else "between" for s in samples]
-    cuts = []
-    for how, statuses in (("vote", [s.vote for s in samples]),
-                          ("probability", [*map(status_of, samples, p)])):  # fmt: skip
-        found = Counter(zip(classes, statuses, strict=True))
-        cuts.append((how, *(str(found[c, s]) for c in ("off", "between", "right") for s in VOTE)))
-    columns = ("", *(f"{c}: {s}" for c in ("off", "between", "right") for s in VOTE))
+            rows.append((f"{low:g} to {high:g}", *map(str, row)))
     return [
-        Table(f"{name}: results", columns, tuple(cuts)),
         Table(f"{name}: mean squared error of the probability", ("results", "vote", "probability"),
               ((str(len(p)), *brier),)),
         Table(f"{name}: how often results are off", ("probability", "results", "its mean", "off"),
-              tuple(reliability)),
+              tuple(rows)),
     ]  # fmt: skip
 
 
@@ -196,7 +210,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--tune", type=Path, nargs="+", required=True, help="files of verdicts")
+    parser.add_argument("--tune", type=Path, nargs="+", default=[], help="files of verdicts")
     parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
     parser.add_argument("--write", action="store_true", help="the weights into the package")
     add_record_option(parser)
