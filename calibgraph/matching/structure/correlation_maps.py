@@ -61,7 +61,9 @@ class CorrelationMaps:
     @cached_property
     def variances(self) -> Array:
         """(g,) of each map over its places."""
-        return np.asarray(self.maps.var(axis=(1, 2), dtype=np.float64))
+        squares = [cv2.norm(each, cv2.NORM_L2SQR) for each in self.maps]  # a fifth of np.var's time
+        means = [cv2.mean(each)[0] for each in self.maps]
+        return np.asarray(np.array(squares) / self.maps[0].size - np.array(means) ** 2)
 
     def blur(self, sigma_cells: float, every: int = 1) -> CorrelationMaps:
         """Blur the maps by a Gaussian, and keep only every so many rows and columns."""

@@ -91,11 +91,12 @@ class PoseSearch:
         return self._settle(refine(self._frames, body))
 
     def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
-        """The best pose in all of the range; of those that are accepted, the first."""
+        """The best pose in all of the range; of those beyond doubt, the first."""
+        beyond_doubt = max(CONFIDENT, least_z_score(tries))
         best = Candidate(body, -math.inf)
         for roll in ROLLS_RAD:
             best = max(best, self.with_roll(body, roll, effort=effort), key=_by_z_score)
-            if best.z_score >= least_z_score(tries) or self.out_of_time():
+            if best.z_score >= beyond_doubt or self.out_of_time():
                 break
         return best
 

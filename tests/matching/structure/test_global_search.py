@@ -17,7 +17,12 @@ from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
-from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
+from calibgraph.matching.structure.pose_search import (
+    CONFIDENT,
+    PROMISING,
+    PoseSearch,
+    SearchRange,
+)
 from calibgraph.progress import no_progress
 from tests.conftest import SAMPLE
 from tests.matching.structure.data import never
@@ -113,6 +118,42 @@ def test_a_lower_z_score_is_accepted_at_the_guess_if_a_search_found_no_better(
     if found.accepted:
         T = guess if taken == "near" else off(guess)
         np.testing.assert_allclose(found.camera.T_camera_lidar, T, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("z_scores", "searches"),
+    [
+        ((1.0, 2.0), [*BOTH[1]]),
+        ((PROMISING + 1, PROMISING + 2), [*BOTH[1], NAMES[1]]),
+    ],
+)
+def test_where_no_camera_is_found_the_most_promising_is_searched_again_if_any_is(
+    two: Rig, z_scores: tuple[float, float], searches: list[str]
+) -> None:
+    guesses = [two.T_camera_lidar[name] for name in NAMES]
+    search = MadeUp(two, [*zip(guesses, z_scores, strict=True)])
+    found = locate(search)
+    assert search.searches == searches
+    assert not any(located.accepted for located in found.values())
+
+
+@pytest.mark.parametrize(
+    ("by_roll", "rolls"), [((CONFIDENT + 1, 40.0, 50.0), 1), ((MANY + 0.1, 30.0, 50.0), 2)]
+)
+def test_of_the_rolls_those_are_tried_until_a_pose_is_beyond_doubt(
+    one: Rig, by_roll: tuple[float, ...], rolls: int
+) -> None:
+    """A local optimum may be accepted, but is not taken while better places may be left."""
+    tried: list[float] = []
+
+    class Rolled(PoseSearch):
+        def with_roll(self, body: Body, roll_rad: float, *, effort: int) -> Candidate:
+            tried.append(roll_rad)
+            return Candidate(body, by_roll[len(tried) - 1])
+
+    search = Rolled(one, {}, SearchRange(0.3, 1.5), 0, never)
+    found = search.everywhere(dict(one.cameras), 1, TRIES[1])
+    assert (len(tried), found.z_score) == (rolls, max(by_roll[:rolls]))
 
 
 def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) -> None:
