@@ -12,6 +12,7 @@ taken for each other. Here the name of a file holds the fingerprint of all of th
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 import math
 import os
@@ -32,6 +33,7 @@ import platformdirs
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
+from numba.core.extending import _Intrinsic
 from numba.core.serialize import dumps
 
 _MODULES = (np, math)  # whose functions kernels use by attribute: all others must be named
@@ -104,6 +106,8 @@ def _parts(kernel: Any, seen: set[str]) -> Iterator[str]:
             value = function.__globals__.get(used)
             if isinstance(value, Dispatcher):
                 yield from _parts(value, seen)
+            elif isinstance(value, _Intrinsic):
+                yield inspect.getsource(sys.modules[value.__module__])
             else:
                 yield f"{used} {_text(value)}"
 

@@ -29,6 +29,16 @@ OFFSET = {offset}
 def twice(x):
     return {factor} * x
 """
+INTRINSIC_HELPER = """
+from numba.extending import intrinsic
+OFFSET = {offset}
+
+@intrinsic
+def twice(_, x):
+    def build(context, builder, signature, arguments):
+        return builder.fmul(arguments[0], arguments[0].type({factor}))
+    return x(x), build
+"""
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
 LENS = (
     "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
@@ -122,15 +132,16 @@ def test_damaged_files_are_compiled_anew(tmp_path: Path, damage: bytes | None) -
     assert run(LENS, NUMBA_CACHE_DIR=str(tmp_path)) == (f"{HUBER} 1", "")
 
 
+@pytest.mark.parametrize("helper", [HELPER, INTRINSIC_HELPER])
 @pytest.mark.slow
-def test_a_change_of_a_callee_or_a_constant_is_noticed(tmp_path: Path) -> None:
+def test_a_change_of_a_callee_or_a_constant_is_noticed(helper: str, tmp_path: Path) -> None:
     """Both are in another file than the kernel, whose own file stays the same."""
     folder, cache = tmp_path / "kernels", str(tmp_path / "cache")
     folder.mkdir()
     (folder / "__init__.py").write_text("")
     (folder / "main.py").write_text(LOGARITHM)
     for factor, offset, hits in ((2.0, 1.0, 0), (2.0, 5.0, 0), (7.0, 5.0, 0), (2.0, 1.0, 1)):
-        (folder / "helper.py").write_text(HELPER.format(factor=factor, offset=offset))
+        (folder / "helper.py").write_text(helper.format(factor=factor, offset=offset))
         shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # Python compares times
         found = run(CALL, path=tmp_path, NUMBA_CACHE_DIR=cache)
         assert found == (f"{factor * 3.0 + offset} {hits}", "")  # the first version is kept too

@@ -1,25 +1,30 @@
 """The kernel that scores windows against an image at every shift of a grid.
 
 Where the time of a calibration goes. What makes it fast, measured against a matrix product by
-``benchmarks.speed.kernel``: the part of the image that a window meets is copied to a patch, in
-which all rows of shifts are one row, of the length that vectors like; five points of the window
-are multiplied in one pass over it, so that a sum is loaded and stored once for five products; the
-sums are arrays of their own, which the compiler can tell apart. The image has zero mean, which
-keeps single precision: its sum of squares is then not the difference of two large numbers.
+``benchmarks.speed.kernel``: the sums over a window's points are taken for a block of shifts at
+once, in registers, so that a pixel is loaded for all products that it is in, and no sum is loaded
+or stored in between. The image has zero mean, which keeps single precision: its sum of squares is
+then not the difference of two large numbers.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.matching.structure.registers import (
+    LANES,
+    ROWS,
+    fill_block,
+    load_block,
+    store_block,
+)
 from factors.compiled import compiled
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
 MIN_RESIDUAL_SHARE = 0.1  # of an image's variance, which no cloud explains
-LANES = 8  # floats of a vector that all current processors have
-MAX_SUMS = 768  # shifts whose sums are held at once: they stay in the first-level cache
-MIN_PATCH_SHARE = 0.35  # of a patch that is of use; below, rows of shifts are taken one by one
 OPPOSITE = np.float32(0.5)
 """Weight of an image that is dark where the intensity is high. Leaves are bright in the near
 infrared, and markings are bright in both: on recordings with much of the former, a weight of -1
@@ -28,6 +33,7 @@ CHANCE_DEPTH, CHANCE_INTENSITY = 0.13, 0.05
 """Shares of a structured image's variation that an unrelated window explains. Without them,
 windows would rather lie on any structure than on the flat image that they belong to."""
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
+UNCOUNTED = {"_nrt": False}  # arrays of callers: to count references takes as long as short loops
 
 
 def score_windows(
@@ -61,68 +67,61 @@ def score_windows(
         chance: how much of an unrelated window's share to subtract.
     """
     height, width = image.shape
-    pixels = np.zeros((2, height * width + LANES), np.float32)  # whole image, patch
-    pixels[0, : height * width] = (image - image.mean()).ravel()
-    sums = tuple(np.empty(max(MAX_SUMS, width) + LANES, np.float32) for _ in range(6))
-    factors = np.ones(grids.shape[1:], np.float32)
+    pixels = np.zeros((height + ROWS, width + LANES), np.float32)  # blocks may begin anywhere
+    pixels[:height, :width] = image - image.mean()
+    rows, columns = grids.shape[1:]
+    padded = math.ceil(columns / LANES) * LANES
+    room = (
+        np.empty(places.shape[1], np.int64),
+        np.empty(ROWS * padded, np.float32),
+        np.full((rows + ROWS) * padded, likelihood, np.float32),
+    )
     _score_windows(
-        image.shape, (*pixels,), (places, counts, basis, group), origin, likelihood, sums, factors,
+        pixels.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
         grids, (chance * CHANCE_DEPTH, chance * CHANCE_INTENSITY),
     )  # fmt: skip
 
 
-@compiled(fastmath=True)
-def _score_windows(shape, pixels, windows, origin, likelihood, sums, factors, grids, shares):  # type: ignore[no-untyped-def]
-    """See :func:`score_windows`; sums and factors: room for intermediate values."""
+@compiled(fastmath=True, **UNCOUNTED)
+def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_chance):  # type: ignore[no-untyped-def]
+    """See :func:`score_windows`.
+
+    room: for the place in pixels of each point of a window, the scores of a row of blocks, and the
+    scores of a group, in rows as long as whole blocks; of likelihoods they are factors.
+    """
     height, width = shape
-    whole, patch = pixels
     places, counts, basis, group = windows
+    start, scores, totals = room
+    stride, padded = width + LANES, len(scores) // ROWS
     rows, columns = grids.shape[1], grids.shape[2]
-    start = np.empty(places.shape[1], np.int64)
-    multiplied = 0
+    held = 0  # windows whose scores are in the totals
     for w in range(len(places)):
         n = counts[w]
-        if multiplied == FACTORS or (multiplied > 0 and group[w] != group[w - 1]):
-            _take_logarithms(factors, grids[group[w - 1]])
-            multiplied = 0
+        if held > 0 and (group[w] != group[w - 1] or (likelihood and held == FACTORS)):
+            _take_totals(totals, padded, likelihood, grids[group[w - 1]])
+            held = 0
+        held += 1
         left, right, top, bottom = _find_extent(places[w], n)
         first, above = max(origin[0], -left), max(origin[1], -top)
         size = min(origin[0] + columns, width - right) - first
         end = min(origin[1] + rows, height - bottom)
-        if size <= 0 or end <= above:
-            continue
-        source, stride, at_once = whole, width, 1
-        corner = (top + above) * width + left + first
-        if size >= MIN_PATCH_SHARE * (right - left + size):
-            source, stride = patch, right - left + size
-            at_once = max(1, MAX_SUMS // stride)
-            for row in range(bottom - top + end - above):
-                for k in range(stride):
-                    patch[row * stride + k] = whole[corner + row * width + k]
-            corner = 0
         chance = 0.0
         for p in range(n):
-            chance += shares[0] * basis[w, p, 0] ** 2 + shares[1] * basis[w, p, 1] ** 2
-            start[p] = corner + (places[w, p, 1] - top) * stride + places[w, p, 0] - left
-        for shift in range(above, end, at_once):
-            lines = min(at_once, end - shift)
-            length = ((lines - 1) * stride + size + LANES - 1) // LANES * LANES
-            part = source[(shift - above) * stride :]
-            _sum_products(part, start, n, basis[w], not likelihood, length, sums)
-            for line in range(lines):
-                row, column = shift + line - origin[1], first - origin[0]
-                if likelihood:
-                    out = factors[row, column : column + size]
-                    _multiply_factors(sums, line * stride, n, np.float32(chance), out)
-                else:
-                    out = grids[group[w], row, column : column + size]
-                    _add_shares(sums, line * stride, n, np.float32(chance), out)
-        multiplied += int(likelihood)
-    if multiplied:
-        _take_logarithms(factors, grids[group[-1]])
+            chance += by_chance[0] * basis[w, p, 0] ** 2 + by_chance[1] * basis[w, p, 1] ** 2
+            start[p] = (places[w, p, 1] + above) * stride + places[w, p, 0] + first
+        for shift in range(above, end, ROWS):
+            for k in range(0, size, LANES):
+                at = (shift - above) * stride + k
+                score = _score_block(pixels, start, at, stride, n, basis[w], chance, likelihood)
+                store_block(scores, k, padded, score)
+            at = (shift - origin[1]) * padded + first - origin[0]
+            length = size if size < columns else padded  # of whole vectors where it can be
+            _add_scores(scores, padded, min(ROWS, end - shift), length, likelihood, totals[at:])
+    if held:
+        _take_totals(totals, padded, likelihood, grids[group[-1]])
 
 
-@compiled()
+@compiled(**UNCOUNTED)
 def _find_extent(places, n):  # type: ignore[no-untyped-def]
     """The least and largest u, then v, of the first n places."""
     left, top = places[0, 0], places[0, 1]
@@ -133,90 +132,57 @@ def _find_extent(places, n):  # type: ignore[no-untyped-def]
     return left, right, top, bottom
 
 
-@compiled(fastmath=True)
-def _sum_products(pixels, start, n, basis, with_trend, length, sums):  # type: ignore[no-untyped-def]
-    """Over a window's points, at each shift k: sums of basis[p] v, of v and of v^2.
+@compiled(fastmath=True, **UNCOUNTED)
+def _score_block(pixels, start, at, stride, n, basis, chance, likelihood):  # type: ignore[no-untyped-def]
+    """The score of a window of n points at a block of shifts; of a likelihood, the factor.
 
-    v = pixels[start[p] + k], k < length.
+    At the first of the shifts, point p lies at pixels[start[p] + at].
     """
-    depth, intensity, total, power, trend_u, trend_v = sums
-    noise = np.float32(n * GRAY_NOISE**2)
-    for k in range(length):
-        depth[k] = 0
-        intensity[k] = 0
-        total[k] = 0
-        power[k] = noise
-    if with_trend:
-        for k in range(length):
-            trend_u[k] = 0
-            trend_v[k] = 0
-    for p in range(0, n - 4, 5):
-        row0, row1, row2 = pixels[start[p] :], pixels[start[p + 1] :], pixels[start[p + 2] :]
-        row3, row4 = pixels[start[p + 3] :], pixels[start[p + 4] :]
-        p1, p2, p3, p4 = p + 1, p + 2, p + 3, p + 4
-        a0, b0, c0, d0 = basis[p, 0], basis[p, 1], basis[p, 2], basis[p, 3]
-        a1, b1, c1, d1 = basis[p1, 0], basis[p1, 1], basis[p1, 2], basis[p1, 3]
-        a2, b2, c2, d2 = basis[p2, 0], basis[p2, 1], basis[p2, 2], basis[p2, 3]
-        a3, b3, c3, d3 = basis[p3, 0], basis[p3, 1], basis[p3, 2], basis[p3, 3]
-        a4, b4, c4, d4 = basis[p4, 0], basis[p4, 1], basis[p4, 2], basis[p4, 3]
-        for k in range(length):
-            v0, v1, v2, v3, v4 = row0[k], row1[k], row2[k], row3[k], row4[k]
-            depth[k] += a0 * v0 + a1 * v1 + a2 * v2 + a3 * v3 + a4 * v4
-            intensity[k] += b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3 + b4 * v4
-            total[k] += v0 + v1 + v2 + v3 + v4
-            power[k] += v0 * v0 + v1 * v1 + v2 * v2 + v3 * v3 + v4 * v4
-        if with_trend:
-            for k in range(length):
-                v0, v1, v2, v3, v4 = row0[k], row1[k], row2[k], row3[k], row4[k]
-                trend_u[k] += c0 * v0 + c1 * v1 + c2 * v2 + c3 * v3 + c4 * v4
-                trend_v[k] += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4
-    for p in range(n - n % 5, n):
-        row0 = pixels[start[p] :]
-        a0, b0, c0, d0 = basis[p, 0], basis[p, 1], basis[p, 2], basis[p, 3]
-        for k in range(length):
-            v0 = row0[k]
-            depth[k] += a0 * v0
-            intensity[k] += b0 * v0
-            total[k] += v0
-            power[k] += v0 * v0
-        if with_trend:
-            for k in range(length):
-                v0 = row0[k]
-                trend_u[k] += c0 * v0
-                trend_v[k] += d0 * v0
+    noise = n * GRAY_NOISE**2
+    depth, intensity, total = fill_block(0.0), fill_block(0.0), fill_block(0.0)
+    variation = fill_block(noise)
+    for p in range(n):
+        seen = load_block(pixels, start[p] + at, stride)
+        depth += basis[p, 0] * seen
+        intensity += basis[p, 1] * seen
+        total += seen
+        variation += seen * seen
+    variation -= total * total * (1.0 / n)
+    explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
+    if likelihood:
+        share = (explained + chance * noise) / variation - chance
+        return 1.0 - share * (1 / (1 + MIN_RESIDUAL_SHARE))
+    trend_u, trend_v = fill_block(0.0), fill_block(0.0)
+    for p in range(n):
+        seen = load_block(pixels, start[p] + at, stride)
+        trend_u += basis[p, 2] * seen
+        trend_v += basis[p, 3] * seen
+    variation -= trend_u * trend_u + trend_v * trend_v
+    return (explained + chance * noise) / variation - chance
 
 
-@compiled(fastmath=True)
-def _add_shares(sums, at, n, chance, grid):  # type: ignore[no-untyped-def]
-    """Add the share of explained variance at each shift of a row."""
-    depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
-    trend_u, trend_v = sums[4][at:], sums[5][at:]
-    by_chance = chance * np.float32(n * GRAY_NOISE**2)
-    for k in range(len(grid)):
-        variation = power[k] - total[k] * total[k] / np.float32(n)
-        variation -= trend_u[k] * trend_u[k] + trend_v[k] * trend_v[k]
-        explained = depth[k] * depth[k]
-        explained += intensity[k] * max(intensity[k], OPPOSITE * intensity[k])
-        grid[k] += (explained + by_chance) / variation - chance
+@compiled(fastmath=True, **UNCOUNTED)
+def _add_scores(scores, padded, lines, size, likelihood, totals):  # type: ignore[no-untyped-def]
+    """Add lines of scores to the totals, or multiply factors."""
+    for line in range(lines):
+        of_line, out = scores[line * padded :], totals[line * padded :]
+        if likelihood:
+            for k in range(size):
+                out[k] *= of_line[k]
+        else:
+            for k in range(size):
+                out[k] += of_line[k]
 
 
-@compiled(fastmath=True)
-def _multiply_factors(sums, at, n, chance, factors):  # type: ignore[no-untyped-def]
-    """Multiply by the residual share at each shift of a row."""
-    depth, intensity, total, power = sums[0][at:], sums[1][at:], sums[2][at:], sums[3][at:]
-    by_chance = chance * np.float32(n * GRAY_NOISE**2)
-    for k in range(len(factors)):
-        variation = power[k] - total[k] * total[k] / np.float32(n)
-        explained = depth[k] * depth[k]
-        explained += intensity[k] * max(intensity[k], OPPOSITE * intensity[k])
-        share = (explained + by_chance) / variation - chance
-        factors[k] *= np.float32(1) - share / np.float32(1 + MIN_RESIDUAL_SHARE)
-
-
-@compiled(fastmath=True)
-def _take_logarithms(factors, grid):  # type: ignore[no-untyped-def]
-    """Subtract the logarithms of the factors from a grid; the factors become 1."""
+@compiled(fastmath=True, **UNCOUNTED)
+def _take_totals(totals, padded, likelihood, grid):  # type: ignore[no-untyped-def]
+    """Add the totals to a grid, of factors the negative logarithms, and clear them."""
     for row in range(grid.shape[0]):
-        for column in range(grid.shape[1]):
-            grid[row, column] -= np.log(factors[row, column])
-            factors[row, column] = 1
+        of_row = totals[row * padded :]
+        if likelihood:
+            for column in range(grid.shape[1]):
+                grid[row, column] -= np.log(of_row[column])
+        else:
+            for column in range(grid.shape[1]):
+                grid[row, column] += of_row[column]
+    totals[:] = np.float32(likelihood)

@@ -53,6 +53,47 @@ def test_the_score_of_a_window_is_its_share_of_the_images_variance(
     assert grids[0, 1, 4] == pytest.approx(log if likelihood else share, rel=1e-4)
 
 
+@pytest.mark.parametrize("likelihood", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (9, 13), (13, 17), (6, 33)])
+def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
+    likelihood: bool, size: tuple[int, int]
+) -> None:
+    """Grids as wide as no vector, windows that are partly or never in the image, and groups."""
+    rng = np.random.default_rng(0)
+    image = rng.standard_normal((20, 30)).astype(np.float32)
+    places = rng.integers([-20, -20], [50, 40], (100, 1, 2)) + rng.integers(-3, 4, (100, 12, 2))
+    basis = rng.uniform(-0.2, 0.2, (100, 12, 4)).astype(np.float32)
+    basis[:, :, 2:] *= not likelihood
+    counts = rng.integers(9, 13, 100)
+    group = np.repeat([0, 1, 3], [30, 50, 20])
+    origin = -np.array(size[::-1]) // 2
+    grids, expected = np.zeros((4, *size), np.float32), np.zeros((4, *size))
+    score_windows(
+        image, places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
+        origin, likelihood, grids,
+    )  # fmt: skip
+    for window, n, columns, g in zip(places, counts, basis, group, strict=True):
+        for row, column in np.ndindex(size):
+            u, v = (window[:n] + origin + [column, row]).T
+            if min(u.min(), v.min()) >= 0 and u.max() < 30 and v.max() < 20:
+                score = formula(image[v, u] - image.mean(), columns[:n], likelihood)
+                expected[g, row, column] += score
+    rounding = 50 * 12 * np.finfo(np.float32).eps  # of the windows of a group, and their points
+    assert np.count_nonzero(expected) > 0.5 * expected[[0, 1, 3]].size
+    np.testing.assert_allclose(grids, expected, rtol=rounding, atol=rounding)
+
+
+def formula(seen: np.ndarray, basis: np.ndarray, likelihood: bool) -> float:
+    """The score of a window at one shift."""
+    depth, intensity, *trend = basis.T.astype(np.float64) @ seen
+    noise = len(seen) * GRAY_NOISE**2
+    variance = len(seen) * seen.astype(np.float64).var() - np.square(trend).sum() + noise
+    explained = depth**2 + (1 if intensity > 0 else OPPOSITE) * intensity**2
+    chance = [CHANCE_DEPTH, CHANCE_INTENSITY] @ np.square(basis[:, :2].astype(np.float64)).sum(0)
+    share = explained / variance - chance * (1 - noise / variance)
+    return float(-np.log(1 - share / (1 + MIN_RESIDUAL_SHARE)) if likelihood else share)
+
+
 def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -> None:
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.standard_normal((60, 60)), (0, 0), 1.0).astype(np.float32)
