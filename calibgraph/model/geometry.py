@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def invert(T_a_b: Array) -> Array:
-    """(4, 4) T_b_a."""
+    """(4, 4) T_b_a, or (f, 4, 4) of as many."""
     return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
 
 
@@ -181,12 +181,12 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
     return moved
 
 
-def local_coordinates(T_camera_lidar: Array, others: Array) -> Array:
-    """(f, 6) tangents from one T_lidar_camera to others, as GTSAM's ``localCoordinates``.
+def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
+    """(f, 6) tangents from one variable to others, as GTSAM's ``localCoordinates``.
 
     Args:
-        T_camera_lidar: (4, 4).
-        others: (f, 4, 4) T_camera_lidar.
+        T_camera_lidar: (4, 4) of the one, inverted.
+        T_lidar_camera: (f, 4, 4) of the others.
     """
-    tangents: Array = logarithms(T_camera_lidar @ np.linalg.inv(others))
+    tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
     return tangents

@@ -99,6 +99,15 @@ def median(values):  # type: ignore[no-untyped-def]
 
 
 @compiled()
+def medians(values, runs):  # type: ignore[no-untyped-def]
+    """(r,) :func:`median` of the values in each of (r, 2) runs."""
+    out = np.empty(len(runs))
+    for i in range(len(runs)):
+        out[i] = median(values[runs[i, 0] : runs[i, 1]])
+    return out
+
+
+@compiled()
 def _spread(values, start, half, cut):  # type: ignore[no-untyped-def]
     """See ``residual_scale.robust_spread``: ``start`` is a quantile and a factor."""
     work, edges, bits = _bin(values)
