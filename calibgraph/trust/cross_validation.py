@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.perturbation import perturb_extrinsics
 from calibgraph.model.verdict import Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock, camera_block
@@ -64,9 +64,11 @@ def restart_checks(evidence: Evidence) -> Checks:
     if not evidence.fitted_blocks:
         return {}
     solution = evidence.of_correspondences.solution
-    rig = solution.solved_rig
+    T_camera_lidar = solution.T_camera_lidar
     displaced = [
-        perturb(rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed).T_camera_lidar
+        perturb_extrinsics(
+            T_camera_lidar, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
+        )
         for seed in range(RESTARTS)
     ]
     ends = _ends_from(solution, displaced)
@@ -77,7 +79,7 @@ def restart_checks(evidence: Evidence) -> Checks:
         differences = [
             (180.0, np.inf)
             if end is None
-            else pose_difference(end[camera], solution.T_camera_lidar[camera])
+            else pose_difference(end[camera], T_camera_lidar[camera])
             for end in ends
         ]
         degrees, centimetres = np.max(differences, axis=0)
