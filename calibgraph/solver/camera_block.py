@@ -18,7 +18,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
-from calibgraph.solver.spread_kernel import medians
+from calibgraph.solver.spread_kernel import median, medians
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
@@ -269,7 +269,7 @@ class BlockResiduals:
     def summary(self, scale: ResidualScale) -> Residuals:
         """What the result reports of them."""
         return Residuals(
-            median_px=float(np.median(self.errors_px)),
+            median_px=float(median(self.errors_px)),
             inlier_share=float(np.mean(self.inliers(scale))),
             sigma_px=robust_spread(self.sizes[0]),
             loss_scale_px=scale.loss_scale,

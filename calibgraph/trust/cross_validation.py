@@ -17,6 +17,7 @@ from calibgraph.solver.camera_block import CameraBlock, camera_block
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
 
@@ -56,7 +57,7 @@ def _held_out_ratio(
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])
     held_out = np.concatenate([errors[0][~even], errors[1][even]])
-    return float(np.median(held_out) / max(np.median(fitted), np.finfo(float).tiny))
+    return float(median(held_out) / max(median(fitted), np.finfo(float).tiny))
 
 
 def restart_checks(evidence: Evidence) -> Checks:

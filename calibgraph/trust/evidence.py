@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -242,9 +242,7 @@ class Evidence:
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
         curvature = curvature_at(
-            replace(free, gated=solution.inliers.gated),
-            T_camera_lidar,
-            hessians_of_blocks(blocks, T_camera_lidar),
+            free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar)
         )
         scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
         if scatter is None:
