@@ -20,7 +20,14 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import RobustBlock, check_shape, contiguous, join_roots, read_only, rows_of_root
+from factors.block_arrays import (
+    RobustBlock,
+    check_shape,
+    contiguous,
+    join_roots,
+    read_only,
+    rows_of_root,
+)
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.compiled import one_at_a_time
 from factors.kernel import (

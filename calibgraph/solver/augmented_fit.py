@@ -82,7 +82,7 @@ class LinearRows:
         if solved is None:
             return None
         solution, normal, weights, errors = solved
-        inverse = np.linalg.inv(normal)
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         sigmas = self._cluster_sigmas(which[:-1], normal, inverse, weights, errors)
         shares = 1 / np.sqrt(np.diag(inverse) * np.diag(normal))
         return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:])

@@ -78,9 +78,7 @@ def restart_checks(evidence: Evidence) -> Checks:
     checks = {}
     for camera in evidence.fitted_blocks:
         differences = [
-            (180.0, np.inf)
-            if end is None
-            else pose_difference(end[camera], T_camera_lidar[camera])
+            (180.0, np.inf) if end is None else pose_difference(end[camera], T_camera_lidar[camera])
             for end in ends
         ]
         degrees, centimetres = np.max(differences, axis=0)

@@ -64,9 +64,7 @@ def distances_between(
     guesses: Mapping[str, Array], results: Mapping[str, Array]
 ) -> dict[tuple[str, str], float]:
     """Between each guess and each result, (4, 4) T_camera_lidar, by the names of both cameras."""
-    return {
-        (one, two): _distance(guesses[one], results[two]) for one in results for two in results
-    }
+    return {(one, two): _distance(guesses[one], results[two]) for one in results for two in results}
 
 
 def compare_with_other_guesses(
@@ -81,7 +79,6 @@ def compare_with_other_guesses(
     Returns:
         One check; none for a single camera.
     """
-
     slack = limit("swap_slack")
     ratios = {
         other: (slack + distances[other, camera] + distances[camera, other])
