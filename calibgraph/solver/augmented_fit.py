@@ -144,51 +144,57 @@ class LinearRows:
         return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))
 
 
-def linearize(
-    camera: Camera, table: Correspondences, differentiate: Callable[[Array], Array]
-) -> LinearRows:
+def linearize(camera: Camera, table: Correspondences, jacobian_px: Array) -> LinearRows:
     """The rows of a fit of the pose together with further unknowns.
 
     Args:
         camera: lens, and the extrinsic about which is linearised.
         table: the rows of this camera.
-        differentiate: from the (n, 2) predicted pixels to their (n, 2, k) derivatives by the
-            unknowns.
+        jacobian_px: (n, 2, k) derivatives of each row's pixel by the unknowns.
     """
     numbers, group = np.unique(table.frame, return_inverse=True)
     root = None if table.information_px is None else upper_root(table.information_px)
     block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px, root)
-    return _linearize(camera, block, differentiate, group, len(numbers))
+    columns = np.empty((6 + jacobian_px.shape[2] + 1, 2, len(table)))
+    columns[6:-1] = jacobian_px.transpose(2, 1, 0)
+    _finish_columns(columns, _fill_pose(columns, camera, block), camera, block)
+    return LinearRows(columns, group, len(numbers))
 
 
 def linearize_block(
-    camera: Camera, block: CameraBlock, differentiate: Callable[[Array], Array]
+    camera: Camera, block: CameraBlock, unknowns: int, fill: Callable[[Array, Array], None]
 ) -> LinearRows:
-    """As :func:`linearize`, of correspondences with their weights."""
-    edges = block.frame_edges
-    group = np.repeat(np.arange(block.frames), np.diff(edges))
-    return _linearize(camera, block.block, differentiate, group, block.frames)
+    """As :func:`linearize`, of correspondences with their weights.
+
+    Args:
+        camera: as there.
+        block: its correspondences.
+        unknowns: k.
+        fill: given the (2, n) predicted pixels, fills (k, 2, n) derivatives by the unknowns.
+    """
+    columns = np.empty((6 + unknowns + 1, 2, len(block)))  # filled in place: fresh memory is slow
+    pixels = _fill_pose(columns, camera, block.block)
+    fill(pixels, columns[6:-1])
+    _finish_columns(columns, pixels, camera, block.block)
+    group = np.repeat(np.arange(block.frames), np.diff(block.frame_edges))
+    return LinearRows(columns, group, block.frames)
 
 
-def _linearize(
-    camera: Camera,
-    block: ProjectionBlock,
-    differentiate: Callable[[Array], Array],
-    group: NDArray[np.int64],
-    groups: int,
-) -> LinearRows:
-    by_twist = np.empty((6, 2, len(block)))
-    pixels = fill_twist_columns(camera, block.points_lidar_m, by_twist)
-    by_unknowns = differentiate(pixels.T).transpose(2, 1, 0)
-    errors = camera.lens.subtract(block.pixels_px, pixels.T)
-    columns = np.concatenate([by_twist, by_unknowns, errors.T[None]])
-    if block.sqrt_information is not None:
-        s00, s01, s11 = block.sqrt_information.T
-        columns[:, 0] *= s00
-        if s01.any():
-            columns[:, 0] += s01 * columns[:, 1]
-        columns[:, 1] *= s11
-    return LinearRows(columns, group, groups)
+def _fill_pose(columns: Array, camera: Camera, block: ProjectionBlock) -> Array:
+    """Fill in the derivatives by the pose; (2, n) predicted pixels."""
+    return fill_twist_columns(camera, block.points_lidar_m, columns[:6])
+
+
+def _finish_columns(columns: Array, pixels: Array, camera: Camera, block: ProjectionBlock) -> None:
+    """Fill in the errors, and whiten all columns."""
+    columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
+    if block.sqrt_information is None:
+        return
+    s00, s01, s11 = block.sqrt_information.T
+    columns[:, 0] *= s00
+    if s01.any():
+        columns[:, 0] += s01 * columns[:, 1]
+    columns[:, 1] *= s11
 
 
 def fit_augmented(
@@ -212,7 +218,7 @@ def fit_augmented(
     """
     if len(table) < MIN_ROWS:
         return None
-    rows = linearize(camera, table, lambda _: jacobian_px)
+    rows = linearize(camera, table, jacobian_px)
     return rows.fit(range(jacobian_px.shape[2]), loss_scale=loss_scale)
 
 
@@ -222,5 +228,5 @@ def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Arr
     By all rows alike, without a robust loss, with the camera at the solution. Arguments as of
     `fit_augmented`.
     """
-    rows = linearize(camera, table, lambda _: jacobian_px)
+    rows = linearize(camera, table, jacobian_px)
     return rows.compensating_twists(range(jacobian_px.shape[2]), np.ones(len(table)))

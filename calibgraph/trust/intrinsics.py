@@ -7,6 +7,7 @@ check is how far the camera moves when it is set free, and with which significan
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ _LIMITS = {
 
 _SHAPES = ("aspect ratio", "skew")
 
+_FIELDS = 6  # of displacements, see ``fill_displacement_fields``
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 
@@ -97,7 +99,7 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the
     # centre would explain everything.
     rows = linearize_block(
-        camera, some.select(in_front), lambda predicted: displacement_fields(camera, predicted)
+        camera, some.select(in_front), _FIELDS, partial(fill_displacement_fields, camera)
     )
     unknowns = {
         "focal length": (0,),
@@ -116,24 +118,21 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
     return [*checks, _check_sensitivity(twists[:, 0])]
 
 
-def displacement_fields(camera: Camera, pixels_px: Array) -> Array:
-    """(n, 2, 6) displacements [px] of (n, 2) pixels per unit of each lens parameter's values.
+def fill_displacement_fields(camera: Camera, pixels_px: Array, fields: Array) -> None:
+    """Displacements [px] of pixels per unit of each lens parameter's values.
 
-    Of the focal length, the principal point (two), the distortion, the aspect ratio and the skew.
+    Args:
+        camera: its lens.
+        pixels_px: (2, n).
+        fields: (6, 2, n), filled: of the focal length, the principal point (two), the distortion,
+            the aspect ratio and the skew.
     """
     k = camera.intrinsics_px
-    u, v = pixels_px.T - [[k.cx], [k.cy]]
-    squared = (u / k.fx) ** 2 + (v / k.fy) ** 2
-    zeros, ones = np.zeros(len(u)), np.ones(len(u))
-    fields = np.array([
-        (u, v),
-        (ones, zeros),
-        (zeros, ones),
-        (u * squared, v * squared),
-        (0.5 * u, -0.5 * v),
-        (v * (k.fx / k.fy), zeros),
-    ])  # fmt: skip
-    return fields.transpose(2, 1, 0)
+    u, v = np.subtract(pixels_px, [[k.cx], [k.cy]], out=fields[0])
+    fields[1, 0], fields[1, 1], fields[2, 0], fields[2, 1] = 1.0, 0.0, 0.0, 1.0
+    np.multiply(fields[0], (u / k.fx) ** 2 + (v / k.fy) ** 2, out=fields[3])
+    np.multiply(fields[0], [[0.5], [-0.5]], out=fields[4])
+    fields[5, 0], fields[5, 1] = v * (k.fx / k.fy), 0.0
 
 
 def _free(name: str, fit: AugmentedFit) -> FreedParameter:
