@@ -152,7 +152,9 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
     )
-    _log.info("%s %s", result.verdict.status, "; ".join(result.verdict.reasons))
+    if _log.isEnabledFor(logging.INFO):
+        verdict = result.verdict
+        _log.info("%s %s", verdict.status, "; ".join(verdict.reasons))
     return result
 
 

@@ -12,7 +12,6 @@ that is concave in s with rho(0) = 0.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,7 +20,14 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import RobustBlock, check_shape, contiguous, join_roots, rows_of_root
+from factors.block_arrays import (
+    RobustBlock,
+    check_shape,
+    contiguous,
+    join_roots,
+    read_only,
+    rows_of_root,
+)
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.compiled import one_at_a_time
 from factors.kernel import (
@@ -88,11 +94,10 @@ class ProjectionBlock(RobustBlock):
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        edges = np.append(np.arange(0, columns.shape[1], _CHUNK), columns.shape[1])
         self._replace(
             _columns=columns,
             _whitening=np.empty((0, columns.shape[1])) if root is None else root[:rows],
-            _chunks=to_runs(edges),
+            _chunks=_cut(columns.shape[1]),
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:].T,
             sqrt_information=None if root is None else root.T,
@@ -105,15 +110,18 @@ class ProjectionBlock(RobustBlock):
         """The same correspondences, not copied, with other (n, 3) whitening matrices, or none."""
         if sqrt_information is not None:
             check_shape("sqrt_information", sqrt_information, (len(self), 3))
-        other = copy.copy(self)
+        other = self._copy()
         other._initialize(self._columns, *rows_of_root(sqrt_information))
         return other
 
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
         """The block with only some correspondences: a mask or an index array."""
-        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        if rows.dtype == np.bool_:
+            rows = np.flatnonzero(rows)
+            if len(rows) == len(self):
+                return self
         root = self.sqrt_information
-        other = copy.copy(self)
+        other = self._copy()
         other._initialize(
             self._columns.take(rows, axis=1),
             None if root is None else root.T.take(rows, axis=1),
@@ -125,7 +133,7 @@ class ProjectionBlock(RobustBlock):
     def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
         """The correspondences of blocks of one lens under each other; loss as of the first."""
         roots = join_roots([part.sqrt_information for part in parts], [*map(len, parts)])
-        joined, columns = copy.copy(parts[0]), np.hstack([part._columns for part in parts])
+        joined, columns = parts[0]._copy(), np.hstack([part._columns for part in parts])
         joined._initialize(columns, *rows_of_root(roots))
         return joined
 
@@ -234,7 +242,16 @@ class ProjectionBlock(RobustBlock):
 
 def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
-    return contiguous(np.stack([edges[:-1], edges[1:]], axis=1))
+    runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
+    runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
+    return read_only(runs)
+
+
+def _cut(count: int) -> NDArray[np.int64]:
+    """(c, 2) the runs of so many correspondences, see _CHUNK."""
+    edges = np.arange(0, count + _CHUNK, _CHUNK)
+    edges[-1] = count
+    return to_runs(edges)
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any, Self, TypeVar
 
@@ -26,21 +25,27 @@ class RobustBlock:
 
     def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
-        other = copy.copy(self)  # not checked again: its correspondences are those of a good block
+        other = self._copy()  # not checked again: its correspondences are those of a good block
         other._replace(scale=scale, sigma=sigma)
         other._check_scale()
         return other
 
+    def _copy(self) -> Self:
+        """A block with the same attributes, to be changed; faster than ``copy.copy``."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
     def _check_scale(self) -> None:
-        for name in ("scale", "sigma"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, found {getattr(self, name)}")
+        if not (self.scale > 0 and self.sigma > 0):
+            name = "sigma" if self.scale > 0 else "scale"
+            raise ValueError(f"{name} must be positive, found {getattr(self, name)}")
 
     def _replace(self, **values: Any) -> None:
         """Set attributes of a block that is being made; arrays as views that are read-only."""
         for name, value in values.items():
             array = isinstance(value, np.ndarray)
-            object.__setattr__(self, name, read_only(value) if array else value)
+            self.__dict__[name] = read_only(value) if array else value
 
 
 def read_only(array: NDArray[_Number]) -> NDArray[_Number]:

@@ -15,7 +15,6 @@ It does not depend on the length of t, which epipolar geometry does not determin
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -88,7 +87,7 @@ class EpipolarBlock(RobustBlock):
 
     def select(self, rows: NDArray[Any]) -> EpipolarBlock:
         """The block with only some features: a mask or an index array."""
-        other = copy.copy(self)
+        other = self._copy()
         names = "_rays", "pixels_a_px", "pixels_b_px"
         other._replace(**{name: getattr(self, name)[rows] for name in names})
         return other

@@ -158,6 +158,25 @@ class Lens:
         pixels, jacobians = _project_many_with_jacobian(self.kind, self.packed, points)
         return pixels, jacobians
 
+    def fill_twist_columns(
+        self, T_camera_lidar: Array, points_lidar_m: Array, columns: Array
+    ) -> Array:
+        """Project points in the LiDAR frame, with derivatives by a twist of the camera, by columns.
+
+        Args:
+            T_camera_lidar: (4, 4); the twist xi is that of exp(xi) T_camera_lidar.
+            points_lidar_m: (n, 3) in the LiDAR frame.
+            columns: (6, 2, n), filled: derivatives by rotation [px/rad] and translation [px/m].
+
+        Returns:
+            (2, n) pixels.
+        """
+        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64).T)
+        pixels: Array = _fill_twist_columns(
+            self.kind, self.packed, contiguous(T_camera_lidar), points, columns
+        )
+        return pixels
+
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
     if not (fx > 0 and fy > 0):
@@ -233,3 +252,23 @@ def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-
         jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
         jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
     return pixels, jacobians
+
+
+@compiled()
+def _fill_twist_columns(kind, lens, T, points, columns):  # type: ignore[no-untyped-def]
+    n = points.shape[1]
+    pixels = np.empty((2, n))
+    for i in range(n):
+        px, py, pz = points[0, i], points[1, i], points[2, i]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
+        pixels[0, i], pixels[1, i] = u, v
+        columns[3, 0, i], columns[4, 0, i], columns[5, 0, i] = ux, uy, uz
+        columns[3, 1, i], columns[4, 1, i], columns[5, 1, i] = vx, vy, vz
+        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
+        columns[0, 0, i], columns[0, 1, i] = y * uz - z * uy, y * vz - z * vy
+        columns[1, 0, i], columns[1, 1, i] = z * ux - x * uz, z * vx - x * vz
+        columns[2, 0, i], columns[2, 1, i] = x * uy - y * ux, x * vy - y * vx
+    return pixels

@@ -14,7 +14,6 @@ longer meets the plane passes smoothly through infinity.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,7 +74,7 @@ class SurfaceBlock(RobustBlock):
 
     def select(self, rows: NDArray[Any]) -> SurfaceBlock:
         """The block with only some features: a mask or an index array."""
-        other = copy.copy(self)
+        other = self._copy()
         other._replace(**{name: getattr(self, name)[rows] for name in _WIDTHS})
         return other
 

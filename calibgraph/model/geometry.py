@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def invert(T_a_b: Array) -> Array:
-    """(4, 4) T_b_a."""
+    """(4, 4) T_b_a, or (f, 4, 4) of as many."""
     return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
 
 
@@ -98,13 +98,14 @@ def inverse_ranges(rays: Array, planes_lidar_per_m: Array, T_camera_lidar: Array
 
 def angle_deg(R: Array) -> float:
     """Angle of a (3, 3) rotation, degrees; accurate for small angles too."""
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return math.degrees(math.atan2(float(np.linalg.norm(axis)), float(np.trace(R)) - 1.0))
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = R.tolist()
+    sine = math.hypot(r21 - r12, r02 - r20, r10 - r01)
+    return math.degrees(math.atan2(sine, r00 + r11 + r22 - 1.0))
 
 
 def pose_difference(one: Array, two: Array) -> tuple[float, float]:
     """Between two T_camera_lidar: the angle [deg] and the distance of the camera centres [cm]."""
-    meters = float(np.linalg.norm(camera_center(one) - camera_center(two)))
+    meters = math.hypot(*(camera_center(one) - camera_center(two)).tolist())
     return angle_deg(one[:3, :3] @ two[:3, :3].T), 100 * meters
 
 
@@ -181,12 +182,12 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
     return moved
 
 
-def local_coordinates(T_camera_lidar: Array, others: Array) -> Array:
-    """(f, 6) tangents from one T_lidar_camera to others, as GTSAM's ``localCoordinates``.
+def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
+    """(f, 6) tangents from one variable to others, as GTSAM's ``localCoordinates``.
 
     Args:
-        T_camera_lidar: (4, 4).
-        others: (f, 4, 4) T_camera_lidar.
+        T_camera_lidar: (4, 4) of the one, inverted.
+        T_lidar_camera: (f, 4, 4) of the others.
     """
-    tangents: Array = logarithms(T_camera_lidar @ np.linalg.inv(others))
+    tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
     return tangents

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,26 @@ def perturb(
     Raises:
         ValueError: if an angle or length is out of range.
     """
+    return rig.moved_to(
+        perturb_extrinsics(
+            rig.T_camera_lidar,
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+            seed=seed,
+            uniform=uniform,
+        )
+    )
+
+
+def perturb_extrinsics(
+    T_camera_lidar: Mapping[str, Array],
+    *,
+    rotation_deg: float,
+    translation_m: float,
+    seed: int = 0,
+    uniform: bool = False,
+) -> dict[str, Array]:
+    """As :func:`perturb`, of (4, 4) T_camera_lidar by camera."""
     if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
         raise ValueError(
             f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "
@@ -36,11 +57,7 @@ def perturb(
         )
     rng = np.random.default_rng(seed)
     draw = _draw_uniform if uniform else _draw_exact
-    T_camera_lidar = {
-        name: draw(rng, rotation_deg, translation_m) @ camera.T_camera_lidar
-        for name, camera in rig.cameras.items()
-    }
-    return rig.moved_to(T_camera_lidar)
+    return {name: draw(rng, rotation_deg, translation_m) @ T for name, T in T_camera_lidar.items()}
 
 
 def _draw_exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from calibgraph.model.verdict import Check, Status, grade
@@ -41,7 +41,9 @@ class Threshold:
 
     def grade(self, value: float) -> Status:
         """PASS, WARN or FAIL of a value; NaN fails."""
-        return self.check(value).status
+        if self.direction == "at most":
+            return grade(not value <= self.warn, not value <= self.fail)
+        return grade(not value >= self.warn, not value >= self.fail)
 
     def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
         """The check of a value.
@@ -52,10 +54,8 @@ class Threshold:
             advice: likewise.
         """
         build = at_most if self.direction == "at most" else at_least
-        check = build(
-            name or self.name, value, self.warn, self.fail, self.unit, advice or self.advice
-        )
-        return replace(check, kind=self.key)
+        limits = (self.warn, self.fail, self.unit)
+        return build(name or self.name, value, *limits, advice or self.advice, self.key)
 
     def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
         """A check whose sentence, and perhaps status, depend on more than the value."""
@@ -64,7 +64,7 @@ class Threshold:
 
 
 def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
+    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
 ) -> Check:
     """A check that a number is at most its limits; NaN fails.
 
@@ -75,17 +75,18 @@ def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
         fail: the largest value that is not FAIL.
         unit: of the values; "share" is printed in percent.
         advice: what to do if it is above.
+        kind: of the check.
     """
     status = grade(not value <= warn, not value <= fail)
-    return _measured(name, status, "above", value, warn, fail, unit, advice)
+    return _measured(name, status, "above", value, warn, fail, unit, advice, kind)
 
 
 def at_least(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = ""
+    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
 ) -> Check:
     """A check that a number is at least its limits; NaN fails. Arguments as of `at_most`."""
     status = grade(not value >= warn, not value >= fail)
-    return _measured(name, status, "below", value, warn, fail, unit, advice)
+    return _measured(name, status, "below", value, warn, fail, unit, advice, kind)
 
 
 def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
@@ -97,6 +98,7 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
     fail: float,
     unit: str,
     advice: str,
+    kind: str,
 ) -> Check:
     limit = fail if status == "FAIL" else warn
     digits = 3 if status == "PASS" or in_unit(value, unit) != in_unit(limit, unit) else 9
@@ -104,7 +106,7 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
     if status != "PASS":
         text += f" is {side} {in_unit(limit, unit)}"
         text += f": {advice}" if advice else ""
-    return Check(name, status, text, float(value), warn, fail, unit)
+    return Check(name, status, text, float(value), warn, fail, unit, kind)
 
 
 def is_reachable(limit: float, unit: str, direction: Direction) -> bool:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_twist import twist_columns
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.normal_kernel import (
-    combine,
     grouped_gradients,
     solve_reweighted,
     weighted_products,
 )
 from calibgraph.solver.whitening import upper_root
-from factors import unit_diagonal
+from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -59,17 +58,13 @@ class LinearRows:
     Attributes:
         columns: (6 + k + 1, 2, n) whitened derivatives of the pixels by a twist of the pose and by
             the unknowns; the last are the whitened errors, observed minus predicted.
-        frame: (n,) frame numbers; the rows of one frame may share errors.
+        group: (n,) which of the frames each row is of; the rows of one frame may share errors.
+        groups: how many frames.
     """
 
     columns: Array
-    frame: NDArray[np.int64]
-
-    @cached_property
-    def _frames(self) -> tuple[int, NDArray[np.intp]]:
-        """How many frames, and (n,) which of them each row is of."""
-        frames, index = np.unique(self.frame, return_inverse=True)
-        return len(frames), index
+    group: NDArray[np.int64]
+    groups: int
 
     def fit(
         self, unknowns: Sequence[int], *, loss_scale: float | None = None
@@ -80,16 +75,16 @@ class LinearRows:
             unknowns: their numbers, from 0.
             loss_scale: of the Cauchy loss.
         """
-        if len(self.frame) < MIN_ROWS:
+        if len(self.group) < MIN_ROWS:
             return None
         which = np.array([*range(6), *(6 + k for k in unknowns), len(self.columns) - 1])
         solved = self._solve_reweighted(which, loss_scale)
         if solved is None:
             return None
-        solution, normal, weights = solved
-        errors = combine(self.columns, which, np.append(solution, -1.0))
-        sigmas = self._cluster_sigmas(which[:-1], normal, errors, weights)
-        shares = 1 / np.sqrt(np.diag(np.linalg.inv(normal)) * np.diag(normal))
+        solution, normal, weights, errors = solved
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        sigmas = self._cluster_sigmas(which[:-1], normal, inverse, weights, errors)
+        shares = 1 / np.sqrt(np.diag(inverse) * np.diag(normal))
         return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:])
 
     def compensating_twists(self, unknowns: Sequence[int], weights: Array) -> Array:
@@ -112,63 +107,94 @@ class LinearRows:
 
     def _solve_reweighted(
         self, which: NDArray[np.intp], loss_scale: float | None
-    ) -> tuple[Array, Array, Array] | None:
+    ) -> tuple[Array, Array, Array, Array] | None:
         """Iteratively reweighted least squares with a Cauchy loss on the norm of each row.
 
         Returns:
-            (k,) solution; (k, k) normal matrix; (n,) weights. None if the matrix is singular.
+            (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors. None if the
+            matrix is singular.
         """
-        solution, normal, weights, regular = solve_reweighted(
+        solution, normal, weights, errors, regular = solve_reweighted(
             self.columns,
             which,
             0.0 if loss_scale is None else float(loss_scale),
             _LOSS_MEDIANS,
             (_MAX_ITERATIONS, _CONVERGED, _LEAST_SHARE),
         )
-        return (solution, normal, weights) if regular else None
+        return (solution, normal, weights, errors) if regular else None
 
     def _cluster_sigmas(
-        self, which: NDArray[np.intp], normal: Array, errors: Array, weights: Array
+        self, which: NDArray[np.intp], normal: Array, inverse: Array, weights: Array, errors: Array
     ) -> Array:
         """Cluster-robust standard deviations of all unknowns, with frames as clusters.
 
         Args:
             which: (k,) columns.
             normal: (k, k).
-            errors: (2, n).
+            inverse: (k, k) of it.
             weights: (n,).
+            errors: (2, n).
         """
-        count, index = self._frames
-        if count < 2:  # noqa: PLR2004
+        if self.groups < 2:  # noqa: PLR2004
             return np.full(len(normal), np.nan)
-        sums = grouped_gradients(self.columns, which, errors, weights, index, count)
-        scatter = with_pseudo_frames(sums.T @ sums, normal, np.full(len(normal), float(count)))
-        inverse = np.linalg.inv(normal)
+        sums = grouped_gradients(self.columns, which, errors, weights, self.group, self.groups)
+        scatter = with_pseudo_frames(
+            sums.T @ sums, normal, np.full(len(normal), float(self.groups))
+        )
         return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))
 
 
-def linearize(
-    camera: Camera, table: Correspondences, differentiate: Callable[[Array], Array]
-) -> LinearRows:
+def linearize(camera: Camera, table: Correspondences, jacobian_px: Array) -> LinearRows:
     """The rows of a fit of the pose together with further unknowns.
 
     Args:
         camera: lens, and the extrinsic about which is linearised.
         table: the rows of this camera.
-        differentiate: from the (n, 2) predicted pixels to their (n, 2, k) derivatives by the
-            unknowns.
+        jacobian_px: (n, 2, k) derivatives of each row's pixel by the unknowns.
     """
-    pixels, by_twist = twist_columns(camera, table.points_lidar_m)
-    jacobian_px = differentiate(pixels.T)
-    errors = camera.lens.subtract(table.pixels_px, pixels.T)
-    columns = np.concatenate([by_twist, jacobian_px.transpose(2, 1, 0), errors.T[None]])
-    if table.information_px is not None:
-        s00, s01, s11 = upper_root(table.information_px).T
-        columns[:, 0] *= s00
-        if s01.any():
-            columns[:, 0] += s01 * columns[:, 1]
-        columns[:, 1] *= s11
-    return LinearRows(columns, table.frame)
+    numbers, group = np.unique(table.frame, return_inverse=True)
+    root = None if table.information_px is None else upper_root(table.information_px)
+    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px, root)
+    columns = np.empty((6 + jacobian_px.shape[2] + 1, 2, len(table)))
+    columns[6:-1] = jacobian_px.transpose(2, 1, 0)
+    _finish_columns(columns, _fill_pose(columns, camera, block), camera, block)
+    return LinearRows(columns, group, len(numbers))
+
+
+def linearize_block(
+    camera: Camera, block: CameraBlock, unknowns: int, fill: Callable[[Array, Array], None]
+) -> LinearRows:
+    """As :func:`linearize`, of correspondences with their weights.
+
+    Args:
+        camera: as there.
+        block: its correspondences.
+        unknowns: k.
+        fill: given the (2, n) predicted pixels, fills (k, 2, n) derivatives by the unknowns.
+    """
+    columns = np.empty((6 + unknowns + 1, 2, len(block)))  # filled in place: fresh memory is slow
+    pixels = _fill_pose(columns, camera, block.block)
+    fill(pixels, columns[6:-1])
+    _finish_columns(columns, pixels, camera, block.block)
+    group = np.repeat(np.arange(block.frames), np.diff(block.frame_edges))
+    return LinearRows(columns, group, block.frames)
+
+
+def _fill_pose(columns: Array, camera: Camera, block: ProjectionBlock) -> Array:
+    """Fill in the derivatives by the pose; (2, n) predicted pixels."""
+    return fill_twist_columns(camera, block.points_lidar_m, columns[:6])
+
+
+def _finish_columns(columns: Array, pixels: Array, camera: Camera, block: ProjectionBlock) -> None:
+    """Fill in the errors, and whiten all columns."""
+    columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
+    if block.sqrt_information is None:
+        return
+    s00, s01, s11 = block.sqrt_information.T
+    columns[:, 0] *= s00
+    if s01.any():
+        columns[:, 0] += s01 * columns[:, 1]
+    columns[:, 1] *= s11
 
 
 def fit_augmented(
@@ -192,7 +218,7 @@ def fit_augmented(
     """
     if len(table) < MIN_ROWS:
         return None
-    rows = linearize(camera, table, lambda _: jacobian_px)
+    rows = linearize(camera, table, jacobian_px)
     return rows.fit(range(jacobian_px.shape[2]), loss_scale=loss_scale)
 
 
@@ -202,5 +228,5 @@ def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Arr
     By all rows alike, without a robust loss, with the camera at the solution. Arguments as of
     `fit_augmented`.
     """
-    rows = linearize(camera, table, lambda _: jacobian_px)
+    rows = linearize(camera, table, jacobian_px)
     return rows.compensating_twists(range(jacobian_px.shape[2]), np.ones(len(table)))

@@ -18,6 +18,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
+from calibgraph.solver.spread_kernel import median, medians
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
@@ -101,6 +102,10 @@ class CameraBlock:
 
     def select(self, rows: NDArray[Any]) -> CameraBlock:
         """Some rows: a mask or an index array."""
+        if rows.dtype == np.bool_:
+            rows = np.flatnonzero(rows)
+            if len(rows) == len(self.frame):
+                return self
         information = None if self.information is None else self.information[rows]
         return CameraBlock(self.block.select(rows), information, self.frame[rows])
 
@@ -204,7 +209,7 @@ class CameraBlock:
         if root is None:
             return np.full(len(runs), MIN_SIGMA_PX)
         sizes = np.sqrt(root[:, 0] ** 2 + root[:, 2] ** 2)
-        return MIN_SIGMA_PX * np.array([np.median(sizes[slice(*run)]) for run in runs])
+        return np.asarray(MIN_SIGMA_PX * medians(sizes, runs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +269,7 @@ class BlockResiduals:
     def summary(self, scale: ResidualScale) -> Residuals:
         """What the result reports of them."""
         return Residuals(
-            median_px=float(np.median(self.errors_px)),
+            median_px=float(median(self.errors_px)),
             inlier_share=float(np.mean(self.inliers(scale))),
             sigma_px=robust_spread(self.sizes[0]),
             loss_scale_px=scale.loss_scale,

@@ -39,21 +39,20 @@ def project_with_jacobian(camera: Camera, points_lidar_m: Array) -> tuple[Array,
     Returns:
         (n, 2) pixels [px]; (n, 2, 6) their derivatives by rotation [px/rad] and translation [px/m].
     """
-    pixels, columns = twist_columns(camera, points_lidar_m)
+    columns = np.empty((6, 2, len(points_lidar_m)))
+    pixels = fill_twist_columns(camera, points_lidar_m, columns)
     return np.ascontiguousarray(pixels.T), np.ascontiguousarray(columns.transpose(2, 1, 0))
 
 
-def twist_columns(camera: Camera, points_lidar_m: Array) -> tuple[Array, Array]:
-    """As :func:`project_with_jacobian`, by columns: (2, n) pixels, (6, 2, n) derivatives."""
-    T = camera.T_camera_lidar
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    pixels, by_point = camera.lens.project_with_jacobian(points)
-    x, y, z = np.ascontiguousarray(points.T)
-    columns = np.empty((6, 2, len(points)))
-    columns[3:] = by_point.transpose(2, 1, 0)
-    gx, gy, gz = columns[3:]
-    # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
-    columns[0] = y * gz - z * gy
-    columns[1] = z * gx - x * gz
-    columns[2] = x * gy - y * gx
-    return pixels.T, columns
+def fill_twist_columns(camera: Camera, points_lidar_m: Array, columns: Array) -> Array:
+    """As :func:`project_with_jacobian`, by columns.
+
+    Args:
+        camera: as there.
+        points_lidar_m: as there.
+        columns: (6, 2, n), filled with the derivatives.
+
+    Returns:
+        (2, n) pixels.
+    """
+    return camera.lens.fill_twist_columns(camera.T_camera_lidar, points_lidar_m, columns)

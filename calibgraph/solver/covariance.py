@@ -157,7 +157,7 @@ def with_pseudo_frames(
 
 def _along(vectors: Array, matrix: Array) -> Array:
     """(n,) v^T M v of each column v."""
-    return np.asarray(np.einsum("ik,ij,jk->k", vectors, matrix, vectors))
+    return np.asarray((vectors * (matrix @ vectors)).sum(axis=0))
 
 
 def data_sigmas(

@@ -138,8 +138,10 @@ def pose_hessian(
     graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
 ) -> Array:
     """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
-    values = to_values(cameras, T_camera_lidar)
     hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    if not graph.size():
+        return hessian
+    values = to_values(cameras, T_camera_lidar)
     keys = list(values.keys())
     for index in range(graph.size()):
         factor = graph.at(index).linearize(values)

@@ -21,12 +21,13 @@ from scipy.optimize import isotonic_regression
 
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import local_coordinates, retract_all
+from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread
+from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
+from factors import to_runs
 from factors.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -155,33 +156,27 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     first steps the reach is widened, to keep every good frame. A frame with fewer matches than
     others may be farther off, by the noise of its own extrinsic.
     """
-    center = start
-    by_chance = _CHANCE * np.maximum(frames.noise - np.median(frames.noise), 0)
+    center, noise = start, frames.noise
+    T_lidar_camera = invert(frames.T_camera_lidar)
+    by_chance = _CHANCE * np.maximum(noise - np.median(noise), 0)
     for number in range(_STEPS):
-        away, shift = _displacements(frames, center)
+        away = local_coordinates(center, T_lidar_camera)
+        products = (frames.hessians @ away[:, :, None])[:, :, 0]
+        shift = (away * products).sum(axis=1) / frames.counts  # mean squares of whitened pixels
         apart = np.maximum(shift - by_chance, 0)
         if number <= _SEARCH_STEPS:
-            reach = _reach(apart, frames.noise, widened=number == _SEARCH_STEPS)
+            reach = _reach(apart, noise, widened=number == _SEARCH_STEPS)
         near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
         if not near.any():  # no two frames agree
             return start, np.ones(len(near))
-        scatter = max(float(near @ (shift - frames.noise) / near.sum()), 0.0)
+        scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (frames.spreads**2 + frames.counts * scatter / 6)
-        gradient = np.einsum("f,fij,fj->i", weights, frames.hessians, away)
-        step = np.linalg.solve(damped(np.einsum("f,fij->ij", weights, frames.hessians)), gradient)
+        hessian = np.tensordot(weights, frames.hessians, 1)
+        step = np.linalg.solve(damped(hessian), weights @ products)
         center = retract_all(center[None], step[None])[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()
-
-
-def _displacements(frames: FrameFits, center: Array) -> tuple[Array, Array]:
-    """(f, 6) tangents from a T_camera_lidar to the frames' own; (f,) mean squares in pixels.
-
-    The latter are of whitened pixels.
-    """
-    away = local_coordinates(center, frames.T_camera_lidar)
-    return away, np.einsum("fi,fij,fj->f", away, frames.hessians, away) / frames.counts
 
 
 def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
@@ -192,7 +187,8 @@ def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
     unless the third is far from them.
     """
     least = math.sqrt(float(np.median(noise)))
-    two, three = (max(math.sqrt(_quantile_of_nearest(shift, fewest=n)), least) for n in (2, 3))
+    nearest_first = np.sort(shift)
+    two, three = (max(math.sqrt(_of_nearest(nearest_first, fewest=n)), least) for n in (2, 3))
     if not widened:
         return _SEARCH_REACH * two
     nearest = two if three > _FAR_THIRD * two else three
@@ -214,10 +210,15 @@ def densest_start(block: _Candidates, frames: FrameFits, T_camera_lidar: Array) 
     return candidates[block.best_candidate(candidates, scale_px)]
 
 
-def _quantile_of_nearest(shift: Array, *, fewest: int) -> float:
-    """The displacement within which the nearest share of the frames lies, or the fewest of them."""
+def _of_nearest(shift: Array, *, fewest: int) -> float:
+    """The displacement within which the nearest share of the frames lies, or the fewest of them.
+
+    Args:
+        shift: (f,) ascending.
+        fewest: frames.
+    """
     nearest = max(fewest, int(np.ceil(_NEAREST_SHARE * len(shift))))
-    return float(np.sort(shift)[nearest - 1])
+    return float(shift[nearest - 1])
 
 
 def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
@@ -233,15 +234,22 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     order = known[_order_of(confidence[known])]
     if count_groups(len(order)) == 1 or confidence[order[0]] == confidence[order[-1]]:
         return np.ones(len(sizes))
-    groups = np.array_split(order, count_groups(len(order)))
-    spreads = np.array([robust_spread(sizes[group]) for group in groups])
-    counts = np.array([len(group) for group in groups])
-    middles = np.array([np.median(confidence[group]) for group in groups])
+    groups = _equal_runs(len(order), count_groups(len(order)))
+    spreads = robust_spreads(sizes[order], groups)
+    counts, ordered = groups[:, 1] - groups[:, 0], confidence[order]
+    middles = (ordered[(groups.sum(axis=1) - 1) // 2] + ordered[groups.sum(axis=1) // 2]) / 2
     falling = falling_logarithms(spreads, counts)
     learnt = np.empty(len(sizes))
     for rows in (order, np.flatnonzero(~np.isfinite(sizes))):  # in order, places are found faster
         learnt[rows] = np.exp(np.interp(confidence[rows], middles, falling))
     return np.asarray(learnt / np.median(learnt))
+
+
+def _equal_runs(count: int, parts: int) -> NDArray[np.int64]:
+    """(parts, 2) runs of so many rows, the longer ones first, which differ by one at most."""
+    sizes = np.full(parts, count // parts)
+    sizes[: count % parts] += 1
+    return to_runs(np.concatenate([[0], np.cumsum(sizes)]))
 
 
 def count_groups(matches: int) -> int:

@@ -16,20 +16,28 @@ _TILE = 256  # rows whose columns stay in the first-level cache
 _FAST = {"reassoc", "contract", "nsz"}
 
 
-@compiled(fastmath=_FAST)
-def combine(columns, which, factors):  # type: ignore[no-untyped-def]
-    """(2, n) sum of some columns times their factors."""
-    n = columns.shape[2]
-    out = np.zeros((2, n))
+@compiled(fastmath=_FAST | {"nnan"})
+def _move(columns, which, factors, errors):  # type: ignore[no-untyped-def]
+    """Replace (2, n) errors by the sum of some columns times their factors.
+
+    Returns:
+        The largest change of one of them.
+    """
+    k, n = len(which), columns.shape[2]
+    moved, largest = np.empty(_TILE), 0.0
     for start in range(0, n, _TILE):
         end = min(start + _TILE, n)
-        for j in range(len(which)):
-            factor, column = factors[j], columns[which[j]]
-            for part in range(2):
-                source, target = column[part, start:end], out[part, start:end]
+        for part in range(2):
+            moved[:] = 0.0
+            for j in range(k):
+                factor, source = factors[j], columns[which[j]][part, start:end]
                 for i in range(end - start):
-                    target[i] += factor * source[i]
-    return out
+                    moved[i] += factor * source[i]
+            target = errors[part, start:end]
+            for i in range(end - start):
+                largest = max(largest, abs(moved[i] - target[i]))
+                target[i] = moved[i]
+    return largest
 
 
 @compiled(fastmath=_FAST)
@@ -60,13 +68,13 @@ def weighted_products(columns, which, weights):  # type: ignore[no-untyped-def]
 
 
 @compiled(fastmath=_FAST)
-def _reweighted_products(columns, which, errors, scale):  # type: ignore[no-untyped-def]
-    """As ``weighted_products``, with the Cauchy weights of (2, n) errors; and (n,) weights."""
+def _cauchy_weights(errors, scale):  # type: ignore[no-untyped-def]
+    """(n,) weights of (2, n) errors."""
     u, v, over = errors[0], errors[1], 1.0 / (scale * scale)
     weights = np.empty(len(u))
     for i in range(len(u)):
         weights[i] = 1.0 / (1.0 + over * (u[i] * u[i] + v[i] * v[i]))
-    return weighted_products(columns, which, weights), weights
+    return weights
 
 
 @compiled()
@@ -126,44 +134,40 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
             share of an unknown's column that is no combination of those before it.
 
     Returns:
-        (k,) solution; (k, k) normal matrix; (n,) weights; whether that matrix is regular.
+        (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors at the solution; whether
+        that matrix is regular.
     """
     k, n = len(which) - 1, columns.shape[2]
-    factors, step = np.zeros(k + 1), np.empty(k)
+    factors = np.zeros(k + 1)
     factors[k] = -1.0
     products, weights, squares = np.zeros((k + 1, k + 1)), np.zeros(n), np.empty(n)
     units, root, solution = np.empty(k), np.empty((k, k)), np.empty(k)
+    errors = -columns[which[k]]
     for _ in range(limits[0]):
-        errors = combine(columns, which, factors)
         scale = loss_scale
         if scale == 0.0:
             for i in range(n):
                 squares[i] = errors[0, i] * errors[0, i] + errors[1, i] * errors[1, i]
             scale = medians * math.sqrt(median(squares)) + 1e-12
-        products, weights = _reweighted_products(columns, which, errors, scale)
+        weights = _cauchy_weights(errors, scale)
+        products = weighted_products(columns, which, weights)
         if not _factorize(products, limits[2], units, root):
-            return factors[:k], products[:k, :k], weights, False
+            return factors[:k], products[:k, :k], weights, errors, False
         _solve(products, units, root, solution)
-        for j in range(k):
-            step[j] = solution[j] - factors[j]
-            factors[j] = solution[j]
-        moved = combine(columns, which[:k], step)
-        largest = 0.0
-        for i in range(n):
-            largest = max(largest, abs(moved[0, i]), abs(moved[1, i]))
-        if largest < limits[1] * scale:
+        factors[:k] = solution
+        if _move(columns, which, factors, errors) < limits[1] * scale:
             break
-    return factors[:k], products[:k, :k], weights, True
+    return factors[:k], products[:k, :k], weights, errors, True
 
 
 @compiled()
 def grouped_gradients(columns, which, errors, weights, group, count):  # type: ignore[no-untyped-def]
     """(count, k) sums of weighted columns times (2, n) errors, over the rows of each group."""
-    out, gradient = np.zeros((count, len(which))), np.empty(len(weights))
-    for a in range(len(which)):
-        column = columns[which[a]]
-        for i in range(len(weights)):
-            gradient[i] = weights[i] * (column[0, i] * errors[0, i] + column[1, i] * errors[1, i])
-        for i in range(len(weights)):
-            out[group[i], a] += gradient[i]
+    k = len(which)
+    out = np.zeros((count, k))
+    for i in range(len(weights)):
+        u, v = weights[i] * errors[0, i], weights[i] * errors[1, i]
+        own = out[group[i]]
+        for a in range(k):
+            own[a] += columns[which[a], 0, i] * u + columns[which[a], 1, i] * v
     return out

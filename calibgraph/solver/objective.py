@@ -148,7 +148,9 @@ class Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
         pairs = tuple(pair for pair in self.pairs if {pair.a, pair.b} <= self.blocks.keys())
-        return replace(self, rig=rig, T_hat={}, pairs=pairs)
+        free = replace(self, rig=rig, T_hat={}, pairs=pairs)
+        free.__dict__["gate_hessian"] = self.gate_hessian  # the same gate
+        return free
 
     def minimize(self, start: Transforms, scales: Scales) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""

@@ -15,7 +15,7 @@ from factors.compiled import compiled
 
 _MANTISSA = 52  # bits
 _LEAST, _LARGEST = 1023 - 16, 1023 + 16  # biased exponents: smaller and larger values share a bin
-_FINE_FROM = 8192  # values from which an octave has 256 bins instead of 16
+_BITS = ((16384, 8), (2048, 6), (0, 4))  # from so many values on, an octave has 2^bits bins
 
 
 @compiled()
@@ -84,7 +84,10 @@ def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped
 @compiled()
 def _bin(values):  # type: ignore[no-untyped-def]
     """The finite values by bins, where these begin, and the bins' bits."""
-    bits = 8 if len(values) >= _FINE_FROM else 4
+    bits = 0
+    for least, some in _BITS:
+        if len(values) >= least:
+            bits = max(bits, some)
     edges = np.empty((((_LARGEST - _LEAST) << bits) + 3), dtype=np.int64)
     work = np.empty(len(values))
     _fill_bins(values, bits, work, edges)
@@ -92,10 +95,25 @@ def _bin(values):  # type: ignore[no-untyped-def]
 
 
 @compiled()
+def quantile(values, share):  # type: ignore[no-untyped-def]
+    """A quantile of (n,) values of zero and more, interpolated; NaN without any finite ones."""
+    work, edges, bits = _bin(values)
+    return _quantile_below(work, edges, bits, math.inf, share)
+
+
+@compiled()
 def median(values):  # type: ignore[no-untyped-def]
     """The median of (n,) values of zero and more; NaN without any that are finite."""
-    work, edges, bits = _bin(values)
-    return _quantile_below(work, edges, bits, math.inf, 0.5)
+    return quantile(values, 0.5)
+
+
+@compiled()
+def medians(values, runs):  # type: ignore[no-untyped-def]
+    """(r,) :func:`median` of the values in each of (r, 2) runs."""
+    out = np.empty(len(runs))
+    for i in range(len(runs)):
+        out[i] = median(values[runs[i, 0] : runs[i, 1]])
+    return out
 
 
 @compiled()

@@ -161,7 +161,8 @@ def aggregate_frames(
         frames: how many there are in all.
         config: ``aggregate``.
     """
-    kept = poses[are_near_median(poses)]
+    near = are_near_median(poses)
+    kept = poses if near.all() else poses[near]
     return CameraStage1(
         T_camera_lidar=aggregate(kept, config.aggregate) if len(kept) else None,
         by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.perturbation import perturb_extrinsics
 from calibgraph.model.verdict import Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock, camera_block
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
 
@@ -56,7 +57,7 @@ def _held_out_ratio(
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])
     held_out = np.concatenate([errors[0][~even], errors[1][even]])
-    return float(np.median(held_out) / max(np.median(fitted), np.finfo(float).tiny))
+    return float(median(held_out) / max(median(fitted), np.finfo(float).tiny))
 
 
 def restart_checks(evidence: Evidence) -> Checks:
@@ -64,9 +65,11 @@ def restart_checks(evidence: Evidence) -> Checks:
     if not evidence.fitted_blocks:
         return {}
     solution = evidence.of_correspondences.solution
-    rig = solution.solved_rig
+    T_camera_lidar = solution.T_camera_lidar
     displaced = [
-        perturb(rig, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed).T_camera_lidar
+        perturb_extrinsics(
+            T_camera_lidar, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
+        )
         for seed in range(RESTARTS)
     ]
     ends = _ends_from(solution, displaced)
@@ -75,9 +78,7 @@ def restart_checks(evidence: Evidence) -> Checks:
     checks = {}
     for camera in evidence.fitted_blocks:
         differences = [
-            (180.0, np.inf)
-            if end is None
-            else pose_difference(end[camera], solution.T_camera_lidar[camera])
+            (180.0, np.inf) if end is None else pose_difference(end[camera], T_camera_lidar[camera])
             for end in ends
         ]
         degrees, centimetres = np.max(differences, axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -241,11 +241,7 @@ class Evidence:
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
-        curvature = curvature_at(
-            replace(free, gated=solution.inliers.gated),
-            T_camera_lidar,
-            hessians_of_blocks(blocks, T_camera_lidar),
-        )
+        curvature = curvature_at(free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar))
         scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
         if scatter is None:
             return DataOnly(T_camera_lidar, None)

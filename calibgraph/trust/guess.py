@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
 from calibgraph.model.verdict import Check
+from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -55,31 +56,34 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
 def swap_checks(evidence: Evidence) -> Checks:
     """Whether a camera and another ended where the other's guess is."""
     guesses, results = evidence.guess.T_camera_lidar, evidence.solution.T_camera_lidar
-    return {name: compare_with_other_guesses(name, guesses, results) for name in results}
+    distances = distances_between(guesses, results)
+    return {name: compare_with_other_guesses(name, distances) for name in results}
+
+
+def distances_between(
+    guesses: Mapping[str, Array], results: Mapping[str, Array]
+) -> dict[tuple[str, str], float]:
+    """Between each guess and each result, (4, 4) T_camera_lidar, by the names of both cameras."""
+    return {(one, two): _distance(guesses[one], results[two]) for one in results for two in results}
 
 
 def compare_with_other_guesses(
-    camera: str, guesses: Mapping[str, Array], results: Mapping[str, Array]
+    camera: str, distances: Mapping[tuple[str, str], float]
 ) -> list[Check]:
     """The distance of two cameras to each other's guess over that to their own, at the least.
 
     Args:
         camera: its name; all others are tried.
-        guesses: (4, 4) T_camera_lidar, by camera.
-        results: (4, 4) T_camera_lidar, by camera.
+        distances: of the guess of one camera and the result of another, by both names.
 
     Returns:
         One check; none for a single camera.
     """
-
-    def distance(*pairs: tuple[str, str]) -> float:
-        each = [_distance(guesses[one], results[two]) for one, two in pairs]
-        return limit("swap_slack") + sum(each)
-
+    slack = limit("swap_slack")
     ratios = {
-        other: distance((other, camera), (camera, other))
-        / distance((camera, camera), (other, other))
-        for other in results
+        other: (slack + distances[other, camera] + distances[camera, other])
+        / (slack + distances[camera, camera] + distances[other, other])
+        for other, _ in distances
         if other != camera
     }
     if not ratios:
@@ -99,7 +103,7 @@ def point_distance_checks(evidence: Evidence) -> Checks:
     """Whether the points can be in metres."""
     row = threshold("point_distance")
     return {
-        name: [row.check(float(np.median(_lengths(block.block.points_lidar_m))))]
+        name: [row.check(float(median(_lengths(block.block.points_lidar_m))))]
         for name, block in evidence.solution.objective.blocks.items()
     }
 

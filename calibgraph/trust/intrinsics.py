@@ -7,17 +7,16 @@ check is how far the camera moves when it is set free, and with which significan
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, grade
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.augmented_fit import AugmentedFit, linearize
+from calibgraph.solver.augmented_fit import AugmentedFit, linearize_block
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_twist import twisted
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -35,6 +34,7 @@ _LIMITS = {
 
 _SHAPES = ("aspect ratio", "skew")
 
+_FIELDS = 6  # of displacements, see ``fill_displacement_fields``
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 
@@ -96,13 +96,10 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
     """
     some = block.select_evenly(_MAX_MATCHES)
     errors_px, in_front = some.errors_px(camera.T_camera_lidar)
-    table = some.select(in_front).as_table(camera="camera")
     # At the predicted pixels: at the observed ones, a focal length doubled and all points in the
     # centre would explain everything.
-    rows = linearize(
-        camera,
-        table,
-        lambda predicted: np.concatenate([*displacement_fields(camera, predicted).values()], 2),
+    rows = linearize_block(
+        camera, some.select(in_front), _FIELDS, partial(fill_displacement_fields, camera)
     )
     unknowns = {
         "focal length": (0,),
@@ -112,34 +109,36 @@ def check_intrinsics(camera: Camera, block: CameraBlock, scale: ResidualScale) -
         "skew": (5,),
     }
     checks = [
-        _check_freed(_free(name, fit, camera))
+        _check_freed(_free(name, fit))
         for name, numbers in unknowns.items()
         if (fit := rows.fit(numbers, loss_scale=scale.loss_scale))
     ]
     inside = (errors_px <= scale.gate_px)[in_front].astype(np.float64)
     twists = rows.compensating_twists(unknowns["focal length"], inside)
-    return [*checks, _check_sensitivity(camera, twists[:, 0])]
+    return [*checks, _check_sensitivity(twists[:, 0])]
 
 
-def displacement_fields(camera: Camera, pixels_px: Array) -> dict[str, Array]:
-    """Per lens parameter, (n, 2, k) displacement [px] of (n, 2) pixels per unit of its values."""
+def fill_displacement_fields(camera: Camera, pixels_px: Array, fields: Array) -> None:
+    """Displacements [px] of pixels per unit of each lens parameter's values.
+
+    Args:
+        camera: its lens.
+        pixels_px: (2, n).
+        fields: (6, 2, n), filled: of the focal length, the principal point (two), the distortion,
+            the aspect ratio and the skew.
+    """
     k = camera.intrinsics_px
-    off = pixels_px - [k.cx, k.cy]
-    ones, zeros = np.ones(len(off)), np.zeros(len(off))
-    centre = np.stack([np.stack([ones, zeros], 1), np.stack([zeros, ones], 1)], axis=2)
-    radius = np.hypot(off[:, 0] / k.fx, off[:, 1] / k.fy)[:, None]
-    return {
-        "focal length": off[:, :, None],
-        "principal point": centre,
-        "distortion": (off * radius**2)[:, :, None],
-        "aspect ratio": (off * [0.5, -0.5])[:, :, None],
-        "skew": np.stack([off[:, 1] * k.fx / k.fy, zeros], axis=1)[:, :, None],
-    }
+    u, v = np.subtract(pixels_px, [[k.cx], [k.cy]], out=fields[0])
+    fields[1, 0], fields[1, 1], fields[2, 0], fields[2, 1] = 1.0, 0.0, 0.0, 1.0
+    np.multiply(fields[0], (u / k.fx) ** 2 + (v / k.fy) ** 2, out=fields[3])
+    np.multiply(fields[0], [[0.5], [-0.5]], out=fields[4])
+    fields[5, 0], fields[5, 1] = v * (k.fx / k.fy), 0.0
 
 
-def _free(name: str, fit: AugmentedFit, camera: Camera) -> FreedParameter:
-    T = camera.T_camera_lidar
-    degrees, centimetres = pose_difference(twisted(T, fit.twist), T)
+def _free(name: str, fit: AugmentedFit) -> FreedParameter:
+    """exp(twist) turns the camera by its rotation's length, and moves the centre by the other's."""
+    degrees = float(np.degrees(np.linalg.norm(fit.twist[:3])))
+    centimetres = 100 * float(np.linalg.norm(fit.twist[3:]))
     return FreedParameter(name, fit.values, fit.sigmas, degrees, centimetres)
 
 
@@ -172,18 +171,16 @@ def _check_freed(freed: FreedParameter) -> Check:
     return replace(worse, kind=f"lens_{freed.name.replace(' ', '_')}")
 
 
-def _check_sensitivity(camera: Camera, twist: Array) -> Check:
+def _check_sensitivity(twist: Array) -> Check:
     """How far a focal length wrong by one percent, easily overlooked, moves the camera.
 
     Args:
-        camera: at the solution.
         twist: (6,) by which its pose compensates for a unit relative change of the focal length.
     """
-    row, T = threshold("focal_sensitivity"), camera.T_camera_lidar
+    row = threshold("focal_sensitivity")
     if np.isnan(twist).any():
         return row.describe(np.nan, "WARN", "matches within the gate do not determine the camera")
-    centimetres = pose_difference(twisted(T, 0.01 * twist), T)[1]
-    return row.check(centimetres)
+    return row.check(0.01 * 100 * float(np.linalg.norm(twist[3:])))
 
 
 def _describe(freed: FreedParameter) -> str:

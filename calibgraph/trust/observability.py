@@ -12,6 +12,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.spread_kernel import quantile
 
 Array = NDArray[np.float64]
 
@@ -107,8 +108,8 @@ def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float
     x, y, z = (
         block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
     )
-    near, far = np.quantile(np.sqrt(x * x + y * y + z * z), [0.02, 0.98])
-    return float(near), float(far)
+    distances = np.sqrt(x * x + y * y + z * z)
+    return float(quantile(distances, 0.02)), float(quantile(distances, 0.98))
 
 
 def prior_shares(solution: Solution, robust_hessians: Mapping[str, Array]) -> dict[str, float]:

@@ -12,6 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -78,14 +79,15 @@ def contributions(
         other: of kinds without.
     """
     return {
-        kind: float(np.dot(steps(severity), weights.get(kind, other)))
+        kind: sum(map(mul, steps(severity), weights.get(kind, other)))
         for kind, severity in severities.items()
     }
 
 
-def steps(severity: float) -> Array:
-    """(3,) how far a severity is through PASS, WARN and FAIL, each 0 to 1."""
-    return np.clip(severity - np.arange(3.0), 0.0, 1.0)
+def steps(severity: float) -> tuple[float, float, float]:
+    """How far a severity is through PASS, WARN and FAIL, each 0 to 1."""
+    through = [min(max(severity - status, 0.0), 1.0) for status in range(3)]
+    return through[0], through[1], through[2]
 
 
 def probability_beyond(covariance: Array | None, tolerance: tuple[float, float]) -> float:

@@ -62,7 +62,7 @@ def test_rows_made_once_give_the_fit_of_every_choice_of_unknowns() -> None:
         points_lidar_m=points,
         information_px=np.column_stack([root[:, 0], 0.3 * np.ones(400), root[:, 1]]),
     )
-    rows = linearize(camera, table, lambda _: columns)
+    rows = linearize(camera, table, columns)
     for choice in ([0], [1, 2], [0, 1, 2]):
         alone = fit_augmented(camera, table, columns[:, :, choice])
         together = rows.fit(choice)
@@ -78,6 +78,6 @@ def test_no_pose_compensates_where_too_few_rows_determine_one(inside: int) -> No
     table = Correspondences.from_arrays(
         camera="front", frame=0, pixels_px=pixels, points_lidar_m=points
     )
-    rows = linearize(camera, table, lambda predicted: jacobian[:, :, :1])
+    rows = linearize(camera, table, jacobian[:, :, :1])
     weights = (np.arange(50) < inside).astype(np.float64)
     assert np.isnan(rows.compensating_twists((0,), weights)).all()

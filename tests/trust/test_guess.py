@@ -7,7 +7,11 @@ import numpy as np
 import calibgraph
 from calibgraph import MatcherErrors, Rig, solve
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.trust.guess import compare_with_guess, compare_with_other_guesses
+from calibgraph.trust.guess import (
+    compare_with_guess,
+    compare_with_other_guesses,
+    distances_between,
+)
 from tests.trust.conftest import named, simulated
 
 
@@ -31,21 +35,18 @@ def test_swapped_cameras_are_named(pair: Rig) -> None:
     swapped = dict(zip(right, reversed(right.values()), strict=True))
     guess = calibgraph.perturb(pair, rotation_deg=2, translation_m=0.2, seed=3).T_camera_lidar
     for name in right:
-        assert [check.status for check in compare_with_other_guesses(name, guess, right)] == [
-            "PASS"
-        ]
-        (check,) = compare_with_other_guesses(name, guess, swapped)
+        (check,) = compare_with_other_guesses(name, distances_between(guess, right))
+        assert check.status == "PASS"
+        (check,) = compare_with_other_guesses(name, distances_between(guess, swapped))
         assert check.status != "PASS" and "are their images swapped" in check.text
     # Lenses of one housing, and results that are off by more than these are apart.
     near = {"left": np.eye(4), "right": np.eye(4)}
     near["right"][0, 3] = 0.02
     for results in (near, dict(zip(near, reversed(near.values()), strict=True))):
-        assert [check.status for check in compare_with_other_guesses("left", near, results)] == [
-            "PASS"
-        ]
-    assert (
-        compare_with_other_guesses("left", {"left": guess["left"]}, {"left": right["left"]}) == []
-    )
+        (check,) = compare_with_other_guesses("left", distances_between(near, results))
+        assert check.status == "PASS"
+    alone = distances_between({"left": guess["left"]}, {"left": right["left"]})
+    assert compare_with_other_guesses("left", alone) == []
 
 
 def test_points_in_millimetres_fail(pair: Rig) -> None:

@@ -118,7 +118,6 @@ def test_points_that_no_focal_length_explains_fail_without_a_fault(pair: Rig) ->
         assert result.verdict.status == "FAIL"
 
 
-def test_a_fit_that_moves_the_camera_beyond_any_length_is_measured(pair: Rig) -> None:
-    camera = pair.cameras["left"]
+def test_a_fit_that_moves_the_camera_beyond_any_length_is_measured() -> None:
     fit = AugmentedFit(np.array([0, 0, 0, 0, 0, 1e8]), np.ones(1), np.ones(1), np.ones(1))
-    assert _free("focal length", fit, camera).moved_cm == pytest.approx(1e10)
+    assert _free("focal length", fit).moved_cm == pytest.approx(1e10)

@@ -54,7 +54,7 @@ def test_a_finding_without_a_number_is_in_the_middle_of_its_status() -> None:
 
 
 def test_steps_go_through_pass_warn_and_fail() -> None:
-    assert [steps(s).tolist() for s in (0.0, 0.5, 1.25, 3.0)] == [
+    assert [list(steps(s)) for s in (0.0, 0.5, 1.25, 3.0)] == [
         [0, 0, 0], [0.5, 0, 0], [1, 0.25, 0], [1, 1, 1],
     ]  # fmt: skip
 
