@@ -12,6 +12,7 @@ from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
+from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import tie_cameras
@@ -89,7 +90,8 @@ def check(
         lidar = None
     finally:
         full.release()
-    return Audit(cameras, lidar, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds)
+    numbers = tolerance_deg, tolerance_cm, len(data.frames), watch.seconds
+    return Audit(cameras, lidar, *numbers, package_versions()).of_recording(deployed, data)
 
 
 def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
