@@ -7,6 +7,9 @@ options=(--tolerance-deg "$INPUT_TOLERANCE_DEG" --tolerance-cm "$INPUT_TOLERANCE
 if [ -n "${INPUT_FRAMES:-}" ]; then
   options+=(--frames "$INPUT_FRAMES")
 fi
+if [ -n "${INPUT_PAGE:-}" ]; then
+  options+=(--page "$INPUT_PAGE")
+fi
 datasets=()
 while IFS= read -r line; do
   if [ -n "$line" ]; then

@@ -8,6 +8,7 @@ from .audit import LidarAudit as LidarAudit
 from .audit import Trend as Trend
 from .audit import check as check
 from .audit import drift as drift
+from .audit.page import write_audit_report as write_audit_report
 from .doctor import Diagnosis as Diagnosis
 from .doctor import Finding as Finding
 from .doctor import diagnose as diagnose

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
-from calibgraph.audit.judgement import Tolerance, judge_camera, judge_lidar
+from calibgraph.audit.judgement import Tolerance, has_too_few_frames, judge_camera, judge_lidar
+from calibgraph.audit.kept_frames import keep_frames
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.errors import CorrespondenceError
@@ -12,6 +13,7 @@ from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
+from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import tie_cameras
@@ -76,7 +78,7 @@ def check(
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
     deployed = rig.model_copy(update={"relative_poses": ()})
     data = _open(dataset, deployed, full)
-    matching = Matching(data, deployed, full, _config(full, seed), report)
+    matching = Matching(keep_frames(data), deployed, full, _config(full, seed), report)
     try:
         run = tie_cameras(match_from_deployed(matching, watch), report)
         with watch("checks"):
@@ -89,7 +91,8 @@ def check(
         lidar = None
     finally:
         full.release()
-    return Audit(cameras, lidar, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds)
+    numbers = tolerance_deg, tolerance_cm, len(data.frames), watch.seconds
+    return Audit(cameras, lidar, *numbers, package_versions()).of_recording(deployed, data)
 
 
 def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
@@ -121,24 +124,27 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
     """Per camera, why its measurement cannot be trusted; empty if it can."""
     parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
     z_scores = evidence.findings.z_score
-    of_frames = _doubts_by_frames(run, progress)
-    return {
+    found = {
         name: _doubt_by_z_score(z_scores.get(name))
         or "; ".join(check.text for check in checks if check.status == "FAIL")
-        or of_frames.get(name, "")
         for name, checks in concatenate(parts, evidence.cameras).items()
     }
+    open_ = [n for n, doubt in found.items() if not (doubt or has_too_few_frames(evidence, n))]
+    return found | _doubts_by_frames(run, open_, progress)
 
 
-def _doubts_by_frames(run: MatchingRun, progress: Progress) -> dict[str, str]:
+def _doubts_by_frames(
+    run: MatchingRun, cameras: Collection[str], progress: Progress
+) -> dict[str, str]:
     """Per camera, the frames that fit another extrinsic: something moved during the recording.
 
     The solve leaves such frames out, and what is left agrees. Of matchers that may use what these
     scores do not, nothing is concluded.
     """
-    if not run.matcher.fails_on_images:
+    if not run.matcher.fails_on_images or not cameras:
         return {}
     rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
+    rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
     return {

@@ -153,8 +153,7 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     deviation = _deviation(evidence, name)
     if covariance is None:
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
-    block = evidence.solution.inliers.blocks.get(name)
-    if block is not None and block.frames < ENOUGH_FRAMES:
+    if has_too_few_frames(evidence, name):
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
@@ -165,6 +164,13 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         reason += SINGLE_CAMERA
     smallest = detectable(sigma, quantiles.significant)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
+
+
+def has_too_few_frames(evidence: Evidence, name: str) -> bool:
+    """Whether a camera's error bar is none of its own frames, so that nothing can be told."""
+    block = evidence.solution.inliers.blocks.get(name)
+    few = block is not None and block.frames < ENOUGH_FRAMES
+    return few and evidence.covariance_of(name) is not None
 
 
 def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun, RoundSummary
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Status
 from calibgraph.progress import Progress, Stopwatch
 from calibgraph.rounds import find_same_places, summarize_round
 from calibgraph.solver.joint import solve_joint
@@ -46,7 +48,7 @@ class Matching:
 
 
 def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
-    """The tracking rounds; where they do not settle within their reach, again after the first.
+    """As few rounds as settle: the last tracking round, all of them, or after the first round.
 
     Raises:
         CorrespondenceError: if no camera has enough correspondences.
@@ -54,8 +56,22 @@ def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
     tracking = matching.matcher.tracking_rounds
     if not tracking:
         return _run_rounds(matching, range(matching.matcher.rounds), watch)
+    if len(tracking) > 1 and (found := _confirm(matching, tracking[-1], watch)) is not None:
+        return found
     run = _run_rounds(matching, tracking, watch)
     return run if _has_settled(run) else _run_rounds(matching, (0, *tracking), watch)
+
+
+def _confirm(matching: Matching, last: int, watch: Stopwatch) -> MatchingRun | None:
+    """The last round alone, if it ends where it begins: at the deployed rig, as a converged run.
+
+    None if a camera moves by more than a last round may, or has a low z-score or too few matches.
+    """
+    try:
+        run = _run_rounds(matching, (last,), watch)
+    except CorrespondenceError:
+        return None
+    return run if not run.solution.held and _has_settled(run, still="PASS") else None
 
 
 def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> MatchingRun:
@@ -72,17 +88,23 @@ def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> 
     return MatchingRun(data, matcher, matching.deployed, table, solution, tuple(summaries), watch)
 
 
-def _has_settled(run: MatchingRun) -> bool:
-    """Whether every camera ended within reach, with a good z-score, after a short last step."""
+def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:
+    """Whether every camera ended within reach, with a good z-score, after a short last step.
+
+    Args:
+        run: of the rounds.
+        still: the worst grade of the last step.
+    """
     z_scores, last = run.correspondences.findings.z_score, run.rounds[-1]
     deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
     for name, T in deployed.items():
         degrees, centimetres = pose_difference(ended[name], T)
-        still = (
+        steps = {
             threshold("last_round_rotation").grade(last[name]["moved_deg"]),
             threshold("last_round_translation").grade(last[name]["moved_cm"]),
-        )
+        }
         good = threshold("z_score").grade(z_scores.get(name, 0.0)) == "PASS"
-        if not good or "FAIL" in still or degrees > _REACH_DEG or centimetres > _REACH_CM:
+        far = degrees > _REACH_DEG or centimetres > _REACH_CM
+        if not good or far or not steps <= {"PASS", still}:
             return False
     return True

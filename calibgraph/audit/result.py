@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
+from calibgraph.model.rig import Rig
 
 Array = NDArray[np.float64]
 AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
@@ -69,6 +73,10 @@ class Audit:
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
+        versions: of this package and the libraries that matter; empty if a server has measured.
+        deployed: the rig that was compared; None if only the numbers are known.
+        shown: the frame that a page shows, in the middle of the recording; None if unknown.
+        recording: the sources of the frames.
     """
 
     cameras: Mapping[str, CameraAudit]
@@ -77,6 +85,21 @@ class Audit:
     tolerance_cm: float
     frames: int
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    deployed: Rig | None = None
+    shown: Frame | None = None
+    recording: tuple[str, ...] = ()
+
+    def of_recording(self, deployed: Rig, data: Dataset) -> Audit:
+        """The audit with what its page shows besides its numbers.
+
+        Args:
+            deployed: the rig that was compared.
+            data: the frames that it was compared with.
+        """
+        middle = data.frames[len(data.frames) // 2]
+        sources = tuple(str(folder) for folder in data.folders)
+        return replace(self, deployed=deployed, shown=middle, recording=sources)
 
     @property
     def status(self) -> AuditStatus:
@@ -138,6 +161,13 @@ def by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
         f"{name}_deg": None if twist is None else np.degrees(twist[:3]).tolist(),
         f"{name}_cm": None if twist is None else (100.0 * twist[3:]).tolist(),
     }
+
+
+def twist_cells(twist: Array | None, form: str) -> list[str]:
+    """Six numbers in degrees and centimetres; dashes if there are none."""
+    if twist is None:
+        return ["-"] * 6
+    return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]
 
 
 def audit_of(summary: Mapping[str, Any]) -> Audit:

@@ -87,7 +87,7 @@ def _options(
 
 COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     calibrate: outputs.result,
-    check: outputs.nothing,
+    check: outputs.page_of_audit,
     drift: outputs.plot_of_drift,
     match: outputs.table,
     solve: outputs.result,

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from pathlib import Path
+
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from calibgraph.audit import Audit, CameraAudit
+from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
 from calibgraph.cli.terminal import print_plain
 
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red"}
 
 
-def print_audit(console: Console, audit: Audit) -> None:
-    """Print the status with its reasons, and the deviations per axis."""
+def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
+    """Print the status with its reasons, the deviations per axis, and what was written."""
     console.print(f"[bold {_COLOURS[audit.status]}]{audit.status}[/]", highlight=False)
     if audit.lidar is not None:
         print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
@@ -31,7 +32,8 @@ def print_audit(console: Console, audit: Audit) -> None:
     )
     time = f"{sum(audit.timings_s.values()):.1f} s"
     text = f"tolerance {audit.tolerance_deg:g} deg, {audit.tolerance_cm:g} cm per axis"
-    print_plain(console, f"{text}; {audit.frames} frames; {time}; nothing was written")
+    written = "nothing was written" if page is None else f"{page}: written"
+    print_plain(console, f"{text}; {audit.frames} frames; {time}; {written}")
 
 
 def audit_table(audit: Audit) -> Table:
@@ -46,15 +48,8 @@ def audit_table(audit: Audit) -> Table:
 
 def _rows(camera: CameraAudit) -> list[tuple[str, list[str]]]:
     rows = (
-        ("deviation", camera.deviation, "+.2f"),
+        ("deviation", camera.deviation, "+z.2f"),
         ("sigma", camera.sigma, ".2f"),
         ("detectable", camera.detectable, ".2f"),
     )
     return [(label, twist_cells(twist, form)) for label, twist, form in rows]
-
-
-def twist_cells(twist: NDArray[np.float64] | None, form: str) -> list[str]:
-    """Six numbers in degrees and centimetres; dashes if there are none."""
-    if twist is None:
-        return ["-"] * 6
-    return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]

@@ -28,11 +28,16 @@ def check(
     ] = 10.0,
     frames: FramesOption = None,
     seed: SeedOption = 0,
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Show the answer on a page, with pictures."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
 
-    Compares it with images and clouds of a recent recording, per camera and axis. Writes no files.
+    Compares it with images and clouds of a recent recording, per camera and axis. Writes no file
+    but the page, if one is wanted.
     """
     from calibgraph.audit import check
     from calibgraph.audit.judgement import Tolerance
@@ -42,14 +47,14 @@ def check(
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
-    data = dataset_from(dataset, rig, frames)
+    data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
     if remote.SERVER.get() is not None:
         wanted = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "seed": seed}
-        audit = audit_of(remote.check(rig, data, frames, wanted))
+        audit = audit_of(remote.check(rig, data, frames, wanted)).of_recording(deployed, data)
     else:
         with progress_bar() as progress:
             audit = check(
-                load_rig(rig),
+                deployed,
                 data,
                 tolerance_deg=tolerance_deg,
                 tolerance_cm=tolerance_cm,
@@ -57,6 +62,10 @@ def check(
                 seed=seed,
                 progress=progress,
             )
+    if page is not None:
+        from calibgraph.audit.page import write_audit_report
+
+        write_audit_report(audit, page)
     if as_json:
         from calibgraph.audit import audit_summary
         from calibgraph.report.as_json import print_json
@@ -65,5 +74,5 @@ def check(
     else:
         from calibgraph.cli.audit_table import print_audit
 
-        print_audit(terminal(), audit)
+        print_audit(terminal(), audit, page)
     raise typer.Exit(_EXIT_CODES[audit.status])

@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from calibgraph.audit import Drift
-from calibgraph.cli.audit_table import twist_cells
+from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
 from calibgraph.cli.terminal import print_plain
 

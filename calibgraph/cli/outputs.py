@@ -14,7 +14,7 @@ Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
 
 TABLE_SUFFIXES = (".parquet", ".csv")
-WRITTEN = ("out", "rerun", "mcap", "plot")
+WRITTEN = ("out", "rerun", "mcap", "plot", "page")
 """The options that name what a command writes."""
 
 
@@ -56,6 +56,15 @@ def plot_of_drift(given: Given) -> list[Output]:
     from calibgraph.audit.drift_plot import output_of_drift_plot
 
     return [] if given["plot"] is None else [output_of_drift_plot(given["plot"])]
+
+
+def page_of_audit(given: Given) -> list[Output]:
+    """The page of an audit, if it is wanted."""
+    if given["page"] is None:
+        return []
+    from calibgraph.audit.page import output_of_audit_report
+
+    return [output_of_audit_report(given["page"])]
 
 
 def fleet_page(given: Given) -> list[Output]:

@@ -53,12 +53,20 @@ is_calibration_file = starts_with(f"format: {CALIBRATION_FORMAT}\n".encode())
 """Whether a file is a result's, by its first line."""
 
 
-def is_report(path: Path) -> bool:
-    """Whether a file is a page of a report, by its head."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return PAGE_MARK in file.read(_HEAD_BYTES)
+def has_page_mark(mark: bytes) -> Callable[[Path], bool]:
+    """Whether a file is a page with a mark in its head."""
+
+    def is_marked(path: Path) -> bool:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return mark in file.read(_HEAD_BYTES)
+
+    return is_marked
+
+
+is_report = has_page_mark(PAGE_MARK)
+"""Whether a file is a page of a report, by its head."""
 
 
 def written_by(command: str) -> Callable[[Path], bool]:

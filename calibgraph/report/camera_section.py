@@ -14,7 +14,7 @@ from calibgraph.model.verdict import Verdict
 from calibgraph.report import plots
 from calibgraph.report.check_table import CheckRow, check_rows
 from calibgraph.report.diagrams import Diagram, camera_diagrams
-from calibgraph.report.page_overlays import Overlays
+from calibgraph.report.page_overlays import Overlays, width_on_page
 from calibgraph.report.reprojection_errors import BeforeAfter
 from calibgraph.report.worked_point import WorkedPoint, worked_point
 
@@ -39,7 +39,6 @@ _COUNT_MEANINGS = {
     "frames_without_pnp": "frames in which PnP found no pose",
 }
 _FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped", "used")
-_OVERLAY_HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _AXES = (
     ("rotation x (pitch)", "deg", "pitch_deg"),
     ("rotation y (yaw)", "deg", "yaw_deg"),
@@ -122,7 +121,7 @@ def camera_section(
         no_error_bar=_why_no_error_bar(result, name),
         numbers=_overview_cells(result, name, moved),
         overlays=overlays,
-        overlay_width_px=round(_OVERLAY_HEIGHT_PX * camera.width_px / camera.height_px),
+        overlay_width_px=width_on_page(camera),
         diagrams=camera_diagrams(result, name, errors),
         axes=_axes(result, name, moved),
         counts=_counts(result.counts.get(name, {})),

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import yaml
-from jinja2 import Environment, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from calibgraph.files import write_text
@@ -63,11 +62,7 @@ def report_html(result: Calibration) -> str:
     ]
     verdicts = {name: result.camera_verdicts[name] for name in result.rig.cameras}
     weaknesses = {name: result.weaknesses.get(name, ()) for name in result.rig.cameras}
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = files("calibgraph.report").joinpath("page.html.j2").read_text("utf-8")
-    return environment.from_string(template).render(
+    return load_template("page.html.j2").render(
         result=result,
         cameras=cameras,
         usable=_CAN_I_USE_IT[result.verdict.label],
@@ -82,6 +77,24 @@ def report_html(result: Calibration) -> str:
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
+
+
+def load_template(name: str, package: str = "calibgraph.report") -> Template:
+    """A page's template, which may use the report's: ``base.html.j2``, ``macros.html.j2``.
+
+    Args:
+        name: of its file.
+        package: that the file is in.
+    """
+    loader = ChoiceLoader([PackageLoader(each, "") for each in (package, "calibgraph.report")])
+    environment = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
 
 
 def _accuracy(result: Calibration) -> str:

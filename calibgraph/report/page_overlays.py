@@ -24,9 +24,10 @@ from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionError
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_BYTES = 3_000_000  # of all pictures together; base64 adds a third
+PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _PICTURES = 4  # per camera
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
+_HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _DARKENED = 0.45
 _MAX_GATES = 2.0  # larger residuals have the last colour
 _LEVELS = 24
@@ -101,8 +102,8 @@ def _overlays(
 ) -> Overlays:
     cameras = result.initial_rig.cameras[name], result.rig.cameras[name]
     image = load_image(Path(shown["images"][name]), cameras[1])
-    budget = _BYTES // (_PICTURES * len(result.rig.cameras))
-    by_depth = [_by_depth(image, cloud, camera, budget) for camera in cameras]
+    budget = PICTURES_BYTES // (_PICTURES * len(result.rig.cameras))
+    by_depth = [draw_by_depth(image, cloud, camera, budget) for camera in cameras]
     by_residual = scale = None
     if errors is not None:
         scale = residual_scale(errors.after.gate_px)
@@ -113,9 +114,22 @@ def _overlays(
     return Overlays(frame, (by_depth[0], by_depth[1]), by_residual, depth_scale(), scale)
 
 
-def _by_depth(image: Image, cloud: Array, camera: Camera, budget: int) -> str:
+def draw_by_depth(image: Image, cloud: Array, camera: Camera, budget: int) -> str:
+    """A data URI of a cloud on an image, coloured by distance.
+
+    Args:
+        image: (height, width, 3) BGR.
+        cloud: (n, 3) [m] in the LiDAR frame.
+        camera: lens and extrinsic.
+        budget: most bytes of the JPEG.
+    """
     drawn = _shrink(draw_points(image, cloud, camera), _SIZES[0][0])
     return to_jpeg(drawn, budget)
+
+
+def width_on_page(camera: Camera) -> int:
+    """At most so wide are a camera's pictures shown [px]."""
+    return round(_HEIGHT_PX * camera.width_px / camera.height_px)
 
 
 def _by_residual(image: Image, errors: ReprojectionErrors, budget: int) -> str:

@@ -54,7 +54,7 @@ def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoi
             f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
             f"residual {used.sizes_px[row]:.2f} px"
         )
-    return WorkedPoint(_matrix(T), _steps(camera, point) + matched, _inverse(T), origin)
+    return WorkedPoint(matrix_text(T), _steps(camera, point) + matched, _inverse(T), origin)
 
 
 def _steps(camera: Camera, point: Array) -> str:
@@ -88,7 +88,8 @@ def _vector(values: Array) -> str:
     return f"({', '.join(f'{value:.3f}' for value in values)})"
 
 
-def _matrix(T: Array) -> str:
+def matrix_text(T: Array) -> str:
+    """The rows of a matrix, a line each."""
     return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
 
 

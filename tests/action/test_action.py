@@ -143,7 +143,8 @@ def test_a_status_is_an_exit_code_outputs_a_summary_and_an_annotation(
 ) -> None:
     programs = stand_in(tmp_path, status, found)
     ran = run_check(tmp_path, Path("my rig.yaml"), "one\ntwo\n", programs,
-                    frames="0:9", tolerance_cm="5", fail_on_cannot_tell=fail)  # fmt: skip
+                    frames="0:9", tolerance_cm="5", page="a page.html",
+                    fail_on_cannot_tell=fail)  # fmt: skip
     assert ran.code == code
     assert ran.outputs["status"] == status
     assert json.loads(ran.outputs["json"])["cameras"]["left_1"]["status"] == status
@@ -156,7 +157,7 @@ def test_a_status_is_an_exit_code_outputs_a_summary_and_an_annotation(
     assert ran.stdout.count("\n") == 1
     assert (tmp_path / "arguments").read_text().splitlines() == [
         "-m", "calibgraph", "check", "--tolerance-deg", "0.5", "--tolerance-cm", "5", "--json",
-        "--frames", "0:9", "--", "my rig.yaml", "one", "two",
+        "--frames", "0:9", "--page", "a page.html", "--", "my rig.yaml", "one", "two",
     ]  # fmt: skip
 
 

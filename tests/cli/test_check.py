@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from calibgraph import load_rig
+from calibgraph import Audit, CameraAudit, load_rig
+from calibgraph.audit import audit_summary
+from calibgraph.cli import remote
 from tests.audit.test_check import motion, with_camera_moved
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
@@ -56,6 +58,37 @@ def test_one_frame_exits_with_3(call: Call) -> None:
     assert code == 3
     assert err.startswith("CANNOT TELL\n")
     assert "record" in err
+
+
+def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:
+    page, other, recording = tmp_path / "check.html", tmp_path / "report.html", tmp_path / "sample"
+    given = ("check", REFERENCE, SAMPLE, "--frames", "0", "--page")
+    for _ in range(2):
+        code, _, err = call(*given, page)
+        assert code == 3
+        assert err.rstrip().endswith(f"{page}: written")
+    assert '<strong class="big">CANNOT TELL</strong>' in page.read_text()
+    other.write_text('<meta name="generator" content="calibgraph">')
+    assert "was not written by calibgraph check" in error_line(*call(*given, other))
+    assert ".html" in error_line(*call(*given, tmp_path / "check.txt"))
+    (recording / "cameras").mkdir(parents=True)
+    found = call("check", REFERENCE, recording, "--page", recording / "cameras" / "check.html")
+    assert "is among the data of" in error_line(*found)
+
+
+def test_a_server_measures_and_the_page_is_made_here(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("front_left", "front_right", "left")
+    audit = Audit({name: CameraAudit("OK", "nothing") for name in names}, None, 0.5, 10.0, 6)
+    monkeypatch.setattr(remote, "check", lambda *_: audit_summary(audit))
+    page = tmp_path / "check.html"
+    given = ("--server", "http://127.0.0.1:1", "check", REFERENCE, SAMPLE, "--page", page)
+    code, _, err = call(*given)
+    assert (code, err.rstrip().endswith(f"{page}: written")) == (0, True)
+    text = page.read_text()
+    assert "a server has measured" in text
+    assert text.count("data:image/jpeg") == 3
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,156 @@
+"""The page of an audit: everything of it, nothing fetched, whatever is missing."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Audit, CameraAudit, LidarAudit
+from calibgraph.audit.page_camera import measured_camera
+from calibgraph.audit.page_chart import charts_of
+from calibgraph.audit.result import audit_of, audit_summary
+from calibgraph.model.geometry import twist_between
+from tests.audit.test_check import TRUTH
+from tests.conftest import ROOT, SAMPLE
+from tests.report.conftest import read_page
+from tests.report.test_browser import render
+
+DEVIATION = np.array([0.001, 0.02, 0, 0.01, 0, -0.02])
+SIGMA = np.repeat([0.001, 0.01], 3)
+WRONG = CameraAudit("WRONG", "turned about y (yaw)", DEVIATION, SIGMA, 5 * SIGMA, 30.0)
+RIGHT = CameraAudit("OK", "no significant deviation", 0.1 * DEVIATION, SIGMA, 5 * SIGMA, 30.0)
+FEW = CameraAudit("CANNOT TELL", "too few frames: record at least 5", DEVIATION)
+NOTHING = CameraAudit("CANNOT TELL", "0 usable correspondences")
+
+
+def audit_with(*cameras: CameraAudit, lidar: LidarAudit | None = None) -> Audit:
+    """Of the first cameras of the sample, with its images and clouds."""
+    names = [*TRUTH.cameras][: len(cameras)]
+    rig = TRUTH.model_copy(update={"cameras": {name: TRUTH.cameras[name] for name in names}})
+    found = dict(zip(names, cameras, strict=True))
+    audit = Audit(found, lidar, 0.5, 10.0, 6, {"match": 1.5}, {"numpy": "2.0"})
+    return audit.of_recording(rig, calibgraph.load_dataset(SAMPLE, rig))
+
+
+def page_of(audit: Audit, folder: Path) -> str:
+    """The text of its page, which refers to nothing outside of itself."""
+    return read_page(calibgraph.write_audit_report(audit, folder / "check.html"))
+
+
+def test_a_wrong_camera_is_shown_beside_what_was_measured(tmp_path: Path) -> None:
+    text = page_of(audit_with(WRONG, RIGHT), tmp_path)
+    assert "<title>WRONG - deployed calibration of front_left, front_right</title>" in text
+    assert '<strong class="big">WRONG</strong>' in text
+    assert "No. front_left is not where the calibration has it." in text
+    assert "Fasten what is loose, and calibrate again" in text
+    assert text.count("<svg") == 4
+    assert text.count('class="beyond" x=') == 1
+    for name in ("front_left", "front_right"):
+        assert f'alt="{name} deployed, coloured by distance"' in text
+        assert f'alt="{name} measured, coloured by distance"' in text
+    assert "p_camera = T_camera_lidar" in text and "T_deployed_now = exp(xi)" in text
+    assert f"<td>{SAMPLE}</td>" in text
+    assert "1.50" in text and "<td>2.0</td>" in text
+
+
+def test_what_to_record_is_named_and_no_error_bar_is_drawn(tmp_path: Path) -> None:
+    text = page_of(audit_with(FEW, FEW, NOTHING), tmp_path)
+    assert "<b>front_left, front_right</b>: too few frames: record at least 5" in text
+    assert "This recording cannot tell for front_left, front_right, left." in text
+    assert "Record again" in text
+    assert "Unknown for front_left, front_right, left." in text
+    assert 'class="error"' not in text and 'class="detectable"' not in text
+    assert text.count("<svg") == 4
+    assert "deployed; nothing was measured" in text
+    assert text.count("data:image/jpeg") == 5
+
+
+def test_a_single_camera_that_is_right(tmp_path: Path) -> None:
+    text = page_of(audit_with(RIGHT), tmp_path)
+    assert "Yes. No axis of any camera deviates by more than the tolerance." in text
+    assert "of 1 camera to" in text
+    assert "a turn of any camera about an axis by 0.29 deg, or a shift along one by 5.0 cm" in text
+
+
+def test_the_lidar_is_named_with_its_motion(tmp_path: Path) -> None:
+    lidar = LidarAudit("turned about z by +1.00 deg", np.array([0, 0, 0.0175, 0, 0, 0]), SIGMA)
+    text = page_of(audit_with(WRONG, WRONG, lidar=lidar), tmp_path)
+    assert "No. LiDAR is not where the calibration has it." in text
+    assert "<b>LiDAR</b>: turned about z by +1.00 deg; all cameras agree on it" in text
+    assert "Motion of the LiDAR" in text
+
+
+def test_names_and_reasons_are_escaped(tmp_path: Path) -> None:
+    name = "<b>x&\"y'"
+    hostile = replace(WRONG, reason="<script>alert(1)</script>")
+    rig = TRUTH.model_copy(update={"cameras": {name: TRUTH.cameras["left"]}})
+    audit = replace(audit_with(WRONG), cameras={name: hostile}, deployed=rig)
+    text = page_of(audit, tmp_path)
+    assert "<b>x" not in text and "<script>alert" not in text
+    assert "&lt;b&gt;x&amp;&#34;y&#39;" in text
+
+
+def test_numbers_alone_make_a_page_without_pictures(tmp_path: Path) -> None:
+    text = page_of(audit_of(audit_summary(audit_with(WRONG, NOTHING))), tmp_path)
+    assert "<b>Pictures are left out:</b> the audit names no recording." in text
+    assert "Unknown: a server has measured." in text
+    assert "data:image" not in text
+    assert text.count("<svg") == 2
+
+
+def test_images_that_are_gone_are_named(tmp_path: Path) -> None:
+    audit = audit_with(WRONG)
+    assert audit.shown is not None
+    gone = replace(audit, shown=replace(audit.shown, cloud_path=tmp_path / "gone.npy"))
+    assert "gone.npy: no such file; check the path." in page_of(gone, tmp_path)
+
+
+def test_the_measured_camera_deviates_as_was_measured() -> None:
+    deployed = TRUTH.cameras["left"]
+    measured = measured_camera(deployed, WRONG)
+    assert measured is not None
+    found = twist_between(deployed.T_camera_lidar, measured.T_camera_lidar)
+    np.testing.assert_allclose(found, DEVIATION, atol=1e-12)
+    assert measured_camera(deployed, NOTHING) is None
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 0.5, 7.0, 300.0])
+def test_bars_are_to_scale_and_inside_the_axis(tolerance: float) -> None:
+    for chart in charts_of(WRONG, tolerance, tolerance):
+        half = chart.tolerance[1] - chart.middle
+        unit = 180 / np.pi if chart.title.startswith("rotation") else 100.0
+        rows = DEVIATION[:3] if chart.title.startswith("rotation") else DEVIATION[3:]
+        for bar, value in zip(chart.bars, rows * unit, strict=True):
+            assert bar.width == pytest.approx(abs(value) * half / tolerance)
+            assert bar.error is not None
+            ends = (bar.x, bar.x + bar.width, *bar.error, *bar.detectable)
+            assert chart.left < min(ends) and max(ends) < chart.right
+        assert 3 <= len(chart.ticks) <= 5
+        assert all(chart.left <= x <= chart.right for x, _ in chart.ticks)
+    assert charts_of(NOTHING, tolerance, tolerance) == ()
+
+
+def test_a_browser_shows_it_without_errors_and_without_a_network(tmp_path: Path) -> None:
+    page_of(audit_with(WRONG, FEW, RIGHT), tmp_path)
+    rendering = render(tmp_path / "check.html", tmp_path)
+    assert (rendering.errors, rendering.requests) == ([], [])
+    red = (rendering.picture[:400, :60] == (0x20, 0x00, 0xB0)).all(axis=2)  # BGR: WRONG
+    assert red.sum() > 500
+    assert rendering.picture[600:].std() > 20  # not blank: charts and overlays
+
+
+def test_the_template_is_part_of_the_package() -> None:
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert content["tool"]["setuptools"]["package-data"]["calibgraph.audit"] == ["page.html.j2"]
+
+
+def test_links_lead_to_the_cameras(tmp_path: Path) -> None:
+    text = page_of(audit_with(WRONG, FEW), tmp_path)
+    for anchor in re.findall(r'href="#([^"]+)"', text):
+        assert f'id="{anchor}"' in text
