@@ -1,6 +1,6 @@
 """How often ``check`` finds what has moved, and how often something where nothing has.
 
-    python -m benchmarks.accuracy.audit [--scenes 24] [--repeats 3]
+    python -m benchmarks.accuracy.audit [--scenes 48] [--repeats 3]
     python -m benchmarks.accuracy.audit --summary out/audit.jsonl
 
 Recordings with KITTI's calibration, and rendered streets with a LiDAR that errs: two frames of each
@@ -55,7 +55,7 @@ def main() -> None:
         work = partial(run_case, sources=sources, stated={})
         records = ledger.run(right_cases(options.scenes), work, out=options.out, jobs=options.jobs)
         work = partial(run_case, sources=sources, stated=dict(stated_by(records)))
-        cases = displaced_cases(ring(options.scenes), options.repeats)
+        cases = displaced_cases(ring(), options.repeats)
         records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
     ledger.publish_cases("accuracy.audit", report(records), records, record=options.record)
 
@@ -65,7 +65,7 @@ def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenes", type=int, default=24, help="rendered scenes, a sensor each")
+    parser.add_argument("--scenes", type=int, default=48, help="right ones, a sensor each")
     parser.add_argument("--repeats", type=int, default=3, help="of each axis and size of a camera")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)

@@ -27,6 +27,7 @@ ONE_RIG = ("05", "06", "07", "08")
 ENOUGH = ("00", "05", "kitti_raw_0005")
 """Of enough frames for an answer, and not longer than needed."""
 
+DISPLACED_SCENES = 24
 STREETS, FRAMES, STEP_M = 3, 2, 8.0
 SENSOR_ERRORS = 1.0
 _SEED = 4000
@@ -77,11 +78,11 @@ class Sources:
         return load_rig(path)
 
 
-def ring(scenes: int) -> list[str]:
-    """Data to go round in: three scenes, one recording, and so on; of odd length."""
+def ring() -> list[str]:
+    """Data to displace, to go round in: three scenes, one recording, and so on; of odd length."""
     names = []
-    for number in range(scenes):
+    for number in range(DISPLACED_SCENES):
         names.append(f"scene_{number}")
         if number % 3 == 2:
             names.append(ENOUGH[number // 3 % len(ENOUGH)])
-    return names if len(names) % 2 else names[:-1]
+    return names[:-1]
