@@ -18,13 +18,18 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.uncertainty import ERRORS, stereo
+from benchmarks.accuracy.uncertainty import (
+    ERRORS,
+    displaced,
+    draw_shared,
+    state_shared,
+    stereo,
+)
 from benchmarks.tables import Table, add_record_option, publish
-from calibgraph import Calibration, Drift, Rig, drift, simulate_correspondences, solve
+from calibgraph import Calibration, Drift, drift, simulate_correspondences, solve
 from calibgraph.audit.judgement import CAMERA_AXES
 
 Array = NDArray[np.float64]
@@ -32,7 +37,6 @@ Rng = np.random.Generator
 
 KINDS = ("sharp", "shared", "common")
 FRAMES, MATCHES = 10, 100
-SHARED = np.repeat([np.radians(0.09), 0.02], 3)
 SIZES = {"deg": (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), "cm": (1.0, 2.0, 5.0, 10.0, 20.0)}
 TOLERANCE = {"tolerance_deg": 1e-6, "tolerance_cm": 1e-6}
 COUNTS = (2, 3, 5, 10)
@@ -87,12 +91,6 @@ def fill_pool(kind: str, size: int) -> list[Calibration]:
     ]
 
 
-def draw_shared(rng: Rng) -> tuple[Array, Array]:
-    """(6,) motion of the cloud and (2, 6) of the cameras' matches, each with half the variance."""
-    half = SHARED / np.sqrt(2)
-    return half * rng.standard_normal(6), half * rng.standard_normal((2, 6))
-
-
 def solve_one(kind: str, shared: tuple[Array, Array], seed: int) -> Calibration:
     """The result of one recording, of which the guess is the truth."""
     truth = stereo()
@@ -101,20 +99,8 @@ def solve_one(kind: str, shared: tuple[Array, Array], seed: int) -> Calibration:
         seen, frames=FRAMES, matches=MATCHES, errors=ERRORS, depth_m=None, seed=seed
     )
     if kind != "sharp":
-        found = {"systematic_rotation_rad": SHARED[0], "systematic_translation_m": SHARED[3]}
-        table = replace(table, metadata={**table.metadata, **found})
+        table = state_shared(table)
     return replace(solve(truth, table), correspondences=None)
-
-
-def displaced(rig: Rig, cloud: Array, cameras: Array) -> Rig:
-    """The rig with its cloud and its cameras displaced."""
-    T_cloud = gtsam.Pose3.Expmap(cloud).matrix()
-    return rig.moved_to(
-        {
-            name: gtsam.Pose3.Expmap(xi).matrix() @ T @ T_cloud
-            for (name, T), xi in zip(rig.T_camera_lidar.items(), cameras, strict=True)
-        }
-    )
 
 
 def choose(pool: Sequence[Calibration], count: int, rng: Rng) -> list[Calibration]:
