@@ -17,6 +17,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.grid import frame_edges
 
 Numbers = NDArray[np.int64]
+Hashes = NDArray[np.uint64]
 
 SAME_PLACE = "same_place"
 """Key of a table's metadata: lists of frame numbers, those of one place each."""
@@ -24,10 +25,11 @@ SAME_PLACE = "same_place"
 PLACES = "places"
 """The same of frames near each other, which show the same objects."""
 
-REPEATED_SHARE = 0.5  # of a frame's matches, equal to the last bit; independent ones have none
+REPEATED_SHARE = 0.5
+"""Of a frame's points, that are those of another one, to the last bit: two scans have none in
+common."""
 
-_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9,
-                 0xD6E8FEB86659FD93, 0xFF51AFD7ED558CCD], dtype=np.uint64)  # fmt: skip
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
 def number_by_place(metadata: Mapping[str, Any], frame: Numbers) -> Numbers:
@@ -78,7 +80,10 @@ def _lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:
 
 
 def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:
-    """(n,) frame numbers, with those of one place or of equal content of a camera replaced.
+    """(n,) frame numbers, with those of one place or of one cloud of a camera replaced.
+
+    Frames are of one cloud if more than half of their points are the same: copies of a frame, also
+    where they were matched anew.
 
     Args:
         table: sorted by camera and frame.
@@ -87,18 +92,42 @@ def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:
     if not len(table):
         return table.frame
     edges = frame_edges(camera, table.frame)
-    numbers, of_group = table.frame[edges[:-1]], camera[edges[:-1]]
-    content = np.add.reduceat(row_hashes(table.pixels_px, table.points_lidar_m), edges[:-1])
-    keys = np.column_stack([of_group.astype(np.uint64), np.diff(edges).astype(np.uint64), content])
-    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    same = np.repeat(numbers[first[group.ravel()]], np.diff(edges))
-    return number_by_place(table.metadata, same)
+    hashes = point_hashes(table.points_lidar_m) + camera.astype(np.uint64) * _ODD[0]
+    numbers = table.frame[edges[:-1]]
+    if _have_repeats(hashes):
+        numbers = numbers[_first_of_same_content(hashes, np.diff(edges))]
+    return number_by_place(table.metadata, np.repeat(numbers, np.diff(edges)))
 
 
-def row_hashes(pixels_px: NDArray[np.float64], points_lidar_m: NDArray[np.float64]) -> Any:
-    """(n,) uint64 of the bits of each correspondence."""
-    mixed = np.zeros(len(pixels_px), dtype=np.uint64)
-    for column, odd in zip((*pixels_px.T, *points_lidar_m.T), _ODD, strict=True):
+def _have_repeats(hashes: Hashes) -> bool:
+    ordered = np.sort(hashes)
+    return bool((ordered[1:] == ordered[:-1]).any())
+
+
+def _first_of_same_content(hashes: Hashes, counts: Numbers) -> Numbers:
+    """(f,) for each frame the first one that has more than half of the rows of either in common.
+
+    Args:
+        hashes: (n,) of the rows, frame by frame.
+        counts: (f,) of rows.
+    """
+    frame = np.repeat(np.arange(len(counts)), counts)
+    _, first, row = np.unique(hashes, return_index=True, return_inverse=True)
+    earlier = frame[first[row]]  # that has this row, too
+    pairs, common = np.unique(
+        np.column_stack([earlier, frame])[earlier < frame], axis=0, return_counts=True
+    )
+    alike = common > REPEATED_SHARE * counts[pairs].min(axis=1)
+    found = np.arange(len(counts))
+    for one, other in pairs[alike]:
+        found[other] = min(found[other], found[one])
+    return found
+
+
+def point_hashes(points_lidar_m: NDArray[np.float64]) -> Hashes:
+    """(n,) uint64 of the bits of each point."""
+    mixed = np.zeros(len(points_lidar_m), dtype=np.uint64)
+    for column, odd in zip(points_lidar_m.T, _ODD, strict=True):
         mixed += np.ascontiguousarray(column, dtype=np.float64).view(np.uint64) * odd
         mixed ^= mixed >> np.uint64(31)
-    return mixed * _ODD[0]
+    return np.asarray(mixed * _ODD[0])

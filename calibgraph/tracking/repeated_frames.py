@@ -1,16 +1,16 @@
-"""A camera's matches that are those of its last frame: a frozen sensor, which tells nothing new."""
+"""A camera's matches with the points of its last frame: of a frozen LiDAR, nothing new."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.repeats import REPEATED_SHARE, row_hashes
+from calibgraph.solver.repeats import REPEATED_SHARE, point_hashes
 from calibgraph.tracking.state import State
 
 
 def without_repeats(state: State, table: Correspondences) -> Correspondences:
-    """The table without cameras most of whose last matches are in it again, to the last bit.
+    """The table without cameras most of whose last points are in it again, to the last bit.
 
     Args:
         state: before the frame.
@@ -28,11 +28,11 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
 
 
 def _repeats(state: State, camera: int, table: Correspondences) -> bool:
-    """Whether a camera's matches are those of the last frame that it has any of."""
+    """Whether a camera's points are those of the last frame that it has any of."""
     last = _last_hashes(state, camera)
     if last is None or not len(table):
         return False
-    again = np.isin(last, row_hashes(table.pixels_px, table.points_lidar_m))
+    again = np.isin(last, point_hashes(table.points_lidar_m))
     return bool(again.mean() > REPEATED_SHARE)
 
 
@@ -41,9 +41,9 @@ def _last_hashes(state: State, camera: int) -> np.ndarray | None:
     waiting = state.cameras[camera].waiting
     if waiting:
         rows = waiting[-1].of_camera(state.names[camera])
-        return np.asarray(row_hashes(rows.pixels_px, rows.points_lidar_m))
+        return point_hashes(rows.points_lidar_m)
     for frame in reversed(state.live_frames):
         if camera in frame.raw:
             block = frame.raw[camera].block
-            return np.asarray(row_hashes(block.pixels_px, block.points_lidar_m))
+            return point_hashes(block.points_lidar_m)
     return None

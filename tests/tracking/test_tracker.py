@@ -337,15 +337,18 @@ def test_a_change_at_any_live_epoch_can_be_followed(pair: Rig, live_epochs: int)
         handle_small_step(state, DetectedStep(epoch.frames[0].number, frozenset([0])))
 
 
-def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig) -> None:
-    """The same matches under new frame numbers: before, the error bar shrank to nothing."""
-    tables = drive(lambda _: pair, 12)
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig, noise_px: float) -> None:
+    """The same cloud under new frame numbers: before, the error bar shrank to nothing."""
+    tables, rng = drive(lambda _: pair, 12), np.random.default_rng(0)
     tracker, updates = tracked(pair, tables)
     before = updates[-1].covariance["left"]
     assert before is not None
     for number in range(12, 80):
-        again = replace(tables[-1], frame=np.full(len(tables[-1]), number, dtype=np.int64))
-        update = tracker.update(again)
+        frame = np.full(len(tables[-1]), number, dtype=np.int64)
+        noise = noise_px * rng.standard_normal(tables[-1].pixels_px.shape)
+        pixels_px = tables[-1].pixels_px + noise
+        update = tracker.update(replace(tables[-1], frame=frame, pixels_px=pixels_px))
     after = update.covariance["left"]
     assert after is not None
     assert (np.diag(after) > 0.9 * np.diag(before)).all()  # 68 new frames would leave a sixth
@@ -354,6 +357,6 @@ def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig) -> None:
 
 
 def moved_on(table: Correspondences, number: int) -> Correspondences:
-    """The same matches a hundredth of a pixel further: another frame."""
+    """Matches of points a tenth of a millimetre further: another frame."""
     frame = np.full(len(table), number, dtype=np.int64)
-    return replace(table, frame=frame, pixels_px=table.pixels_px + 0.01)
+    return replace(table, frame=frame, points_lidar_m=table.points_lidar_m + 1e-4)

@@ -43,6 +43,21 @@ def test_copies_of_a_frame_count_as_one_frame(pair: Rig) -> None:
     assert "they count as one frame each" in reasons
 
 
+def test_a_cloud_that_was_matched_again_counts_once(pair: Rig) -> None:
+    """Ten copies of each of three frames, with matches of their own, of most points."""
+    table, rng = simulated(pair, frames=3), np.random.default_rng(0)
+    parts = []
+    for copy in range(10):
+        noise = 0.1 * rng.standard_normal(table.pixels_px.shape)
+        again = replace(table, frame=table.frame + 3 * copy, pixels_px=table.pixels_px + noise)
+        parts.append(again.select(rng.random(len(table)) < 0.9))
+    result, alone = solve(pair, concatenate(parts)), solve(pair, table)
+    for name in pair.cameras:
+        assert result.counts[name]["frames"] == 3 and result.counts[name]["repeated_frames"] == 27
+        sigmas = [np.sqrt(np.diag(each.covariance[name])) for each in (result, alone)]
+        assert (sigmas[0] > 0.5 * sigmas[1]).all()  # as independent frames: a third and less
+
+
 def test_copies_do_not_narrow_the_error_bar(pair: Rig) -> None:
     table = simulated(pair, frames=8)
     last = table.select(table.frame == 7)

@@ -20,7 +20,7 @@ from calibgraph.solver.frame_fits import FrameFits, fit_alone
 from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.repeats import row_hashes
+from calibgraph.solver.repeats import point_hashes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.stage1 import frames_from
 from calibgraph.solver.whitening import sqrt_information
@@ -268,5 +268,5 @@ def _frames_of(rows: Correspondences) -> CameraFrames:
     if not len(rows):
         none = np.empty(0, np.int64)
         return CameraFrames(none, none, none.astype(np.uint64), informed)
-    contents = np.add.reduceat(row_hashes(rows.pixels_px, rows.points_lidar_m), edges[:-1])
+    contents = np.add.reduceat(point_hashes(rows.points_lidar_m), edges[:-1])
     return CameraFrames(rows.frame[edges[:-1]], np.diff(edges), contents, informed)
