@@ -124,18 +124,19 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
     """Per camera, why its measurement cannot be trusted; empty if it can."""
     parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
     z_scores = evidence.findings.z_score
-    found = {
-        name: _doubt_by_z_score(z_scores.get(name))
-        or "; ".join(check.text for check in checks if check.status == "FAIL")
+    disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
+    open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
+    of_frames = _doubts_by_frames(run, open_, progress)
+    return {
+        name: disagree[name]
+        or "; ".join(of_frames.get(name, []) + [c.text for c in checks if c.status == "FAIL"])
         for name, checks in concatenate(parts, evidence.cameras).items()
     }
-    open_ = [n for n, doubt in found.items() if not (doubt or has_too_few_frames(evidence, n))]
-    return found | _doubts_by_frames(run, open_, progress)
 
 
 def _doubts_by_frames(
     run: MatchingRun, cameras: Collection[str], progress: Progress
-) -> dict[str, str]:
+) -> dict[str, list[str]]:
     """Per camera, the frames that fit another extrinsic: something moved during the recording.
 
     The solve leaves such frames out, and what is left agrees. Of matchers that may use what these
@@ -148,9 +149,11 @@ def _doubts_by_frames(
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
     return {
-        camera: f"frames {', '.join(names[number] for number in of_camera.frames_lost[:5])} fit "
-        "another extrinsic better: has the camera or the LiDAR moved during the recording, or do "
-        "their images and clouds not belong together?"
+        camera: [
+            f"frames {', '.join(names[number] for number in of_camera.frames_lost[:5])} fit "
+            "another extrinsic better: has the camera or the LiDAR moved during the recording, or "
+            "do their images and clouds not belong together?"
+        ]
         for camera, of_camera in found.items()
         if row.grade(of_camera.frames_best) != "PASS"
     }
