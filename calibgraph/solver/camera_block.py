@@ -28,7 +28,7 @@ from calibgraph.solver.whitening import (
     sqrt_information,
     whitened_norm,
 )
-from factors import ProjectionBlock
+from factors import ProjectionBlock, to_runs
 
 Array = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ class CameraBlock:
     @cached_property
     def least_spread(self) -> float:
         """MIN_SIGMA_PX as a whitened residual."""
-        return float(self.least_spreads(np.array([[0, len(self.frame)]]))[0])
+        return float(self.least_spreads(to_runs(np.array([0, len(self.frame)])))[0])
 
     def least_spreads(self, runs: NDArray[np.int64]) -> Array:
         """(r,) MIN_SIGMA_PX as a whitened residual, in each of (r, 2) runs."""

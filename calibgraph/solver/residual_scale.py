@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.solver.spread_kernel import spreads_alone, spreads_shared
+from factors.block_arrays import contiguous
 from factors.compiled import one_at_a_time
 
 Array = NDArray[np.float64]
@@ -85,7 +86,11 @@ def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
     shared = len(values) >= _WORTH_SHARING
     run = one_at_a_time(spreads_shared) if shared else spreads_alone
     spreads: Array = run(
-        np.ascontiguousarray(values), runs, (_START_QUANTILE, _START_FACTOR), _HALF, _CUT
+        np.ascontiguousarray(values),
+        contiguous(runs),
+        (_START_QUANTILE, _START_FACTOR),
+        _HALF,
+        _CUT,
     )
     return spreads
 

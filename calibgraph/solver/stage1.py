@@ -161,8 +161,7 @@ def aggregate_frames(
         frames: how many there are in all.
         config: ``aggregate``.
     """
-    near = are_near_median(poses)
-    kept = poses if near.all() else poses[near]
+    kept = poses[are_near_median(poses)]
     return CameraStage1(
         T_camera_lidar=aggregate(kept, config.aggregate) if len(kept) else None,
         by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibgraph.solver.residual_scale import iterate_spread, robust_spread, robust_spreads
+from calibgraph.solver.spread_kernel import medians, quantile
 
 
 def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:
@@ -30,7 +31,7 @@ def sorted_spread(values: np.ndarray) -> float:
     return iterate_spread(quantile_below)
 
 
-@pytest.mark.parametrize("count", [1, 2, 30, 700, 20_000])
+@pytest.mark.parametrize("count", [1, 2, 30, 700, 3000, 20_000])
 def test_the_spread_is_that_of_sorted_values(count: int) -> None:
     """Whatever their size, with equal ones among them, and far outliers."""
     rng = np.random.default_rng(count)
@@ -49,3 +50,14 @@ def test_runs_have_the_spread_of_their_finite_values() -> None:
     found = robust_spreads(values, runs)
     finite = values[:400][np.isfinite(values[:400])]
     assert found.tolist() == [robust_spread(finite), robust_spread(values[400:]), np.inf]
+
+
+@pytest.mark.parametrize("count", [1, 2, 30, 3000, 20_000])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).exponential(5.0, count)
+    for share in (0.0, 0.02, 0.5, 0.98, 1.0):
+        # Interpolation between two values is rounded in another order.
+        assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14)
+    runs = np.array([[0, count], [count // 2, count]])
+    expected = [np.median(values[slice(*run)]) for run in runs]
+    np.testing.assert_allclose(medians(values, runs), expected, rtol=1e-14)
