@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from calibgraph.audit.judgement import Tolerance, has_too_few_frames, judge_camera, judge_lidar
+from calibgraph.audit.judgement import (
+    SEARCHES_FARTHER,
+    Tolerance,
+    has_too_few_frames,
+    judge_camera,
+    judge_lidar,
+)
 from calibgraph.audit.kept_frames import keep_frames
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
@@ -87,7 +93,8 @@ def check(
         too_few_matches = error.camera in rig.cameras and error.row is None
         if not too_few_matches:  # a wrong table
             raise
-        cameras = {name: CameraAudit("CANNOT TELL", f"{error}") for name in rig.cameras}
+        nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
+        cameras = dict.fromkeys(rig.cameras, nothing)
         lidar = None
     finally:
         full.release()
@@ -165,7 +172,6 @@ def _doubt_by_z_score(z_score: float | None) -> str:
     if z_score is None or row.grade(z_score) == "PASS":
         return ""
     return (
-        f"images and clouds agree too little (z-score {z_score:.1f}, {row.warn:g} needed): if the "
-        "extrinsic may be off by more than 3 deg or 40 cm, `calibgraph calibrate` searches "
-        "farther; else record sharp images of more structure, and check the intrinsics"
+        f"images and clouds agree too little (z-score {z_score:.1f}, {row.warn:g} needed): "
+        f"{SEARCHES_FARTHER}; else record sharp images of more structure, and check the intrinsics"
     )

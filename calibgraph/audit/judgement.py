@@ -50,6 +50,10 @@ _RECORD = (
 )
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 
+SEARCHES_FARTHER = (
+    "if the extrinsic may be off by more than 3 deg or 40 cm, `calibgraph calibrate` searches "
+    "farther"
+)
 SINGLE_CAMERA = "; a single camera cannot be told from the LiDAR: either has moved"
 _TOO_FEW_FRAMES = (
     f"too few frames for an error bar of their own (those of one place count as one): record at "
@@ -149,7 +153,7 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     """
     z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
     if name in evidence.solution.held:
-        return CameraAudit("CANNOT TELL", doubt, z_score=z_score)
+        return CameraAudit("CANNOT TELL", f"{doubt}; {SEARCHES_FARTHER}", z_score=z_score)
     deviation = _deviation(evidence, name)
     if covariance is None:
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
