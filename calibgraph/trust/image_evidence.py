@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.structure.consensus import sum_scores, z_score
+from calibgraph.matching.structure.consensus import z_score
+from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
@@ -32,9 +33,6 @@ Array = NDArray[np.float64]
 
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence
-
-DISPLACEMENTS_DEG, DISPLACEMENT_M = (1.2, 2.2), 0.4
-"""About and along each axis: the displaced poses that a result is compared with."""
 
 PAIR_LEVEL = replace(WIDE, reach_rad=np.radians(1.2))
 
@@ -128,32 +126,13 @@ def _measure_camera(scorer: FrameScorer, seed: int, name: str, camera: Camera) -
 
 def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
     """Compare the score at the result with those of displaced poses, over the same windows."""
-    frames = np.unique(scores.frame)
-    twists = _displacements()
-    per_frame = np.array([sum_scores(_of_frame(scores, frame), twists) for frame in frames])
-    own, displaced = per_frame[:, 0], per_frame[:, 1:]
-    best = own > displaced.max(axis=1)
-    total = displaced.sum(axis=0)
+    frames, per_frame = score_displaced(scores)
+    best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
     return {
-        "displaced_z_score": float((own.sum() - total.mean()) / (total.std() + 1e-12)),
+        "displaced_z_score": displaced_z_score(per_frame),
         "frames_best": float(best.mean()),
         "frames_lost": tuple(frames[~best].tolist()),
     }
-
-
-def _of_frame(scores: ShiftScores, frame: int) -> ShiftScores:
-    rows = scores.frame == frame
-    return replace(scores, grids=scores.grids[rows], jacobian=scores.jacobian[rows])
-
-
-def _displacements() -> Array:
-    """(n, 6) twists: none, then rotations about and shifts along each axis, both ways."""
-    angles = [np.radians(angle) * sign for angle in DISPLACEMENTS_DEG for sign in (-1, 1)]
-    shifts = [DISPLACEMENT_M * sign for sign in (-1, 1)]
-    axes = np.eye(6)
-    twists = [axes[axis] * size for axis in range(3) for size in angles]
-    twists += [axes[axis] * size for axis in range(3, 6) for size in shifts]
-    return np.array([np.zeros(6), *twists])
 
 
 def _compare_with_neighbours(scorer: FrameScorer, images: Images, camera: Camera) -> dict[str, Any]:

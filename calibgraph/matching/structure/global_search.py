@@ -234,7 +234,7 @@ class Locator:
         before = f" (best z-score {z_score:.1f}, {least:.1f} needed)" if z_score > 0 else ""
         self._report(f"searching: {name}{before}")
         self._searches[name] += 1
-        found = self._search.everywhere(self._bodies[name], effort, tries)
+        found = self._search.everywhere(self._bodies[name], effort)
         self._consider(name, found, tries)
 
     def _report(self, what: str) -> None:

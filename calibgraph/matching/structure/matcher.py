@@ -19,7 +19,8 @@ from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.matching.structure.global_search import Located, locate_cameras
 from calibgraph.matching.structure.peaks import extract_correspondences
-from calibgraph.matching.structure.pose_search import CONFIDENT, SearchRange
+from calibgraph.matching.structure.pose_refinement import CONFIDENT
+from calibgraph.matching.structure.pose_search import SearchRange
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place, place_member
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
 from calibgraph.matching.structure.pose_refinement import (
+    CONFIDENT,
     GAIN,
     CameraFrames,
     Candidate,
@@ -35,9 +35,6 @@ ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
 degrees, right places stand out no more."""
 SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
 
-CONFIDENT = 20.0
-"""From this z-score on, no better pose is looked for around: on KITTI 05 and 07, poses 0.8 to 4.6
-degrees or 30 to 160 cm off had 10.8 to 19.4, and of 14 such, 13 led to the right one."""
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
 MAX_LOOKS = 3
 
@@ -78,9 +75,11 @@ class PoseSearch:
     def near(self, body: Body) -> Candidate:
         """The body about its guess, refined on: from there, and from what an approach leads to."""
         direct = refine(self._frames, body)
-        if direct.z_score >= CONFIDENT or self.out_of_time():
+        if direct.is_beyond_doubt or self.out_of_time():
             return direct
-        return self._settle(max(direct, self.from_afar(body), key=_by_z_score))
+        if direct.z_score < CONFIDENT:
+            direct = max(direct, self.from_afar(body), key=_by_z_score)
+        return self._settle(direct)
 
     def from_afar(self, body: Body) -> Candidate:
         """The body near a pose that may be off by some degrees."""
@@ -90,13 +89,12 @@ class PoseSearch:
         """The body near a pose that is off by less than a degree."""
         return self._settle(refine(self._frames, body))
 
-    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
-        """The best pose in all of the range; of those beyond doubt, the first."""
-        beyond_doubt = max(CONFIDENT, least_z_score(tries))
+    def everywhere(self, body: Body, effort: int) -> Candidate:
+        """The best pose in all of the range; of those from CONFIDENT on, the first."""
         best = Candidate(body, -math.inf)
         for roll in ROLLS_RAD:
             best = max(best, self.with_roll(body, roll, effort=effort), key=_by_z_score)
-            if best.z_score >= beyond_doubt or self.out_of_time():
+            if best.z_score >= CONFIDENT or self.out_of_time():
                 break
         return best
 
@@ -145,10 +143,13 @@ class PoseSearch:
         decimetres off can agree far better than by chance.
         """
         for _ in range(MAX_LOOKS):
-            if not PROMISING <= candidate.z_score < CONFIDENT or self.out_of_time():
+            hopeless = candidate.z_score < PROMISING
+            if hopeless or candidate.is_beyond_doubt or self.out_of_time():
                 break
-            refined = refine_on(self._frames, candidate)
-            if refined.z_score >= CONFIDENT:
+            refined = candidate
+            if candidate.z_score < CONFIDENT:
+                refined = refine_on(self._frames, candidate)
+            if refined.is_beyond_doubt:
                 return refined
             around = self._best_around(refined)
             if around.z_score < GAIN * refined.z_score:
