@@ -76,22 +76,34 @@ def check_images(
         for name, found in evidence.items()
     }
     names = {frame.index: frame.name for frame in dataset.frames}
+    row = threshold("displaced_z_score")
+    placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
+    of_placed = {name: checks for name, checks in of_time.items() if name in placed}
     return {
-        name: (*evidence_checks(found, names), *of_time[name], *_clouds_checks(name, of_time))
+        name: (*evidence_checks(found, names), *of_time[name])
+        + _clouds_checks(of_time[name], of_placed)
         for name, found in evidence.items()
     }
 
 
-def _clouds_checks(camera: str, of_time: Mapping[str, Sequence[Check]]) -> list[Check]:
-    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras."""
-    if any(check.status != "PASS" for check in of_time[camera]):
-        return []  # its own checks show it
-    return [
+def _clouds_checks(
+    own: Sequence[Check], of_placed: Mapping[str, Sequence[Check]]
+) -> tuple[Check, ...]:
+    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras.
+
+    Args:
+        own: the checks of a camera's time.
+        of_placed: those of cameras that agree with their clouds at their place: elsewhere, which
+            clouds agree best is chance.
+    """
+    if any(check.status != "PASS" for check in own):
+        return ()  # they show it
+    return tuple(
         Check("clouds of another time", "WARN", f"by camera {other}: {check.text}")
-        for other, checks in of_time.items()
+        for other, checks in of_placed.items()
         for check in checks
         if check.status != "PASS"
-    ]
+    )
 
 
 def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Check, ...]:

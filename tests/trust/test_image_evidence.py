@@ -10,7 +10,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Correspondences, Dataset, Rig
-from calibgraph.trust import image_evidence
+from calibgraph.trust import image_checks, image_evidence
 from calibgraph.trust.image_checks import check_images, evidence_checks, pairing_checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_evidence import LensEvidence
@@ -19,6 +19,12 @@ from tests.conftest import SAMPLE
 NAME = "front_left"
 
 NAMES = {n: f"{n:06}" for n in range(6)}
+EMPTY = Correspondences.from_arrays(
+    camera=NAME,
+    frame=np.empty(0, np.int64),
+    pixels_px=np.empty((0, 2)),
+    points_lidar_m=np.empty((0, 3)),
+)
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +101,7 @@ def test_a_camera_without_structure_gets_a_warning(
     points = np.random.default_rng(0).uniform(5, 6, (10, 4)).astype(np.float32)
     np.save(tmp_path / "few.npy", points)
     frames = tuple(replace(frame, cloud_path=tmp_path / "few.npy") for frame in dataset.frames)
-    empty = Correspondences.from_arrays(
-        camera=NAME,
-        frame=np.empty(0, np.int64),
-        pixels_px=np.empty((0, 2)),
-        points_lidar_m=np.empty((0, 3)),
-    )
-    checks = check_images(replace(dataset, frames=frames), truth, empty)[NAME]
+    checks = check_images(replace(dataset, frames=frames), truth, EMPTY)[NAME]
     assert [check.status for check in checks] == ["WARN"]
     assert "structure in both image and cloud" in checks[0].text
 
@@ -110,3 +110,18 @@ def test_frames_are_named_by_number_and_file() -> None:
     found = ImageEvidence(100, displaced_z_score=5.0, frames_best=0.5, frames_lost=(3, 5))
     (check,) = (c for c in evidence_checks(found, NAMES) if c.value == 0.5)
     assert "frames 3 (000003), 5 (000005) have higher scores" in check.text
+
+
+@pytest.mark.parametrize(("displaced_z_score", "status"), [(5.0, "WARN"), (0.1, "PASS")])
+def test_clouds_of_another_time_are_shown_by_cameras_that_agree_with_clouds_at_all(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, displaced_z_score: float, status: str
+) -> None:
+    """Of a camera that is blurred, or not at its place, the agreement with any cloud is chance."""
+    good = ImageEvidence(100, displaced_z_score=5.0, frames_best=1.0, pair_margin=0.5)
+    other = replace(good, displaced_z_score=displaced_z_score, pair_offset=-1, pair_margin=-0.6)
+    evidence = {"good": good, "other": other}
+    monkeypatch.setattr(image_checks, "measure_image_evidence", lambda *_, **__: evidence)
+    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
+    checks = check_images(dataset, dataset.rig, EMPTY)
+    found = {check.name: check.status for check in checks["good"]}
+    assert found.get("clouds of another time", "PASS") == status
