@@ -22,6 +22,8 @@ from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.task import Limits, Outcome, Task, release
 
+MANY = 100
+
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -112,19 +114,20 @@ def test_clusters_give_the_rows_of_processes(name: str, manifest: str, tmp_path:
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(("name", "most"), [("processes", 20), ("ray", 40), ("dask", 40)])
 def test_every_row_is_there_once_though_workers_are_killed(
-    name: str, most: int, manifest: str, tmp_path: Path
+    name: str, most: int, tmp_path: Path
 ) -> None:
     # A cluster that gives up workers which it loses while they start has done so after 20 s.
+    manifest = str(write_fleet(tmp_path, MANY))  # the last kill comes before the last job
     stop, kills = threading.Event(), [0]
     killer = threading.Thread(target=kill_at_random, args=(stop, kills, most), daemon=True)
     killer.start()
-    run_fleet(manifest, str(tmp_path), engine=name, slots=2)
+    run_fleet(manifest, str(tmp_path / "out"), engine=name, slots=2)
     stop.set()
     killer.join()
     assert kills == [most]
-    run_fleet(manifest, str(tmp_path), slots=2)
-    rows = rows_without_seconds(tmp_path)
-    assert len(rows) == len({(row["vehicle"], row["camera"]) for row in rows}) == 24
+    run_fleet(manifest, str(tmp_path / "out"), slots=2)
+    rows = rows_without_seconds(tmp_path / "out")
+    assert len(rows) == len({(row["vehicle"], row["camera"]) for row in rows}) == 2 * MANY
 
 
 @pytest.mark.slow
