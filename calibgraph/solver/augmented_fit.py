@@ -37,16 +37,19 @@ class AugmentedFit:
     Attributes:
         twist: (6,) rotation [rad] and translation [m] of T_camera_lidar = exp(twist) estimate.
         values: (k,) of the unknowns.
-        sigmas: (k,) standard deviations by the scatter of the frames; NaN with one frame.
+        sigmas: (k,) standard deviations, by the scatter of the frames and what they share; NaN with
+            one frame.
         independent_shares: (k,) share (0 to 1, root mean square) of an unknown's Jacobian that
             is independent of the pose and of the other unknowns. Near zero, the unknown is not
             observable.
+        compensating: (6, k) twists by which the pose compensates for a unit of each unknown.
     """
 
     twist: Array
     values: Array
     sigmas: Array
     independent_shares: Array
+    compensating: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +70,19 @@ class LinearRows:
     groups: int
 
     def fit(
-        self, unknowns: Sequence[int], *, loss_scale: float | None = None
+        self,
+        unknowns: Sequence[int],
+        *,
+        loss_scale: float | None = None,
+        shared_variance: float = 0.0,
     ) -> AugmentedFit | None:
         """Fit the pose and some of the unknowns robustly; see :func:`fit_augmented`.
 
         Args:
             unknowns: their numbers, from 0.
             loss_scale: of the Cauchy loss.
+            shared_variance: of what all frames share, which their scatter does not show: times the
+                covariance of all rows, if they were independent.
         """
         if len(self.group) < MIN_ROWS:
             return None
@@ -84,8 +93,11 @@ class LinearRows:
         solution, normal, weights, errors = solved
         inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         sigmas = self._cluster_sigmas(which[:-1], normal, inverse, weights, errors)
+        variance = (weights * (errors**2).sum(axis=0)).sum() / (2 * weights.sum())
+        sigmas = np.sqrt(sigmas**2 + shared_variance * variance * np.diag(inverse))
         shares = 1 / np.sqrt(np.diag(inverse) * np.diag(normal))
-        return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:])
+        compensating = np.asarray(-np.linalg.solve(normal[:6, :6], normal[:6, 6:]))
+        return AugmentedFit(solution[:6], solution[6:], sigmas[6:], shares[6:], compensating)
 
     def compensating_twists(self, unknowns: Sequence[int], weights: Array) -> Array:
         """(6, k) twists by which the pose compensates best for a unit of each unknown.
@@ -203,6 +215,7 @@ def fit_augmented(
     jacobian_px: Array,
     *,
     loss_scale: float | None = None,
+    shared_variance: float = 0.0,
 ) -> AugmentedFit | None:
     """Fit pose and further unknowns robustly; the rows of one frame may share errors.
 
@@ -212,6 +225,7 @@ def fit_augmented(
         jacobian_px: (n, 2, k) derivatives of each row's pixel by the unknowns.
         loss_scale: of the Cauchy loss, on errors times the root of their information; None: from
             their median, which holds for up to about a third of outliers.
+        shared_variance: see :meth:`LinearRows.fit`.
 
     Returns:
         The fit, or None if the rows do not determine it.
@@ -219,7 +233,8 @@ def fit_augmented(
     if len(table) < MIN_ROWS:
         return None
     rows = linearize(camera, table, jacobian_px)
-    return rows.fit(range(jacobian_px.shape[2]), loss_scale=loss_scale)
+    unknowns = range(jacobian_px.shape[2])
+    return rows.fit(unknowns, loss_scale=loss_scale, shared_variance=shared_variance)
 
 
 def compensating_twists(camera: Camera, table: Correspondences, jacobian_px: Array) -> Array:

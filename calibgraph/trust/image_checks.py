@@ -10,11 +10,11 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.threshold import Threshold
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
+from calibgraph.trust.lens_parameter import LensParameter, check_parameter
 from calibgraph.trust.thresholds import limit, threshold
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
 
@@ -69,7 +69,9 @@ def check_images(
     Returns:
         Checks of every camera.
     """
-    evidence = measure_image_evidence(dataset, rig, seed=seed, progress=progress)
+    evidence = measure_image_evidence(
+        dataset, rig, places=table.metadata, seed=seed, progress=progress
+    )
     offsets = time_offsets(dataset, rig, table)
     of_time = {
         name: (*pairing_checks(found), *offset_checks(offsets.get(name)))
@@ -140,46 +142,26 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
-    log_focal, radial, centre, log_aspect, skew = found.lens
-    focal, aspect = math.expm1(log_focal), math.expm1(log_aspect)
-    longer = "longer" if focal > 0 else "shorter"
-    larger = "larger" if aspect > 0 else "smaller"
-    return (
-        _check_lens(
-            threshold("focal_length"), focal, found.lens_sigmas[0],
-            f"a focal length {abs(focal):.1%} {longer}: check fx, fy and the image size",
-        ),
-        _check_lens(
-            threshold("radial_distortion"), radial, found.lens_sigmas[1],
-            f"a first radial coefficient {radial:+.2f} from the rig's: check the distortion, and "
-            "whether the images are undistorted already",
-        ),
-        _check_lens(
-            threshold("principal_point"), centre, found.lens_sigmas[2],
-            f"a principal point {centre:+.1%} of a focal length from the rig's: check cx, cy, and "
-            "whether the images were cropped",
-        ),
-        _check_lens(
-            threshold("aspect_ratio"), aspect, found.lens_sigmas[3],
-            f"a ratio fx / fy {abs(aspect):.1%} {larger}: check fx and fy, and whether the images "
-            "were scaled",
-        ),
-        _check_lens(
-            threshold("skew"), skew, found.lens_sigmas[4],
-            f"a skew of {skew:+.1%} of fx, which a rig cannot have: check whether the images were "
-            "sheared, or undistort them with the skew that their intrinsics have",
-        ),
-    )  # fmt: skip
+    return tuple(
+        check_parameter(each, "images", _better(each), each.name.replace(" ", "_"))
+        for each in found.lens
+    )
 
 
-def _check_lens(row: Threshold, error: float, sigma: float, better: str) -> Check:
-    """One lens parameter, by its estimated error and the standard deviation of that."""
-    if not sigma < limit("lens_sigma_share") * row.warn:
-        text = f"the images do not determine the {row.name} well enough to check it"
-        return Check(row.name, "PASS", text)
-    status = row.grade(abs(error))
-    agrees = f"{row.name} agrees with the images"
-    return row.describe(error, status, agrees if status == "PASS" else f"the images fit {better}")
+def _better(found: LensParameter) -> str:
+    """The lens that fits the images best, in words."""
+    (change,) = found.values
+    if found.name == "focal length":
+        longer = "longer" if change > 0 else "shorter"
+        return f"a focal length {abs(math.expm1(change)):.1%} {longer}"
+    if found.name == "distortion":
+        return f"a first radial coefficient {change:+.2f} from the rig's"
+    if found.name == "principal point":
+        return f"a principal point {change:+.1%} of a focal length from the rig's"
+    if found.name == "aspect ratio":
+        larger = "larger" if change > 0 else "smaller"
+        return f"a ratio fx / fy {abs(math.expm1(change)):.1%} {larger}"
+    return f"a skew of {change:+.1%} of fx, which a rig cannot have,"
 
 
 def _gain_checks(found: ImageEvidence, lens: Sequence[Check]) -> tuple[Check, ...]:

@@ -11,6 +11,7 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,12 +23,15 @@ from numpy.typing import NDArray
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
+from calibgraph.matching.structure.matcher import PLACE_VARIANCE
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
+from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
-from calibgraph.trust.lens_evidence import UNKNOWN, measure_lens
+from calibgraph.trust.lens_evidence import measure_lens
+from calibgraph.trust.lens_parameter import LensParameter
 
 Array = NDArray[np.float64]
 
@@ -43,10 +47,8 @@ class ImageEvidence:
 
     Attributes:
         groups: groups of windows that were scored; with fewer than MIN_GROUPS all else is NaN.
-        lens: change of the lens that fits best: of the logarithm of the focal length, the first
-            radial coefficient, the principal point along the longer side of the image (in focal
-            lengths), the logarithm of fx / fy, and the skew (in parts of fx).
-        lens_sigmas: standard deviations of these by the scatter of the frames, lower bounds.
+        lens: how the lens that fits best differs; see
+            :class:`calibgraph.trust.lens_evidence.LensEvidence`.
         gain: see :class:`calibgraph.trust.lens_evidence.LensEvidence`.
         displaced_z_score: score at the result less the mean score of the displaced poses, in
             standard deviations of the latter.
@@ -58,8 +60,7 @@ class ImageEvidence:
     """
 
     groups: int
-    lens: tuple[float, ...] = UNKNOWN
-    lens_sigmas: tuple[float, ...] = UNKNOWN
+    lens: tuple[LensParameter, ...] = ()
     gain: float = math.nan
     displaced_z_score: float = math.nan
     frames_best: float = math.nan
@@ -72,6 +73,7 @@ def measure_image_evidence(
     dataset: Dataset,
     rig: Rig,
     *,
+    places: Mapping[str, Any] | None = None,
     seed: int = 0,
     extrinsics_only: bool = False,
     progress: Progress | None = None,
@@ -81,6 +83,7 @@ def measure_image_evidence(
     Args:
         dataset: images and clouds.
         rig: lenses, and the extrinsics in question.
+        places: metadata of its correspondences, which name the frames of each place.
         seed: of the search for the lens.
         extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
             take most of the time.
@@ -91,7 +94,11 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_extrinsic if extrinsics_only else _measure_camera, scorer, seed)
+        numbers = np.array([frame.index for frame in frames])
+        shared = PLACE_VARIANCE * frames_of_one_place(places or {}, numbers)
+        measure = partial(_measure_camera, scorer, seed, shared)
+        if extrinsics_only:
+            measure = partial(_measure_extrinsic, scorer)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
             report(f"checking: {name}", index, len(rig.cameras))
@@ -99,7 +106,7 @@ def measure_image_evidence(
     return evidence
 
 
-def _measure_extrinsic(scorer: FrameScorer, _seed: int, name: str, camera: Camera) -> ImageEvidence:
+def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageEvidence:
     scores = scorer.score_together(scorer.load_images(name, camera), camera, WIDE)
     groups = len(scores.counts)
     if groups < MIN_GROUPS:
@@ -107,17 +114,18 @@ def _measure_extrinsic(scorer: FrameScorer, _seed: int, name: str, camera: Camer
     return ImageEvidence(groups, **_compare_with_displaced(scores))
 
 
-def _measure_camera(scorer: FrameScorer, seed: int, name: str, camera: Camera) -> ImageEvidence:
+def _measure_camera(
+    scorer: FrameScorer, seed: int, shared_variance: float, name: str, camera: Camera
+) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
     groups = len(scores.counts)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
-    lens = measure_lens(scorer, images, camera, scores, seed=seed)
+    lens = measure_lens(scorer, images, camera, scores, seed=seed, shared_variance=shared_variance)
     return ImageEvidence(
         groups,
-        lens=lens.change,
-        lens_sigmas=lens.sigmas,
+        lens=lens.parameters,
         gain=lens.gain,
         **_compare_with_displaced(scores),
         **_compare_with_neighbours(scorer, images, camera),

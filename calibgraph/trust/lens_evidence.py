@@ -22,11 +22,11 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
+from calibgraph.trust.lens_parameter import LensParameter
 
 Array = NDArray[np.float64]
-Pair = tuple[float, ...]
 
-UNKNOWN = (math.nan,) * 5
+NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew")
 SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
 SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
 MAX_RADIAL = 0.3
@@ -40,19 +40,23 @@ class LensEvidence:
     """The lens that fits the images best.
 
     Attributes:
-        change: (5,) of the lens, see above; NaN where the images do not determine it.
-        sigmas: (5,) standard deviations by the scatter of the frames, lower bounds.
+        parameters: those of ``NAMES``, see above; none where the images do not determine them.
         gain: of the summed score at the best pose nearby with its own lens over that at the result,
             in standard deviations of chance agreement.
     """
 
-    change: tuple[float, ...] = UNKNOWN
-    sigmas: tuple[float, ...] = UNKNOWN
+    parameters: tuple[LensParameter, ...] = ()
     gain: float = math.nan
 
 
-def measure_lens(
-    scorer: FrameScorer, images: Images, camera: Camera, scores: ShiftScores, *, seed: int
+def measure_lens(  # noqa: PLR0913 - what is measured, and by what
+    scorer: FrameScorer,
+    images: Images,
+    camera: Camera,
+    scores: ShiftScores,
+    *,
+    seed: int,
+    shared_variance: float,
 ) -> LensEvidence:
     """Find the lens that fits the images best, with the pose free: a search, then two fits.
 
@@ -62,20 +66,32 @@ def measure_lens(
         camera: at the result.
         scores: of the camera at the level ``WIDE``.
         seed: of the search.
+        shared_variance: of what frames of one place share, see
+            :meth:`calibgraph.solver.augmented_fit.LinearRows.fit`.
     """
     if camera.model == "equirectangular":  # the format determines it: the pose alone is free
         return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
     best, gain = _search(camera, scores, _TO_CENTRE, seed)
-    shape, shape_sigmas = _shape(camera, scores, seed)
-    rough = _fit_at_peaks(camera, scores, best)
+    shape = _shape(camera, scores, seed, shared_variance)
+    rough = _fit_at_peaks(camera, scores, best, shared_variance)
     if rough is None:
         return LensEvidence(gain=gain)
     refined = change_lens(apply_twist(camera, rough.twist), np.append(rough.values, 0.0))
-    fine = _fit_at_peaks(refined, scorer.score_together(images, refined, FINER), np.zeros(9))
+    finer = scorer.score_together(images, refined, FINER)
+    fine = _fit_at_peaks(refined, finer, np.zeros(9), shared_variance)
     if fine is None:
         return LensEvidence(gain=gain)
-    change = (*(rough.values + fine.values).tolist(), *shape)
-    return LensEvidence(change, (*fine.sigmas.tolist(), *shape_sigmas), gain)
+    together = replace(fine, values=rough.values + fine.values)
+    found = [_parameter(name, together, number) for number, name in enumerate(NAMES[:_TO_CENTRE])]
+    return LensEvidence((*found, *shape), gain)
+
+
+def _parameter(name: str, fit: AugmentedFit, number: int) -> LensParameter:
+    value, sigma = fit.values[number : number + 1], fit.sigmas[number : number + 1]
+    twist = fit.compensating[:, number] * value
+    degrees = float(np.degrees(np.linalg.norm(twist[:3])))
+    centimetres = 100 * float(np.linalg.norm(twist[3:]))
+    return LensParameter(name, value, sigma, np.ones(1), degrees, centimetres)
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[Array, float]:
@@ -91,18 +107,22 @@ def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[
     return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
 
 
-def _shape(camera: Camera, scores: ShiftScores, seed: int) -> tuple[Pair, Pair]:
-    """Changes of the logarithm of fx / fy and of the skew, and their standard deviations.
+def _shape(
+    camera: Camera, scores: ShiftScores, seed: int, shared_variance: float
+) -> list[LensParameter]:
+    """Changes of the logarithm of fx / fy and of the skew.
 
     Measured apart from the others, which they would make less certain, and without a finer fit: on
     KITTI right ones are then nearer to zero. A skew moves pixels too little to be searched for.
     """
     best, _ = _search(camera, scores, _TO_ASPECT, seed)
-    aspect = _fit_at_peaks(camera, scores, best)
-    skew = _fit_at_peaks(camera, scores, np.append(best, 0.0))
-    if aspect is None or skew is None:
-        return UNKNOWN[:2], UNKNOWN[:2]
-    return (aspect.values[-1], skew.values[-1]), (aspect.sigmas[-1], skew.sigmas[-1])
+    starts = (best, np.append(best, 0.0))
+    fits = [_fit_at_peaks(camera, scores, start, shared_variance) for start in starts]
+    return [
+        _parameter(name, fit, len(fit.values) - 1)
+        for name, fit in zip(NAMES[_TO_CENTRE:], fits, strict=True)
+        if fit is not None
+    ]
 
 
 def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
@@ -138,14 +158,17 @@ def change_lens(camera: Camera, change: Array) -> Camera:
     return Camera(**{**values, "distortion": tuple(distortion)})
 
 
-def _fit_at_peaks(camera: Camera, scores: ShiftScores, start: Array) -> AugmentedFit | None:
+def _fit_at_peaks(
+    camera: Camera, scores: ShiftScores, start: Array, shared_variance: float
+) -> AugmentedFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
     if not len(scores.counts):
         return None
     lens = len(start) - 6
     extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))
     table = extract_correspondences(extended, start, "camera")
-    return fit_augmented(camera, table, lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens])
+    jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
+    return fit_augmented(camera, table, jacobian_px, shared_variance=shared_variance)
 
 
 def _jacobian_with_lens(scores: ShiftScores, camera: Camera, lens: int) -> Array:

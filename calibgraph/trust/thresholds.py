@@ -124,15 +124,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("prior_share", "share of the priors in the result", "at most", 0.5, 1.0, "share",
               "How much of the result comes from priors and relative poses?",
               "Above half, it shows the priors more than the data."),
-    # the lens, from the residuals
-    Threshold("lens_rotation", "rotation by a lens parameter set free", "at most", 0.15, 0.5, "deg",
-              "How far would focal length, principal point or distortion, if estimated, turn the "
-              "camera?", "Right intrinsics, recorded and rendered: up to 0.6 deg (principal "
-              "point, 7 sigma). Counted beyond `focal_sigmas` etc."),
-    Threshold("lens_translation", "translation by a lens parameter set free", "at most",
-              5.0, 10.0, "cm",
-              "The same, how far would they move it?",
-              "Right intrinsics, recorded and rendered: up to 1.4 cm (4.2 sigma)."),
+    # the lens, from the residuals and the images
+    Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
+              "Is focal length, principal point, distortion, fx / fy or skew wrong, so that the "
+              "camera is off by more than 0.5 deg or 10 cm?",
+              "The verdict's own cuts. By an estimate of each together with the extrinsic, once "
+              "from the residuals and once from the images, and by `lens_usual` etc.",
+              "check the intrinsics, the image size, and that images are not undistorted twice, "
+              "cropped, scaled or sheared"),
     Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances"),
@@ -163,26 +162,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("frames_best", "frames whose score is highest at the result", "at least", 0.8, 0.5,
               "share", "In how many frames is no displaced extrinsic better?",
               f"{_RECORDED}: right 100 %, mispaired images up to 67 %, mostly 50 %."),
-    Threshold("focal_length", "focal length", "at most", 0.008, 0.025, "",
-              "Does another focal length fit the images better, by which relative change?",
-              f"{_RECORDED}: right up to 0.5 %; wrong by 2 to 5 %: 1.1 % and more. One percent "
-              "displaces a result by about 10 cm."),
-    Threshold("radial_distortion", "radial distortion", "at most", 0.03, 0.1, "",
-              "Does another first radial coefficient fit the images better, by which change?",
-              f"{_RECORDED}: right up to 0.02; wrong by 0.1: 0.08 and more, which displaces a "
-              "result by about 15 cm."),
-    Threshold("principal_point", "principal point", "at most", 0.018, 0.035, "",
-              "Does another principal point fit the images better, by how many focal lengths?",
-              f"{_RECORDED}: right up to 0.013; wrong by 20 px: 0.026 and 0.04. It is the angle "
-              "in radians that it turns a result by."),
-    Threshold("aspect_ratio", "ratio of fx and fy", "at most", 0.015, 0.06, "",
-              "Does another ratio fx / fy fit the images better, by which relative change?",
-              "KITTI 00, 05, 06, raw 0005: right up to 0.4 %, fy wrong by 3 to 4 % 1.8 to 4.2 %; "
-              "but on 08, a straight street, up to 5.6 % though right."),
-    Threshold("skew", "skew", "at most", 0.022, 0.08, "",
-              "Are the images sheared, by which part of fx?",
-              "KITTI 00, 05 to 08, raw 0005 and other recordings: right up to 2 %, in the median "
-              "0.5 %; sheared by 2 % 0.2 to 2.7 %, on rendered streets 2.1 %."),
     Threshold("score_gain", "score gain of the best extrinsic nearby", "at most", 1.0, 6.0,
               "sigma", "Does an extrinsic nearby fit the images better, by how many standard "
               "deviations of chance agreement?",
@@ -227,20 +206,12 @@ class Limit:
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
           "A pull within this of what a camera's own solution leaves open is zero."),
-    Limit("focal_sigmas", 5.0, "sigma", "A focal length set free counts beyond this."),
-    Limit("centre_sigmas", 10.0, "sigma", "A principal point set free counts beyond this."),
-    Limit("distortion_sigmas", 5.0, "sigma", "A distortion set free counts beyond this."),
-    Limit("focal_fail", 0.01, "", "A smaller relative change of the focal length is at most WARN: "
-          "intrinsics are not known better."),
-    Limit("shape_warn", 0.01, "", "A larger change of fx / fy, or skew, is a warning though it "
-          "moves the camera little. Right intrinsics on KITTI: up to 0.95 %."),
-    Limit("shape_fail", 0.03, "", "A smaller change of fx / fy, or skew, is at most WARN."),
-    Limit("centre_fail", math.inf, "px", "A principal point set free is at most WARN: it is hard "
-          "to distinguish from a rotation."),
-    Limit("distortion_fail", 0.02, "", "A smaller radial displacement at one focal length from "
-          "the centre is at most WARN."),
-    Limit("lens_sigma_share", 0.5, "", "The images determine a lens parameter if its sigma is "
-          "below this share of the WARN limit."),
+    Limit("lens_usual", 0.002, "", "The usual error of a lens parameter, before residuals are "
+          "looked at: relative, or in focal lengths."),
+    Limit("lens_wrong", 0.04, "", "The error of one that is wrong."),
+    Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
+    Limit("lens_match_share", 0.01, "share", "So much of a match's variance is taken to be shared "
+          "by all: less cannot be told from a wrong lens."),
     Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
           "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
           "the sample: wrong lenses left 3.2 and more."),

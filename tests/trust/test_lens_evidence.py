@@ -17,6 +17,7 @@ from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
 from calibgraph.trust.lens_evidence import (
+    NAMES,
     LensEvidence,
     change_lens,
     lens_jacobian_px,
@@ -25,11 +26,6 @@ from calibgraph.trust.lens_evidence import (
 from tests.conftest import KANNALA, RADTAN5, SAMPLE, make_camera, points_in_front
 
 NAME = "front_left"
-LENS_CHECKS = (
-    "focal length", "radial distortion", "principal point", "ratio of fx and fy", "skew",
-)  # fmt: skip
-
-NAMES = {n: f"{n:06}" for n in range(6)}
 
 
 @pytest.fixture(scope="module")
@@ -43,29 +39,29 @@ def measure(camera: Camera, dataset: Dataset | None = None) -> LensEvidence:
         scorer = FrameScorer(dataset, dataset.frames, pool)
         images = scorer.load_images(NAME, camera)
         scores = scorer.score_together(images, camera, WIDE)
-        return measure_lens(scorer, images, camera, scores, seed=0)
+        return measure_lens(scorer, images, camera, scores, seed=0, shared_variance=0.0)
 
 
 def statuses(lens: LensEvidence) -> dict[str, str]:
     """Of the checks of the lens, of a calibrated pose: the true one of another lens fits less."""
     found = ImageEvidence(
         groups=100,
-        lens=lens.change,
-        lens_sigmas=lens.sigmas,
+        lens=lens.parameters,
         gain=lens.gain,
         displaced_z_score=5.0,
         frames_best=1.0,
     )
-    return {check.name: check.status for check in evidence_checks(found, NAMES)}
+    checks = {check.kind: check.status for check in evidence_checks(found, {})}
+    return {name: checks[name.replace(" ", "_")] for name in NAMES}
 
 
 @pytest.mark.parametrize(
     ("index", "error", "name"),
     [
         (0, 0.03, "focal length"),
-        (1, -0.1, "radial distortion"),
+        (1, -0.1, "distortion"),
         (2, 0.04, "principal point"),
-        (3, 0.04, "ratio of fx and fy"),
+        (3, 0.04, "aspect ratio"),
     ],
 )
 def test_a_wrong_lens_is_named_and_measured(
@@ -76,12 +72,12 @@ def test_a_wrong_lens_is_named_and_measured(
     # A rotation about the y axis compensates for the principal point, as in a calibration.
     compensation = np.array([0.0, -change[2], 0.0, 0.0, 0.0, 0.0])
     found = measure(apply_twist(change_lens(truth, change), compensation))
-    assert found.change[index] == pytest.approx(-error, abs=0.2 * abs(error) + 0.004)
+    assert found.parameters[index].values[0] == pytest.approx(-error, abs=0.2 * abs(error) + 0.004)
     status = statuses(found)
     assert status[name] != "PASS"
-    if name == "ratio of fx and fy":  # half of it is a focal length
+    if name == "aspect ratio":  # half of it is a focal length
         return
-    assert all(status[other] == "PASS" for other in LENS_CHECKS if other != name)
+    assert all(status[other] == "PASS" for other in NAMES if other != name)
 
 
 @pytest.mark.parametrize("skew", [-0.03, 0.03])
@@ -99,10 +95,10 @@ def test_sheared_images_are_named_and_measured(truth: Camera, tmp_path: Path, sk
         cv2.imwrite(str(path), cv2.warpAffine(image, shear, image.shape[1::-1]))
         frames.append(replace(frame, image_paths={NAME: path}))
     found = measure(turned, replace(dataset, frames=tuple(frames)))
-    assert found.change[4] == pytest.approx(skew, abs=0.007)
+    assert found.parameters[4].values[0] == pytest.approx(skew, abs=0.007)
     status = statuses(found)
     assert status["skew"] != "PASS"
-    assert status["radial distortion"] == status["principal point"] == "PASS"
+    assert status["distortion"] == status["principal point"] == "PASS"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,131 @@
+"""The probability that a lens parameter is wrong, by an estimate of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit, ndtr
+
+from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.trust.thresholds import limit, threshold
+
+Array = NDArray[np.float64]
+
+SHAPES = ("aspect ratio", "skew")
+"""Names of the parameters that no lens of this kind has wrong by much."""
+
+
+@dataclass(frozen=True, eq=False)
+class LensParameter:
+    """An estimate of one lens parameter together with the extrinsic.
+
+    Attributes:
+        name: "focal length", "principal point", "distortion", "aspect ratio" or "skew".
+        values: (k,) estimates: relative change of the focal length; shift of the principal point
+            [px]; relative radial displacement at one focal length from the centre; relative change
+            of fx / fy (of images: of its logarithm, as of the focal length's); change of the skew,
+            in parts of fx.
+        sigmas: (k,) their standard deviations, frames as clusters.
+        unit: (k,) of the values, for ``size`` and ``sigma``: the focal lengths [px] of a principal
+            point, else one.
+        moved_deg: how far the camera turns.
+        moved_cm: how far the camera's centre moves.
+    """
+
+    name: str
+    values: Array
+    sigmas: Array
+    unit: Array
+    moved_deg: float
+    moved_cm: float
+
+    @property
+    def size(self) -> float:
+        """The length of the values: relative, or in focal lengths."""
+        return float(np.linalg.norm(self.values / self.unit))
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation."""
+        along = self.values / self.unit / max(self.size, np.finfo(float).tiny)
+        of_size = float(np.linalg.norm(along * self.sigmas / self.unit))
+        return max(of_size, np.finfo(float).tiny)
+
+    @property
+    def significance(self) -> str:
+        """The size in its standard deviations, in words."""
+        return "unknown" if math.isnan(self.sigma) else f"{self.size / self.sigma:.2g}"
+
+    @property
+    def probability(self) -> float:
+        """That the parameter is wrong and displaces the camera by more than users tolerate.
+
+        What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
+        wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
+        aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
+        matches from rounds have followed it.
+        """
+        if math.isnan(self.sigma):
+            return 0.0
+        moves = max(self.moved_deg / TOLERANCE[0], self.moved_cm / TOLERANCE[1])
+        tolerated = self.size / moves if moves else math.inf
+        usual = _Posterior(self.size, self.sigma, limit("lens_usual"))
+        wrong = _Posterior(self.size, self.sigma, limit("lens_wrong"))
+        share = limit("lens_wrong_share")
+        is_wrong = float(expit(logit(share) + wrong.log_evidence - usual.log_evidence))
+        after, before = (1.0, 1.0) if self.name in SHAPES else wrong.beyond(tolerated)
+        if_wrong = max(is_wrong * after - share * before, 0.0)
+        after, before = usual.beyond(tolerated)
+        return if_wrong + (1 - is_wrong) * max(after - before, 0.0)
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Of a normally distributed number with mean zero that was measured.
+
+    Attributes:
+        measured: its measurement.
+        sigma: of the measurement's error.
+        spread: of the number.
+    """
+
+    measured: float
+    sigma: float
+    spread: float
+
+    @property
+    def log_evidence(self) -> float:
+        """Of the measurement, up to a constant."""
+        variance = self.sigma**2 + self.spread**2
+        return -(self.measured**2 / variance + math.log(variance)) / 2
+
+    def beyond(self, size: float) -> tuple[float, float]:
+        """The probabilities that the number is larger than this, with and without measurement."""
+        gain = self.spread**2 / (self.sigma**2 + self.spread**2)
+        mean, deviation = gain * self.measured, math.sqrt(gain) * self.sigma
+        after = ndtr((mean - size) / deviation) + ndtr((-mean - size) / deviation)
+        return float(after), float(2 * ndtr(-size / self.spread))
+
+
+def check_parameter(found: LensParameter, by: str, better: str, kind: str) -> Check:
+    """Whether a lens parameter is wrong.
+
+    Args:
+        found: its estimate.
+        by: what it is an estimate by.
+        better: the lens that would be right, in words.
+        kind: of the check.
+    """
+    row = threshold("lens")
+    status = row.grade(found.probability)
+    text = (
+        f"by the {by}, {better} ({found.significance} sigma) would move the camera by "
+        f"{found.moved_deg:.2g} deg, {found.moved_cm:.2g} cm"
+    )
+    if status != "PASS":
+        text += f"; {row.advice}"
+    name = f"{found.name} by the {by}: {row.name}"
+    return replace(row.describe(found.probability, status, text, name=name), kind=kind)

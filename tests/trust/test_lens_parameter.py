@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from calibgraph.trust.lens_parameter import LensParameter, check_parameter
+
+
+def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
+    return LensParameter(name, np.array([size]), np.array([sigma]), np.ones(1), 0.0, moved_cm)
+
+
+def test_a_parameter_of_which_the_residuals_say_nothing_raises_no_doubt() -> None:
+    assert estimate("focal length", 0.5, 1.0, 500.0).probability == pytest.approx(0.0, abs=1e-3)
+    assert estimate("focal length", 0.0, 1e-4, 0.0).probability == 0.0
+    assert estimate("focal length", 0.01, math.nan, 50.0).probability == 0.0
+
+
+def test_a_small_change_counts_by_how_far_it_moves_the_camera() -> None:
+    near, far = (estimate("focal length", 0.005, 1e-4, moved_cm) for moved_cm in (2.0, 30.0))
+    assert near.probability < 1e-6
+    assert far.probability > 0.5  # noqa: PLR2004
+
+
+def test_the_probability_grows_with_the_significance() -> None:
+    found = [
+        estimate("distortion", 0.03, 0.03 / sigmas, 30.0).probability for sigmas in (1, 3, 5, 9)
+    ]
+    assert found == sorted(found) and found[0] < 0.01 and found[-1] > 0.9  # noqa: PLR2004
+
+
+def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> None:
+    assert estimate("skew", 0.03, 0.002, 0.1).probability > 0.9  # noqa: PLR2004
+    assert estimate("focal length", 0.03, 0.002, 0.1).probability < 1e-6  # noqa: PLR2004
+
+
+def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
+    assert estimate("focal length", 1.0, 1e-3, 1e10).probability > 0.9  # noqa: PLR2004
+
+
+def test_a_single_frame_leaves_the_significance_unknown() -> None:
+    check = check_parameter(estimate("skew", 0.03, math.nan, 0.1), "images", "a skew", "skew")
+    assert check.status == "PASS" and "unknown sigma" in check.text
