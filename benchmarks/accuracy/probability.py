@@ -34,6 +34,7 @@ from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import class_of
 from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph.model.verdict import FAIL_ABOVE, Check, Doubt, Verdict
+from calibgraph.trust.lens_parameter import probability_of_lens
 from calibgraph.trust.probability import (
     STRUCTURE,
     TABLES,
@@ -70,7 +71,8 @@ class Sample:
         level: "table" or "data".
         kind: of the case.
         severities: per kind of check.
-        by_bar: the probability that its error bar alone allows.
+        given: the probability by its error bar and the checks of its lens alone.
+        by_bar: by the error bar.
         off: whether it is off.
         right: whether it is right: well within the tolerance.
         vote: the worst status of its checks.
@@ -79,6 +81,7 @@ class Sample:
     level: str
     kind: str
     severities: dict[str, float]
+    given: float
     by_bar: float
     off: bool
     right: bool
@@ -88,16 +91,27 @@ class Sample:
 def samples_of(records: Iterable[Record]) -> list[Sample]:
     """The results of cases that data can tell from right ones, without those decided anyway."""
     return [
-        Sample(
-            record["level"], record["kind"],
-            worst_severities((kind, severity) for kind, _, _, severity, _ in camera["checks"]),
-            probability_beyond(_matrix(camera["covariance"]), TOLERANCE),
-            class_of(camera) == "off", class_of(camera) == "right", _vote(camera["checks"]),
-        )
+        _sample(record, camera)
         for record in records if record["kind"] not in UNCOUNTED
         for camera in record.get("cameras", {}).values()
         if not any(decisive for *_, decisive in camera["checks"])
     ]  # fmt: skip
+
+
+def _sample(record: Record, camera: Record) -> Sample:
+    checks, which = camera["checks"], class_of(camera)
+    by_bar = probability_beyond(_matrix(camera["covariance"]), TOLERANCE)
+    by_lens = probability_of_lens((kind, status, value) for kind, status, value, *_ in checks)
+    return Sample(
+        level=record["level"],
+        kind=record["kind"],
+        severities=worst_severities((kind, severity) for kind, _, _, severity, _ in checks),
+        given=1 - (1 - by_bar) * (1 - by_lens),
+        by_bar=by_bar,
+        off=which == "off",
+        right=which == "right",
+        vote=_vote(checks),
+    )
 
 
 def _matrix(rows: list[list[float]] | None) -> Array | None:
@@ -115,7 +129,7 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
         [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
     ).reshape(len(samples), -1)
     off = np.array([sample.off for sample in samples])
-    by_bar = np.array([sample.by_bar for sample in samples])
+    given = np.array([sample.given for sample in samples])
     share = off.mean()
     counts = np.where(off, 0.5 / share, 0.5 / (1 - share))
     mean, spread = np.tile(USUAL, len(kinds)), np.tile(SPREAD, len(kinds))
@@ -123,7 +137,7 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     def loss(values: Array) -> tuple[float, Array]:
         z = values[0] + rows @ values[1:]
         right = 1 / (1 + np.exp(z))  # not grossly wrong
-        p = np.clip(1 - right * (1 - by_bar), 1e-12, 1 - 1e-12)
+        p = np.clip(1 - right * (1 - given), 1e-12, 1 - 1e-12)
         likelihood = counts * np.where(off, np.log(p), np.log(1 - p))
         slope = counts * np.where(off, (1 - p) * (1 - right) / p, right - 1)
         away = np.append((values[0] - INTERCEPT) / INTERCEPT_SPREAD, (values[1:] - mean) / spread)
@@ -151,7 +165,7 @@ def probabilities(model: dict[str, Any], samples: Sequence[Sample]) -> Array:
     return np.array([
         1 - (1 - expit(model["intercept"] + sum(
             contributions(s.severities, model["weights"], model["other"]).values()
-        ))) * (1 - s.by_bar)
+        ))) * (1 - s.given)
         for s in samples
     ])  # fmt: skip
 

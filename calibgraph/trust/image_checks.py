@@ -14,7 +14,7 @@ from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
-from calibgraph.trust.lens_parameter import LensParameter, check_parameter
+from calibgraph.trust.lens_parameter import IMAGES, LensParameter, check_parameter
 from calibgraph.trust.thresholds import limit, threshold
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
 
@@ -142,10 +142,7 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
-    return tuple(
-        check_parameter(each, "images", _better(each), each.name.replace(" ", "_"))
-        for each in found.lens
-    )
+    return tuple(check_parameter(each, IMAGES, _better(each)) for each in found.lens)
 
 
 def _better(found: LensParameter) -> str:

@@ -19,7 +19,7 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.lens_parameter import LensParameter, check_parameter
+from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter, check_parameter
 from calibgraph.trust.thresholds import limit, threshold
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def check_intrinsics(
     )
     shared = max(of_place, limit("lens_match_share") * len(some))
     checks = [
-        _check_freed(_free(name, fit, camera))
+        check_parameter(freed := _free(name, fit, camera), RESIDUALS, _describe(freed))
         for name, numbers in _UNKNOWNS.items()
         if (fit := rows.fit(numbers, loss_scale=scale.loss_scale, shared_variance=shared))
     ]
@@ -107,12 +107,6 @@ def _free(name: str, fit: AugmentedFit, camera: Camera) -> LensParameter:
     k = camera.intrinsics_px
     unit = np.array([k.fx, k.fy]) if name == "principal point" else np.ones(1)
     return LensParameter(name, fit.values, fit.sigmas, unit, degrees, centimetres)
-
-
-def _check_freed(freed: LensParameter) -> Check:
-    """Whether a lens parameter is wrong, by the residuals."""
-    kind = f"lens_{freed.name.replace(' ', '_')}"
-    return check_parameter(freed, "residuals over the image", _describe(freed), kind)
 
 
 def _check_sensitivity(twist: Array) -> Check:

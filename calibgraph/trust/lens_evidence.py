@@ -22,11 +22,9 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
-from calibgraph.trust.lens_parameter import LensParameter
+from calibgraph.trust.lens_parameter import NAMES, LensParameter
 
 Array = NDArray[np.float64]
-
-NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew")
 SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
 SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
 MAX_RADIAL = 0.3
@@ -40,7 +38,7 @@ class LensEvidence:
     """The lens that fits the images best.
 
     Attributes:
-        parameters: those of ``NAMES``, see above; none where the images do not determine them.
+        parameters: those of ``NAMES``, changed as above; none where images do not determine them.
         gain: of the summed score at the best pose nearby with its own lens over that at the result,
             in standard deviations of chance agreement.
     """

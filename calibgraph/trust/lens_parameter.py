@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, ndtr
 
-from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.trust.thresholds import limit, threshold
 
 Array = NDArray[np.float64]
 
-SHAPES = ("aspect ratio", "skew")
-"""Names of the parameters that no lens of this kind has wrong by much."""
+NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew")
+SHAPES = NAMES[3:]
+"""Those that no lens has wrong by much."""
+
+RESIDUALS, IMAGES = "residuals over the image", "images"
+"""What an estimate is by."""
+
+KINDS = {
+    RESIDUALS: {name: f"lens_{name.replace(' ', '_')}" for name in NAMES},
+    IMAGES: {name: name.replace(" ", "_") for name in NAMES},
+}
+"""Kinds of the checks."""
+LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +122,13 @@ class _Posterior:
         return float(after), float(2 * ndtr(-size / self.spread))
 
 
-def check_parameter(found: LensParameter, by: str, better: str, kind: str) -> Check:
-    """Whether a lens parameter is wrong.
+def check_parameter(found: LensParameter, by: str, better: str) -> Check:
+    """Whether a lens parameter is wrong: the value of the check is the probability.
 
     Args:
         found: its estimate.
-        by: what it is an estimate by.
+        by: RESIDUALS or IMAGES.
         better: the lens that would be right, in words.
-        kind: of the check.
     """
     row = threshold("lens")
     status = row.grade(found.probability)
@@ -128,4 +139,17 @@ def check_parameter(found: LensParameter, by: str, better: str, kind: str) -> Ch
     if status != "PASS":
         text += f"; {row.advice}"
     name = f"{found.name} by the {by}: {row.name}"
-    return replace(row.describe(found.probability, status, text, name=name), kind=kind)
+    check = row.describe(found.probability, status, text, name=name)
+    return replace(check, kind=KINDS[by][found.name])
+
+
+def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:
+    """The probability that the worst of the lens parameters is wrong.
+
+    Args:
+        values: kind, status and value of checks. One that is a WARN counts as one, whatever its
+            value.
+    """
+    most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
+    of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]
+    return max((min(value or 0.0, most[status]) for status, value in of_lens), default=0.0)

@@ -1,15 +1,16 @@
 """The probability that a result is off by more than the user's tolerance: what a verdict is cut of.
 
-Two ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check is,
-which can only grow as a check gets worse. And by the error bar itself, if it is wide beside the
-tolerance. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made
-wrong on purpose and right ones, and kept in ``probability.json`` with how they were got.
+Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check
+is, which can only grow as a check gets worse. By a wrong lens: checks whose value is a probability.
+And by the error bar itself, if it is wide beside the tolerance. The weights are fitted by
+``benchmarks.accuracy.probability``, on results that were made wrong on purpose and right ones, and
+kept in ``probability.json`` with how they were got.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from operator import mul
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
 from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 Array = NDArray[np.float64]
 
@@ -51,20 +53,24 @@ def model_of(metadata: Mapping[str, Any]) -> str:
 
 
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:
-    """The probability that a result is grossly wrong, by its checks; 1 if one is decisive."""
+    """The probability that a result is wrong, by its checks; 1 if one is decisive."""
     if any(check.decisive for check in checks):
         return 1.0
     fitted = _models()[model]
-    worst = worst_severities((check.kind or check.name, check.severity) for check in checks)
+    kinds = [check.kind or check.name for check in checks]
+    worst = worst_severities(zip(kinds, (check.severity for check in checks), strict=True))
     parts = contributions(worst, fitted["weights"], fitted["other"])
-    return float(expit(fitted["intercept"] + sum(parts.values())))
+    grossly = float(expit(fitted["intercept"] + sum(parts.values())))
+    values = [(k, check.status, check.value) for k, check in zip(kinds, checks, strict=True)]
+    return 1.0 - (1.0 - grossly) * (1.0 - probability_of_lens(values))
 
 
-def worst_severities(checks: Any) -> dict[str, float]:
-    """Per kind of check the worst severity, of (kind, severity) pairs."""
+def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """The worst of (kind, severity) pairs per kind of check, without those of the lens."""
     worst: dict[str, float] = {}
     for kind, severity in checks:
-        worst[kind] = max(severity, worst.get(kind, 0.0))
+        if kind not in LENS_KINDS:
+            worst[kind] = max(severity, worst.get(kind, 0.0))
     return worst
 
 

@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from calibgraph.trust.lens_parameter import LensParameter, check_parameter
+from calibgraph.model.verdict import FAIL_ABOVE
+from calibgraph.trust.lens_parameter import (
+    IMAGES,
+    LensParameter,
+    check_parameter,
+    probability_of_lens,
+)
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
@@ -41,5 +47,13 @@ def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
 
 
 def test_a_single_frame_leaves_the_significance_unknown() -> None:
-    check = check_parameter(estimate("skew", 0.03, math.nan, 0.1), "images", "a skew", "skew")
+    check = check_parameter(estimate("skew", 0.03, math.nan, 0.1), IMAGES, "a skew of 0.03")
     assert check.status == "PASS" and "unknown sigma" in check.text
+
+
+def test_the_worst_lens_parameter_counts_and_a_warning_as_one() -> None:
+    assert probability_of_lens([]) == 0.0
+    found = probability_of_lens([("skew", "PASS", 1e-3), ("lens_skew", "FAIL", 0.7)])
+    assert found == 0.7  # noqa: PLR2004
+    assert probability_of_lens([("skew", "WARN", 0.7), ("frames", "FAIL", 0.9)]) == FAIL_ABOVE
+    assert probability_of_lens([("skew", "PASS", None)]) == 0.0
