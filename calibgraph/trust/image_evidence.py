@@ -23,12 +23,10 @@ from numpy.typing import NDArray
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
-from calibgraph.matching.structure.matcher import PLACE_VARIANCE
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
-from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
 from calibgraph.trust.lens_evidence import measure_lens
 from calibgraph.trust.lens_parameter import LensParameter
@@ -83,7 +81,7 @@ def measure_image_evidence(
     Args:
         dataset: images and clouds.
         rig: lenses, and the extrinsics in question.
-        places: metadata of its correspondences, which name the frames of each place.
+        places: metadata of its correspondences: the frames of each place, and repeated ones.
         seed: of the search for the lens.
         extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
             take most of the time.
@@ -94,9 +92,7 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        numbers = np.array([frame.index for frame in frames])
-        shared = PLACE_VARIANCE * frames_of_one_place(places or {}, numbers)
-        measure = partial(_measure_camera, scorer, seed, shared)
+        measure = partial(_measure_camera, scorer, seed, places or {})
         if extrinsics_only:
             measure = partial(_measure_extrinsic, scorer)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
@@ -115,14 +111,14 @@ def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageE
 
 
 def _measure_camera(
-    scorer: FrameScorer, seed: int, shared_variance: float, name: str, camera: Camera
+    scorer: FrameScorer, seed: int, places: Mapping[str, Any], name: str, camera: Camera
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
     groups = len(scores.counts)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
-    lens = measure_lens(scorer, images, camera, scores, seed=seed, shared_variance=shared_variance)
+    lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
     return ImageEvidence(
         groups,
         lens=lens.parameters,

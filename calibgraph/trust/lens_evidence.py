@@ -9,18 +9,23 @@ axis). Across that side, a principal point cannot be told from a rotation.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.consensus import maximize_score, sum_scores
+from calibgraph.matching.structure.matcher import PLACE_VARIANCE
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.rig import Camera
 from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.repeats import frames_of_one_place, number_by_place
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import NAMES, LensParameter
 
@@ -54,7 +59,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     scores: ShiftScores,
     *,
     seed: int,
-    shared_variance: float,
+    places: Mapping[str, Any] = MappingProxyType({}),
 ) -> LensEvidence:
     """Find the lens that fits the images best, with the pose free: a search, then two fits.
 
@@ -64,19 +69,18 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
         camera: at the result.
         scores: of the camera at the level ``WIDE``.
         seed: of the search.
-        shared_variance: of what frames of one place share, see
-            :meth:`calibgraph.solver.augmented_fit.LinearRows.fit`.
+        places: metadata of correspondences, which name the frames of each place, and repeated ones.
     """
     if camera.model == "equirectangular":  # the format determines it: the pose alone is free
         return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
     best, gain = _search(camera, scores, _TO_CENTRE, seed)
-    shape = _shape(camera, scores, seed, shared_variance)
-    rough = _fit_at_peaks(camera, scores, best, shared_variance)
+    shape = _shape(camera, scores, seed, places)
+    rough = _fit_at_peaks(camera, scores, best, places)
     if rough is None:
         return LensEvidence(gain=gain)
     refined = change_lens(apply_twist(camera, rough.twist), np.append(rough.values, 0.0))
     finer = scorer.score_together(images, refined, FINER)
-    fine = _fit_at_peaks(refined, finer, np.zeros(9), shared_variance)
+    fine = _fit_at_peaks(refined, finer, np.zeros(9), places)
     if fine is None:
         return LensEvidence(gain=gain)
     together = replace(fine, values=rough.values + fine.values)
@@ -106,7 +110,7 @@ def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[
 
 
 def _shape(
-    camera: Camera, scores: ShiftScores, seed: int, shared_variance: float
+    camera: Camera, scores: ShiftScores, seed: int, places: Mapping[str, Any]
 ) -> list[LensParameter]:
     """Changes of the logarithm of fx / fy and of the skew.
 
@@ -115,7 +119,7 @@ def _shape(
     """
     best, _ = _search(camera, scores, _TO_ASPECT, seed)
     starts = (best, np.append(best, 0.0))
-    fits = [_fit_at_peaks(camera, scores, start, shared_variance) for start in starts]
+    fits = [_fit_at_peaks(camera, scores, start, places) for start in starts]
     return [
         _parameter(name, fit, len(fit.values) - 1)
         for name, fit in zip(NAMES[_TO_CENTRE:], fits, strict=True)
@@ -157,7 +161,7 @@ def change_lens(camera: Camera, change: Array) -> Camera:
 
 
 def _fit_at_peaks(
-    camera: Camera, scores: ShiftScores, start: Array, shared_variance: float
+    camera: Camera, scores: ShiftScores, start: Array, places: Mapping[str, Any]
 ) -> AugmentedFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
     if not len(scores.counts):
@@ -165,8 +169,10 @@ def _fit_at_peaks(
     lens = len(start) - 6
     extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))
     table = extract_correspondences(extended, start, "camera")
+    table = replace(table, frame=number_by_place(places, table.frame))
     jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
-    return fit_augmented(camera, table, jacobian_px, shared_variance=shared_variance)
+    shared = PLACE_VARIANCE * frames_of_one_place(places, np.unique(table.frame))
+    return fit_augmented(camera, table, jacobian_px, shared_variance=shared)
 
 
 def _jacobian_with_lens(scores: ShiftScores, camera: Camera, lens: int) -> Array:

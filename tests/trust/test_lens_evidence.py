@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 import calibgraph
 from calibgraph import Camera, Dataset, Rig
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
+from calibgraph.solver.repeats import SAME_PLACE
 from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
@@ -33,13 +36,17 @@ def truth() -> Camera:
     return calibgraph.load_rig(SAMPLE / "reference.yaml").cameras[NAME]
 
 
-def measure(camera: Camera, dataset: Dataset | None = None) -> LensEvidence:
+def measure(
+    camera: Camera, dataset: Dataset | None = None, same_place: Sequence[int] = (0,)
+) -> LensEvidence:
     dataset = dataset or calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(dataset, dataset.frames, pool)
         images = scorer.load_images(NAME, camera)
         scores = scorer.score_together(images, camera, WIDE)
-        return measure_lens(scorer, images, camera, scores, seed=0, shared_variance=0.0)
+        return measure_lens(
+            scorer, images, camera, scores, seed=0, places={SAME_PLACE: [[*same_place]]}
+        )
 
 
 def statuses(lens: LensEvidence) -> dict[str, str]:
@@ -78,6 +85,12 @@ def test_a_wrong_lens_is_named_and_measured(
     if name == "aspect ratio":  # half of it is a focal length
         return
     assert all(status[other] == "PASS" for other in NAMES if other != name)
+
+
+def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
+    found = measure(change_lens(truth, np.array([0.03, 0.0, 0.0, 0.0])), same_place=range(6))
+    assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found.parameters)
+    assert abs(found.parameters[0].values[0]) > 0.01  # noqa: PLR2004
 
 
 @pytest.mark.parametrize("skew", [-0.03, 0.03])
