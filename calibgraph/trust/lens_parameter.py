@@ -29,6 +29,9 @@ KINDS = {
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
 
+_ANYTHING = 1e6  # standard deviation of a parameter that is not determined
+_MOST_SIGMAS = 1e6  # enough for any probability
+
 
 @dataclass(frozen=True, eq=False)
 class LensParameter:
@@ -80,7 +83,7 @@ class LensParameter:
         aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
         matches from rounds have followed it.
         """
-        if math.isnan(self.sigma):
+        if not self.sigma < _ANYTHING:
             return 0.0
         moves = max(self.moved_deg / TOLERANCE[0], self.moved_cm / TOLERANCE[1])
         tolerated = self.size / moves if moves else math.inf
@@ -109,15 +112,20 @@ class _Posterior:
     spread: float
 
     @property
+    def total(self) -> float:
+        """Standard deviation of the measurement."""
+        return math.hypot(self.sigma, self.spread)
+
+    @property
     def log_evidence(self) -> float:
         """Of the measurement, up to a constant."""
-        variance = self.sigma**2 + self.spread**2
-        return -(self.measured**2 / variance + math.log(variance)) / 2
+        sigmas = min(self.measured / self.total, _MOST_SIGMAS)
+        return -(sigmas**2) / 2 - math.log(self.total)
 
     def beyond(self, size: float) -> tuple[float, float]:
         """The probabilities that the number is larger than this, with and without measurement."""
-        gain = self.spread**2 / (self.sigma**2 + self.spread**2)
-        mean, deviation = gain * self.measured, math.sqrt(gain) * self.sigma
+        gain = self.spread / self.total
+        mean, deviation = gain**2 * self.measured, gain * self.sigma
         after = ndtr((mean - size) / deviation) + ndtr((-mean - size) / deviation)
         return float(after), float(2 * ndtr(-size / self.spread))
 

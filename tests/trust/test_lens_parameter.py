@@ -21,7 +21,8 @@ def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParam
 def test_a_parameter_of_which_the_residuals_say_nothing_raises_no_doubt() -> None:
     assert estimate("focal length", 0.5, 1.0, 500.0).probability == pytest.approx(0.0, abs=1e-3)
     assert estimate("focal length", 0.0, 1e-4, 0.0).probability == 0.0
-    assert estimate("focal length", 0.01, math.nan, 50.0).probability == 0.0
+    for sigma in (math.nan, math.inf, 1e100):
+        assert estimate("focal length", 0.01, sigma, 50.0).probability == 0.0
 
 
 def test_a_small_change_counts_by_how_far_it_moves_the_camera() -> None:
@@ -44,6 +45,7 @@ def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> 
 
 def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
     assert estimate("focal length", 1.0, 1e-3, 1e10).probability > 0.9  # noqa: PLR2004
+    assert estimate("focal length", 1e100, 1e-3, 1e10).probability > 0.9  # noqa: PLR2004
 
 
 def test_a_single_frame_leaves_the_significance_unknown() -> None:
