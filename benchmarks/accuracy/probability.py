@@ -71,8 +71,8 @@ class Sample:
         level: "table" or "data".
         kind: of the case.
         severities: per kind of check.
-        given: the probability by its error bar and the checks of its lens alone.
-        by_bar: by the error bar.
+        by_bar: the probability that its error bar alone allows.
+        by_lens: that of a wrong lens.
         off: whether it is off.
         right: whether it is right: well within the tolerance.
         vote: the worst status of its checks.
@@ -81,11 +81,16 @@ class Sample:
     level: str
     kind: str
     severities: dict[str, float]
-    given: float
     by_bar: float
+    by_lens: float
     off: bool
     right: bool
     vote: str
+
+    @property
+    def given(self) -> float:
+        """The probability by its error bar and its lens."""
+        return 1 - (1 - self.by_bar) * (1 - self.by_lens)
 
 
 def samples_of(records: Iterable[Record]) -> list[Sample]:
@@ -100,14 +105,12 @@ def samples_of(records: Iterable[Record]) -> list[Sample]:
 
 def _sample(record: Record, camera: Record) -> Sample:
     checks, which = camera["checks"], class_of(camera)
-    by_bar = probability_beyond(_matrix(camera["covariance"]), TOLERANCE)
-    by_lens = probability_of_lens((kind, status, value) for kind, status, value, *_ in checks)
     return Sample(
         level=record["level"],
         kind=record["kind"],
         severities=worst_severities((kind, severity) for kind, _, _, severity, _ in checks),
-        given=1 - (1 - by_bar) * (1 - by_lens),
-        by_bar=by_bar,
+        by_bar=probability_beyond(_matrix(camera["covariance"]), TOLERANCE),
+        by_lens=probability_of_lens((kind, status, value) for kind, status, value, *_ in checks),
         off=which == "off",
         right=which == "right",
         vote=_vote(checks),
@@ -160,21 +163,28 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
+def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[Doubt]:
+    """Of every sample."""
+    weights, other = model["weights"], model["other"]
+    grossly = [
+        expit(model["intercept"] + sum(contributions(s.severities, weights, other).values()))
+        for s in samples
+    ]
+    return [
+        Doubt(1 - (1 - p) * (1 - s.by_lens), s.by_bar)
+        for p, s in zip(grossly, samples, strict=True)
+    ]
+
+
 def probabilities(model: dict[str, Any], samples: Sequence[Sample]) -> Array:
     """(n,) of every sample."""
-    return np.array([
-        1 - (1 - expit(model["intercept"] + sum(
-            contributions(s.severities, model["weights"], model["other"]).values()
-        ))) * (1 - s.given)
-        for s in samples
-    ])  # fmt: skip
+    return np.array([doubt.probability for doubt in doubts(model, samples)])
 
 
-def status_of(sample: Sample, p: float) -> str:
+def status_of(sample: Sample, doubt: Doubt) -> str:
     """The verdict, by the probability that it is off."""
-    by_checks = 1 - (1 - p) / max(1 - sample.by_bar, 1e-12)
     checks = (Check("worst", sample.vote, ""),)  # type: ignore[arg-type]
-    return Verdict(checks, Doubt(by_checks, sample.by_bar)).status
+    return Verdict(checks, doubt).status
 
 
 def judged(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[Table]:
@@ -189,9 +199,8 @@ def judged(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[
 def cuts(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> Table:
     """How many results of each class get each verdict."""
     classes = ["off" if s.off else "right" if s.right else "between" for s in samples]
-    p, rows = probabilities(model, samples), []
-    for how, statuses in (("vote", [s.vote for s in samples]),
-                          ("probability", [*map(status_of, samples, p)])):  # fmt: skip
+    judged, rows = [*map(status_of, samples, doubts(model, samples))], []
+    for how, statuses in (("vote", [s.vote for s in samples]), ("probability", judged)):
         found = Counter(zip(classes, statuses, strict=True))
         rows.append((how, *(str(found[c, s]) for c in ("off", "between", "right") for s in VOTE)))
     columns = ("", *(f"{c}: {s}" for c in ("off", "between", "right") for s in VOTE))
