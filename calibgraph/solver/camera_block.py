@@ -109,20 +109,6 @@ class CameraBlock:
         information = None if self.information is None else self.information[rows]
         return CameraBlock(self.block.select(rows), information, self.frame[rows])
 
-    def as_table(self, *, camera: str) -> Correspondences:
-        """As a table of correspondences, their weights as information."""
-        root, information = self.block.sqrt_information, None
-        if root is not None:  # upper triangular, [[a, b], [0, c]]
-            a, b, c = root.T
-            information = np.column_stack([a * a, a * b, b * b + c * c])
-        return Correspondences.from_arrays(
-            camera=camera,
-            frame=self.frame,
-            pixels_px=self.block.pixels_px,
-            points_lidar_m=self.block.points_lidar_m,
-            information_px=information,
-        )
-
     def at(self, T_camera_lidar: Array) -> BlockResiduals:
         """The residuals at a (4, 4) T_camera_lidar, for callers that use them more than once."""
         T_lidar_camera = to_T_lidar_camera(T_camera_lidar)

@@ -24,7 +24,7 @@ def _move(columns, which, factors, errors):  # type: ignore[no-untyped-def]
         The largest change of one of them.
     """
     k, n = len(which), columns.shape[2]
-    moved, largest = np.empty(_TILE), 0.0
+    moved, changes, largest = np.empty(_TILE), np.zeros(_TILE), 0.0
     for start in range(0, n, _TILE):
         end = min(start + _TILE, n)
         for part in range(2):
@@ -35,8 +35,11 @@ def _move(columns, which, factors, errors):  # type: ignore[no-untyped-def]
                     moved[i] += factor * source[i]
             target = errors[part, start:end]
             for i in range(end - start):
-                largest = max(largest, abs(moved[i] - target[i]))
+                change = abs(moved[i] - target[i])
+                changes[i] = change if change > changes[i] else changes[i]
                 target[i] = moved[i]
+    for i in range(_TILE):  # one maximum over all rows would not be vectorized
+        largest = max(largest, changes[i])
     return largest
 
 

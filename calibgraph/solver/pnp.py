@@ -50,7 +50,7 @@ class Refined:
 
 def frame_pose(
     camera: Camera,
-    matches: Correspondences,
+    matches: Correspondences | ProjectionBlock,
     config: Config,
     *,
     iterations: int = RANSAC_ITERATIONS,
@@ -62,18 +62,19 @@ def frame_pose(
 
     Args:
         camera: its lens.
-        matches: of one frame.
+        matches: of one frame, taken without weights.
         config: ``pnp_threshold_px``, ``seed``.
         iterations: samples of MAGSAC, at most.
 
     Returns:
         None if too few matches agree on an extrinsic, or if they leave a direction of it free.
     """
-    matches = select_evenly(matches, _MAX_SAMPLE)
-    start = ransac_pnp(camera, matches, config, iterations=iterations)
+    step = -(-len(matches) // _MAX_SAMPLE) or None
+    points_lidar_m, pixels_px = matches.points_lidar_m[::step], matches.pixels_px[::step]
+    block = ProjectionBlock(camera.lens, points_lidar_m, pixels_px)
+    start = ransac_pnp(camera, block, config, iterations=iterations)
     if start is None:
         return None
-    block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
     refined = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
     return refined.T_camera_lidar[0] if refined.found[0] else None
 
@@ -100,7 +101,7 @@ def normalized(camera: Camera, pixels_px: Array) -> Array:
 
 def ransac_pnp(
     camera: Camera,
-    matches: Correspondences,
+    matches: Correspondences | ProjectionBlock,
     config: Config,
     *,
     iterations: int = RANSAC_ITERATIONS,

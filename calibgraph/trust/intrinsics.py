@@ -7,7 +7,7 @@ check is how far the camera moves when it is set free, and with which significan
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class FreedParameter:
     moved_deg: float
     moved_cm: float
 
-    @property
+    @cached_property
     def largest(self) -> float:
         """The largest of the values."""
         return float(np.abs(self.values).max())
@@ -68,7 +68,7 @@ class FreedParameter:
         """Whether pixels would not be square, by more than lenses are."""
         return self.name in _SHAPES and self.largest > limit("shape_warn")
 
-    @property
+    @cached_property
     def significance(self) -> float:
         """The largest of the values in its standard deviations."""
         return float(np.max(np.abs(self.values) / np.maximum(self.sigmas, np.finfo(float).tiny)))
@@ -77,10 +77,10 @@ class FreedParameter:
 def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals, and how much depends on the focal length."""
     solution = evidence.of_correspondences.solution
+    cameras = solution.solved_rig.cameras
 
     def of_camera(name: str) -> list[Check]:
-        camera = solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name])
-        return check_intrinsics(camera, evidence.fitted_blocks[name], solution.scales[name])
+        return check_intrinsics(cameras[name], evidence.fitted_blocks[name], solution.scales[name])
 
     names = [*evidence.fitted_blocks]
     return dict(zip(names, map_on_cores(of_camera, names), strict=True))
