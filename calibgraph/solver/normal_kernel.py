@@ -163,14 +163,21 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
     return factors[:k], products[:k, :k], weights, errors, True
 
 
-@compiled()
+@compiled(fastmath=_FAST)
 def grouped_gradients(columns, which, errors, weights, group, count):  # type: ignore[no-untyped-def]
     """(count, k) sums of weighted columns times (2, n) errors, over the rows of each group."""
-    k = len(which)
+    k, n, end = len(which), len(weights), 0
     out = np.zeros((count, k))
-    for i in range(len(weights)):
-        u, v = weights[i] * errors[0, i], weights[i] * errors[1, i]
-        own = out[group[i]]
+    weighted = weights * errors
+    while end < n:
+        start, own = end, group[end]
+        while end < n and group[end] == own:
+            end += 1
+        in_u, in_v = weighted[0, start:end], weighted[1, start:end]
         for a in range(k):
-            own[a] += columns[which[a], 0, i] * u + columns[which[a], 1, i] * v
+            u, v = columns[which[a]][0, start:end], columns[which[a]][1, start:end]
+            total = 0.0
+            for i in range(end - start):
+                total += u[i] * in_u[i] + v[i] * in_v[i]
+            out[own, a] += total
     return out
