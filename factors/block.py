@@ -142,12 +142,11 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         return unpack_sums(sums.sum(axis=0))
 
-    def gradients_at_each(self, poses: Sequence[gtsam.Pose3]) -> Array:
-        """(p, 6) b of the whole block at each of some T_lidar_camera."""
-        each = contiguous(np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4))
+    def gradients_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
         gradients: Array = gradients_alone(
-            self.lens.kind, self.lens.packed, each, self._columns, self._whitening,
-            loss_id(self.loss), self.scale * self.sigma,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma,
         )  # fmt: skip
         return gradients / self.sigma**2
 

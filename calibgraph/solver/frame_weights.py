@@ -24,7 +24,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
+from calibgraph.solver.frame_fits import DAMPING, FrameFits, fit_each_frame
+from calibgraph.solver.frame_poses import solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
@@ -158,7 +159,7 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """
     center, noise = start, frames.noise
     typical = float(np.median(noise))
-    T_lidar_camera = invert(frames.T_camera_lidar)
+    T_lidar_camera, flat = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -172,9 +173,9 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
-        hessian = np.tensordot(weights, frames.hessians, 1)
-        step = np.linalg.solve(damped(hessian), weights @ products)
-        center = retract_all(center[None], step[None])[0]
+        hessian = (weights @ flat).reshape(1, 6, 6)
+        step = -solve_damped(hessian, (weights @ products)[None], DAMPING)
+        center = retract_all(center[None], step)[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()

@@ -133,9 +133,9 @@ class Shard:
         return np.concatenate([sums.hessian[_UPPER], sums.gradient, [sums.cost]])
 
     def gradients(self, stage: str, camera: str, T: Array, scale: float, sigma: float) -> Array:
-        """(p, 6) b at each of (p, 4, 4) T_lidar_camera."""
+        """(p, 6) b at each of (p, 4, 4) T_camera_lidar."""
         block = self._blocks[stage, camera].block.rescale(scale=scale, sigma=sigma)
-        return block.gradients_at_each([gtsam.Pose3(pose) for pose in T])
+        return block.gradients_at_each(T)
 
     def frame_gradients(self, stage: str, camera: str, T: Array, scale: ResidualScale) -> Array:
         """(f, 6) of each frame at a (4, 4) T_lidar_camera."""
