@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -178,8 +179,8 @@ class ProjectionBlock(RobustBlock):
     def _run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None
     ) -> Array:
-        evaluations = int((runs[:, 1] - runs[:, 0]).sum())
-        shared = evaluations >= _WORTH_SHARING
+        shared = len(runs) * len(self) >= _WORTH_SHARING
+        shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
         run = one_at_a_time(accumulate_shared) if shared else accumulate_alone
         scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
@@ -246,6 +247,7 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return read_only(runs)
 
 
+@lru_cache
 def _cut(count: int) -> NDArray[np.int64]:
     """(c, 2) the runs of so many correspondences, see _CHUNK."""
     edges = np.arange(0, count + _CHUNK, _CHUNK)
