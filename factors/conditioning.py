@@ -86,7 +86,7 @@ def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-de
             scaled[i, j] = scaled[j, i] = hessian[i, j] / (units[i] * units[j])
     jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
     if not _fill_triangular_root(scaled, along, jacobian, error):
-        jacobian[:], error[:] = 0.0, 0.0
+        jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
         values, vectors = np.linalg.eigh(scaled)
         for k in range(n):
             if values[k] > 1e-14 * max(values[n - 1], 0.0):

@@ -167,17 +167,16 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
 def grouped_gradients(columns, which, errors, weights, group, count):  # type: ignore[no-untyped-def]
     """(count, k) sums of weighted columns times (2, n) errors, over the rows of each group."""
     k, n, end = len(which), len(weights), 0
-    out = np.zeros((count, k))
-    weighted = weights * errors
+    out, in_u, in_v = np.zeros((count, k)), np.empty(n), np.empty(n)
+    for i in range(n):
+        in_u[i], in_v[i] = weights[i] * errors[0, i], weights[i] * errors[1, i]
     while end < n:
         start, own = end, group[end]
         while end < n and group[end] == own:
             end += 1
-        in_u, in_v = weighted[0, start:end], weighted[1, start:end]
         for a in range(k):
-            u, v = columns[which[a]][0, start:end], columns[which[a]][1, start:end]
-            total = 0.0
-            for i in range(end - start):
+            u, v, total = columns[which[a], 0], columns[which[a], 1], 0.0
+            for i in range(start, end):
                 total += u[i] * in_u[i] + v[i] * in_v[i]
             out[own, a] += total
     return out
