@@ -16,7 +16,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
-from calibgraph.solver.frame_poses import Runs, fit_frames
+from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from factors import ProjectionBlock, smallest_scaled_eigenvalues, unproject
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would domi
 _CONE_RAD = np.radians(60.0)  # of a lens that sees all round: what one plane serves well
 _DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
+_WIDE = 10.0  # PnP thresholds: the scale of the loss of a fit from the guess
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
@@ -135,6 +136,22 @@ def ransac_pnp(
     T[:3, 3] = translation.ravel()
     T[:3] = turn.T @ T[:3]
     return T
+
+
+def pose_near_guess(
+    camera: Camera, matches: Correspondences | ProjectionBlock, config: Config
+) -> Array | None:
+    """(4, 4) T_camera_lidar by a robust fit from the camera's own, None of too few matches.
+
+    Its loss is wide, to be found from farther than the PnP threshold. Arguments as of `frame_pose`.
+    """
+    if len(matches) < MIN_MATCHES:
+        return None
+    block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
+    wide = block.rescale(scale=_WIDE * config.pnp_threshold_px)
+    start, runs = camera.T_camera_lidar[None], np.array([[0, len(block)]])
+    T_camera_lidar: Array = fit_frames(wide, runs, start, tolerance=COARSE).T_camera_lidar[0]
+    return T_camera_lidar
 
 
 def _plane_of_most(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:

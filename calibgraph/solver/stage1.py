@@ -18,7 +18,13 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from calibgraph.solver.grid import frame_edges
-from calibgraph.solver.pnp import frame_pose, ransac_pnp, refine_frames, select_evenly
+from calibgraph.solver.pnp import (
+    frame_pose,
+    pose_near_guess,
+    ransac_pnp,
+    refine_frames,
+    select_evenly,
+)
 from calibgraph.solver.rotation_median import median_rotation
 from factors import ProjectionBlock, to_runs
 
@@ -126,13 +132,17 @@ class FramePoses:
 
 
 def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> FramePoses:
-    """The poses of all frames at once, from one that MAGSAC finds for all of them together.
+    """The poses of all frames at once, from one for all of them together.
 
     Found are those that explain the majority of the frame's correspondences: no other pose can
-    explain more. Three of them do not count, which any pose explains.
+    explain more. Three of them do not count, which any pose explains. So if all are found from a
+    fit that starts at the guess, nothing is left for MAGSAC to find.
     """
-    start = ransac_pnp(camera, select_evenly(rows, COMMON_SAMPLE), config)
-    return frames_from(start, camera, rows, config)
+    sample = select_evenly(rows, COMMON_SAMPLE)
+    near = frames_from(pose_near_guess(camera, sample, config), camera, rows, config)
+    if near.found.all():
+        return near
+    return frames_from(ransac_pnp(camera, sample, config), camera, rows, config)
 
 
 def frames_from(

@@ -98,6 +98,11 @@ class Shard:
         table = self._kept.table
         return table.select(np.isin(table.frame, numbers))
 
+    def are_all_found(self, camera: str, start: Array | None) -> bool:
+        """Whether a pose near all frames of a camera leads to one of each, see ``frames_from``."""
+        frames = frames_from(start, self._rig.cameras[camera], self._rows[camera], self._config)
+        return bool(frames.found.all())
+
     def stage1(self, camera: str, start: Array | None) -> tuple[Array, Numbers]:
         """(f, 4, 4) T_camera_lidar of the frames that PnP solves; (f,) their numbers."""
         rows, model = self._rows[camera], self._rig.cameras[camera]
