@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -142,12 +143,11 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         return unpack_sums(sums.sum(axis=0))
 
-    def gradients_at_each(self, poses: Sequence[gtsam.Pose3]) -> Array:
-        """(p, 6) b of the whole block at each of some T_lidar_camera."""
-        each = contiguous(np.array([T.inverse().matrix() for T in poses]).reshape(-1, 4, 4))
+    def gradients_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
         gradients: Array = gradients_alone(
-            self.lens.kind, self.lens.packed, each, self._columns, self._whitening,
-            loss_id(self.loss), self.scale * self.sigma,
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma,
         )  # fmt: skip
         return gradients / self.sigma**2
 
@@ -179,8 +179,8 @@ class ProjectionBlock(RobustBlock):
     def _run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None
     ) -> Array:
-        evaluations = int((runs[:, 1] - runs[:, 0]).sum())
-        shared = evaluations >= _WORTH_SHARING
+        shared = len(runs) * len(self) >= _WORTH_SHARING
+        shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
         run = one_at_a_time(accumulate_shared) if shared else accumulate_alone
         scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
@@ -247,6 +247,7 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return read_only(runs)
 
 
+@lru_cache
 def _cut(count: int) -> NDArray[np.int64]:
     """(c, 2) the runs of so many correspondences, see _CHUNK."""
     edges = np.arange(0, count + _CHUNK, _CHUNK)

@@ -51,7 +51,7 @@ class RobustBlock:
 def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
     """A view that cannot be written."""
     view = array.view()
-    view.flags.writeable = False
+    view.setflags(write=False)
     return view
 
 

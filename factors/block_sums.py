@@ -30,8 +30,9 @@ class BlockSums:
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
     """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
-    H is scaled to a unit diagonal before its eigenvectors are taken, so that radians and metres
-    lose no digits to each other; directions without information get a zero row.
+    H is scaled to a unit diagonal before its root is taken, so that radians and metres lose no
+    digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
+    eigenvectors, and directions without information get a zero row.
     """
     error, jacobian = compiled_square_root(
         np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient), float(sums.cost)
@@ -39,12 +40,10 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     return error, jacobian.T
 
 
-_UPPER = np.triu_indices(6)
+_PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]
+                    for i in range(6)])  # fmt: skip
 
 
 def unpack_sums(sums: Array) -> BlockSums:
     """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
-    hessian = np.empty((*sums.shape[:-1], 6, 6))
-    hessian[..., _UPPER[0], _UPPER[1]] = sums[..., :21]
-    hessian[..., _UPPER[1], _UPPER[0]] = sums[..., :21]
-    return BlockSums(hessian, sums[..., 21:27], sums[..., 27])
+    return BlockSums(sums.take(_PLACES, axis=-1), sums[..., 21:27], sums[..., 27])

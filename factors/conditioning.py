@@ -9,6 +9,8 @@ from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
+_REGULAR = 1e-10  # least share of an unknown that those before it leave, for a triangular root
+
 
 def unit_diagonal(hessian: Array) -> tuple[Array, Array]:
     """Scale a positive semidefinite matrix to a unit diagonal; rows without information stay zero.
@@ -45,26 +47,57 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
 
 
 @compiled()
+def _fill_triangular_root(scaled, along, jacobian, error):  # type: ignore[no-untyped-def]
+    """Fill in Cholesky's root of a regular matrix, and the error; whether it is regular.
+
+    Args:
+        scaled: (n, n), of unit diagonal.
+        along: (n,) gradient in its units.
+        jacobian: (n, n + 1), filled below the diagonal.
+        error: (n + 1,), all but the last filled.
+    """
+    for i in range(len(along)):
+        error[i] = along[i]
+        for j in range(i + 1):
+            rest = scaled[i, j]
+            for m in range(j):
+                rest -= jacobian[i, m] * jacobian[j, m]
+            if j < i:
+                jacobian[i, j] = rest / jacobian[j, j]
+                error[i] -= jacobian[i, j] * error[j]
+            elif rest > _REGULAR:
+                jacobian[i, i] = np.sqrt(rest)
+                error[i] /= jacobian[i, i]
+            else:
+                return False
+    return True
+
+
+@compiled()
 def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
     """(n + 1,) error and the transposed (n, n + 1) Jacobian, see ``block_sums.square_root``."""
     n = len(gradient)
-    units, scaled = np.ones(n), np.empty((n, n))
+    units, along, scaled = np.ones(n), np.empty(n), np.empty((n, n))
     for i in range(n):
         if hessian[i, i] > 0.0:
             units[i] = np.sqrt(hessian[i, i])
-    for i in range(n):
-        for j in range(n):
-            scaled[i, j] = hessian[i, j] / (units[i] * units[j])
-    values, vectors = np.linalg.eigh(scaled)
+        along[i] = gradient[i] / units[i]
+        for j in range(i + 1):
+            scaled[i, j] = scaled[j, i] = hessian[i, j] / (units[i] * units[j])
     jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
+    if not _fill_triangular_root(scaled, along, jacobian, error):
+        jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
+        values, vectors = np.linalg.eigh(scaled)
+        for k in range(n):
+            if values[k] > 1e-14 * max(values[n - 1], 0.0):
+                root = np.sqrt(values[k])
+                for i in range(n):
+                    jacobian[i, k] = root * vectors[i, k]
+                    error[k] += vectors[i, k] * along[i] / root
     rest = cost
-    for k in range(n):
-        if values[k] > 1e-14 * max(values[n - 1], 0.0):
-            root, along = np.sqrt(values[k]), 0.0
-            for i in range(n):
-                jacobian[i, k] = root * vectors[i, k] * units[i]
-                along += vectors[i, k] * gradient[i] / units[i]
-            error[k] = along / root
-            rest -= error[k] * error[k]
+    for i in range(n):
+        rest -= error[i] * error[i]
+        for k in range(n):
+            jacobian[i, k] *= units[i]
     error[n] = np.sqrt(max(rest, 0.0))
     return error, jacobian

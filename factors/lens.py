@@ -26,6 +26,7 @@ from factors.lens_kernels import (
     OMNIDIRECTIONAL,
     PINHOLE,
     RADTAN,
+    is_in_cone,
     is_projectable,
     project_one,
 )
@@ -221,12 +222,16 @@ def _fisheye_limit(coefficients: Array) -> float:
 @compiled()
 def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
     valid = np.empty(len(points), dtype=np.bool_)
+    looks_ahead = kind in (PINHOLE, RADTAN)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        valid[i] = is_projectable(kind, lens, x, y, z)
+        if looks_ahead:
+            valid[i] = is_in_cone(lens, x, y, z)
+        else:
+            valid[i] = is_projectable(kind, lens, x, y, z)
     return valid
 
 

@@ -143,7 +143,13 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
         return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[_LIMIT]
     if kind == EQUIRECTANGULAR:
         return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
-    return z > MIN_DEPTH_M and x * x + y * y <= (lens[_LIMIT] * z) ** 2
+    return is_in_cone(lens, x, y, z)
+
+
+@compiled()
+def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
+    """As :func:`is_projectable`, of a lens that looks ahead."""
+    return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[_LIMIT] * z) ** 2)
 
 
 @compiled()

@@ -19,6 +19,7 @@ LossName = Literal["l2", "huber", "cauchy", "geman_mcclure", "tukey"]
 LOSSES: tuple[LossName, ...] = get_args(LossName)
 
 L2, HUBER, CAUCHY, GEMAN_MCCLURE, TUKEY = range(len(LOSSES))
+_IDS: dict[str, int] = {name: number for number, name in enumerate(LOSSES)}
 
 
 def loss_id(name: str) -> int:
@@ -27,9 +28,10 @@ def loss_id(name: str) -> int:
     Raises:
         ValueError: if there is no such loss.
     """
-    if name not in LOSSES:
-        raise ValueError(f"unknown robust loss {name!r}; known are {', '.join(LOSSES)}")
-    return LOSSES.index(name)
+    try:
+        return _IDS[name]
+    except KeyError:
+        raise ValueError(f"unknown robust loss {name!r}; known are {', '.join(LOSSES)}") from None
 
 
 @compiled()

@@ -109,20 +109,6 @@ class CameraBlock:
         information = None if self.information is None else self.information[rows]
         return CameraBlock(self.block.select(rows), information, self.frame[rows])
 
-    def as_table(self, *, camera: str) -> Correspondences:
-        """As a table of correspondences, their weights as information."""
-        root, information = self.block.sqrt_information, None
-        if root is not None:  # upper triangular, [[a, b], [0, c]]
-            a, b, c = root.T
-            information = np.column_stack([a * a, a * b, b * b + c * c])
-        return Correspondences.from_arrays(
-            camera=camera,
-            frame=self.frame,
-            pixels_px=self.block.pixels_px,
-            points_lidar_m=self.block.points_lidar_m,
-            information_px=information,
-        )
-
     def at(self, T_camera_lidar: Array) -> BlockResiduals:
         """The residuals at a (4, 4) T_camera_lidar, for callers that use them more than once."""
         T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
@@ -180,7 +166,9 @@ class CameraBlock:
             return 0
         sample = self.select_evenly(_MAX_SAMPLE)
         root = None if sample.information is None else constrained_root(sample.information)
-        errors = replace(sample.block.rewhiten(root), loss="cauchy", scale=scale_px, sigma=1.0)
+        errors = sample.block.rewhiten(root).rescale(scale=scale_px)
+        if errors.loss != "cauchy":
+            errors = replace(errors, loss="cauchy")
         return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
@@ -191,12 +179,21 @@ class CameraBlock:
         sizes_px, sizes = self.all_sizes(T_camera_lidar[None])
         spread_px = robust_spread(sizes_px)
         spread = spread_px if sizes is sizes_px else robust_spread(sizes)
-        return scale_from(spread_px, max(spread, self.least_spread), config)
+        if spread < self._most_least_spread:
+            spread = max(spread, self.least_spread)
+        return scale_from(spread_px, spread, config)
 
     def _any_projectable(self, T_camera_lidar: Array) -> bool:
         """Whether any correspondence is in front of the camera: mostly, one of the first is."""
         first = self.select(np.arange(min(_FIRST, len(self.frame))))
         return any(some.at(T_camera_lidar).projectable.any() for some in (first, self))
+
+    @cached_property
+    def _most_least_spread(self) -> float:
+        """No less than the least spread, without a median."""
+        root = self.block.sqrt_information
+        largest = 1.0 if root is None or not len(root) else np.abs(root).max()
+        return float(2.0 * MIN_SIGMA_PX * largest)
 
     @cached_property
     def least_spread(self) -> float:

@@ -143,9 +143,10 @@ def with_pseudo_frames(
         usual: (n, n) the scatter that is usual for as many frames; None if nothing is known.
     """
     vectors = np.linalg.eigh(hessian)[1]
-    of_frame = np.outer(*[np.maximum(frames, 1.0) ** -0.5] * 2)
+    root = np.maximum(frames, 1.0) ** -0.5
+    of_frame = root[:, None] * root
     along = _along(vectors, scatter * of_frame)
-    count = np.maximum((vectors**2 * frames[:, None]).sum(axis=0), 1.0)
+    count = np.maximum(frames @ vectors**2, 1.0)
     if usual is None:
         mean = along * count / np.maximum(count - 1.0, 1.0)
     else:

@@ -10,7 +10,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import (
+    pose_rows,
+    retract_all,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
+)
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.factor_graph import relative_pose_graph, to_values
@@ -21,6 +26,7 @@ Array = NDArray[np.float64]
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 _STEP = 1e-5  # rad and m: of the central differences of the gradient
+_STEPS = _STEP * np.vstack([np.eye(6), -np.eye(6)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +166,8 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         block: correspondences of one camera.
         T_lidar_camera: where; the Hessian is in its tangent.
     """
-    steps = np.vstack([np.eye(6), -np.eye(6)]) * _STEP
-    gradients = block.gradients_at_each([T_lidar_camera.retract(step) for step in steps])
+    near = np.tile(to_T_camera_lidar(T_lidar_camera), (12, 1, 1))
+    gradients = block.gradients_at_each(retract_all(near, _STEPS))
     hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
     hessian = (hessian + hessian.T) / 2
     if np.linalg.eigvalsh(hessian)[0] > 0:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations, pairwise
 from typing import Literal
 
@@ -216,13 +217,19 @@ def optimize(
         T_camera_lidar: (4, 4) per camera, the start.
         relative_tolerance: relative change of the error at which it stops.
     """
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(MAX_ITERATIONS)
-    parameters.setRelativeErrorTol(relative_tolerance)
-    parameters.setAbsoluteErrorTol(0.0)
     start = to_values(cameras, T_camera_lidar)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(relative_tolerance))
     values = optimizer.optimize()
     found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
     iterations = int(optimizer.iterations())
     return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
+
+
+@cache
+def _parameters(relative_tolerance: float) -> gtsam.LevenbergMarquardtParams:
+    """Of Levenberg-Marquardt, which copies them."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(MAX_ITERATIONS)
+    parameters.setRelativeErrorTol(relative_tolerance)
+    parameters.setAbsoluteErrorTol(0.0)
+    return parameters

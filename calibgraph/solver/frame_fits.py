@@ -15,9 +15,11 @@ from factors import to_runs
 
 Array = NDArray[np.float64]
 
+DAMPING = 1e-6
+"""Of the diagonal, for frames that leave a direction free."""
+
 _OWN_STEPS = 6  # Gauss-Newton steps to a frame's own extrinsic
 _MAX_STEP_RAD = 0.05  # rotation of one step, 3 degrees: beyond it the linearization does not hold
-_DAMPING = 1e-6  # of the diagonal, for a frame that leaves a direction free
 _MAX_SPREAD = 1e6  # px, in place of the infinite spread of a frame that is all behind its camera
 _MIN_MATCHES = 10  # fewer residuals about a frame's own extrinsic (6 unknowns) give no spread
 
@@ -70,7 +72,7 @@ def fit_alone(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
         sizes = block.all_sizes(T, runs)[1]
         spreads = np.minimum(np.maximum(robust_spreads(sizes, runs), least), _MAX_SPREAD)
         sums = block.block.run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
-        steps = solve_damped(sums.hessian, sums.gradient, _DAMPING)
+        steps = solve_damped(sums.hessian, sums.gradient, DAMPING)
         turns = np.abs(steps[:, :3]).max(axis=1)
         steps *= np.minimum(1.0, _MAX_STEP_RAD / np.maximum(turns, 1e-12))[:, None]
         T = retract_all(T, steps)
@@ -95,9 +97,3 @@ def about_common_extrinsic(spreads: Array, counts: Array) -> Array:
     enough = counts >= _MIN_MATCHES
     typical = float(np.median(grown[enough] if enough.any() else grown))
     return np.asarray(np.where(enough, grown, np.maximum(grown, typical)))
-
-
-def damped(hessian: Array) -> Array:
-    """The Hessian with a little on its diagonal: invertible, though it leaves directions free."""
-    least = np.finfo(float).tiny
-    return np.asarray(hessian + np.diag(_DAMPING * np.diag(hessian) + least))

@@ -24,7 +24,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_fits import FrameFits, damped, fit_each_frame
+from calibgraph.solver.frame_fits import DAMPING, FrameFits, fit_each_frame
+from calibgraph.solver.frame_poses import solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
@@ -48,7 +49,7 @@ _MAX_CANDIDATES = 200  # frames of which the own extrinsic is tried as a start
 _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
-_DIGIT, _DIGIT_MASK = 16, 0xFFFF  # bits of a confidence that it is sorted by at a time
+_DIGIT, _DIGITS = 11, 3  # bits of a confidence that it is sorted by at a time
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
 
 
@@ -157,36 +158,41 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     others may be farther off, by the noise of its own extrinsic.
     """
     center, noise = start, frames.noise
-    T_lidar_camera = invert(frames.T_camera_lidar)
-    by_chance = _CHANCE * np.maximum(noise - np.median(noise), 0)
+    typical = float(np.median(noise))
+    T_lidar_camera, flat = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
+    by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
         products = (frames.hessians @ away[:, :, None])[:, :, 0]
         shift = (away * products).sum(axis=1) / frames.counts  # mean squares of whitened pixels
         apart = np.maximum(shift - by_chance, 0)
         if number <= _SEARCH_STEPS:
-            reach = _reach(apart, noise, widened=number == _SEARCH_STEPS)
+            reach = _reach(apart, math.sqrt(typical), widened=number == _SEARCH_STEPS)
         near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
         if not near.any():  # no two frames agree
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
-        weights = near / (frames.spreads**2 + frames.counts * scatter / 6)
-        hessian = np.tensordot(weights, frames.hessians, 1)
-        step = np.linalg.solve(damped(hessian), weights @ products)
-        center = retract_all(center[None], step[None])[0]
+        weights = near / (own + frames.counts * scatter / 6)
+        hessian = (weights @ flat).reshape(1, 6, 6)
+        step = -solve_damped(hessian, (weights @ products)[None], DAMPING)
+        center = retract_all(center[None], step)[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()
 
 
-def _reach(shift: Array, noise: Array, *, widened: bool) -> float:
+def _reach(shift: Array, least: float, *, widened: bool) -> float:
     """The displacement at which the weight becomes zero, in multiples of that of the nearest.
 
     So frames with equally large errors are all near. The wider reach follows the spread of all
     inliers, where there is one; the nearest are then at least three, since two may agree by chance,
     unless the third is far from them.
+
+    Args:
+        shift: (f,) mean square displacements of whitened pixels.
+        least: displacement by the noise of a typical frame.
+        widened: whether the wider reach is wanted.
     """
-    least = math.sqrt(float(np.median(noise)))
     nearest_first = np.sort(shift)
     two, three = (max(math.sqrt(_of_nearest(nearest_first, fewest=n)), least) for n in (2, 3))
     if not widened:
@@ -273,17 +279,18 @@ def falling_logarithms(spreads: Array, counts: NDArray[np.int64]) -> Array:
 def _order_of(confidence):  # type: ignore[no-untyped-def]
     """(n,) stable ascending order of positive numbers, in single precision.
 
-    By their bits, which order positive floats: the lower half of them, then the upper half.
+    By their bits, which order positive floats: digit by digit, the lowest first.
     """
     bits = confidence.astype(np.float32).view(np.int32)
     order, other = np.arange(len(bits)), np.empty(len(bits), dtype=np.int64)
-    for shift in (0, _DIGIT):
+    mask = (1 << _DIGIT) - 1
+    for shift in range(0, _DIGIT * _DIGITS, _DIGIT):
         place = np.zeros((1 << _DIGIT) + 1, dtype=np.int64)
         for i in range(len(bits)):
-            place[((bits[i] >> shift) & _DIGIT_MASK) + 1] += 1
+            place[((bits[i] >> shift) & mask) + 1] += 1
         place = np.cumsum(place)
         for row in order:
-            digit = (bits[row] >> shift) & _DIGIT_MASK
+            digit = (bits[row] >> shift) & mask
             other[place[digit]] = row
             place[digit] += 1
         order, other = other, order

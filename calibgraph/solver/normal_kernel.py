@@ -24,7 +24,7 @@ def _move(columns, which, factors, errors):  # type: ignore[no-untyped-def]
         The largest change of one of them.
     """
     k, n = len(which), columns.shape[2]
-    moved, largest = np.empty(_TILE), 0.0
+    moved, changes, largest = np.empty(_TILE), np.zeros(_TILE), 0.0
     for start in range(0, n, _TILE):
         end = min(start + _TILE, n)
         for part in range(2):
@@ -35,8 +35,11 @@ def _move(columns, which, factors, errors):  # type: ignore[no-untyped-def]
                     moved[i] += factor * source[i]
             target = errors[part, start:end]
             for i in range(end - start):
-                largest = max(largest, abs(moved[i] - target[i]))
+                change = abs(moved[i] - target[i])
+                changes[i] = change if change > changes[i] else changes[i]
                 target[i] = moved[i]
+    for i in range(_TILE):  # one maximum over all rows would not be vectorized
+        largest = max(largest, changes[i])
     return largest
 
 
@@ -160,14 +163,20 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
     return factors[:k], products[:k, :k], weights, errors, True
 
 
-@compiled()
+@compiled(fastmath=_FAST)
 def grouped_gradients(columns, which, errors, weights, group, count):  # type: ignore[no-untyped-def]
     """(count, k) sums of weighted columns times (2, n) errors, over the rows of each group."""
-    k = len(which)
-    out = np.zeros((count, k))
-    for i in range(len(weights)):
-        u, v = weights[i] * errors[0, i], weights[i] * errors[1, i]
-        own = out[group[i]]
+    k, n, end = len(which), len(weights), 0
+    out, in_u, in_v = np.zeros((count, k)), np.empty(n), np.empty(n)
+    for i in range(n):
+        in_u[i], in_v[i] = weights[i] * errors[0, i], weights[i] * errors[1, i]
+    while end < n:
+        start, own = end, group[end]
+        while end < n and group[end] == own:
+            end += 1
         for a in range(k):
-            own[a] += columns[which[a], 0, i] * u + columns[which[a], 1, i] * v
+            u, v, total = columns[which[a], 0], columns[which[a], 1], 0.0
+            for i in range(start, end):
+                total += u[i] * in_u[i] + v[i] * in_v[i]
+            out[own, a] += total
     return out

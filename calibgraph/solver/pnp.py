@@ -16,7 +16,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
-from calibgraph.solver.frame_poses import Runs, fit_frames
+from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from factors import ProjectionBlock, smallest_scaled_eigenvalues, unproject
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ _MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would domi
 _CONE_RAD = np.radians(60.0)  # of a lens that sees all round: what one plane serves well
 _DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
+_WIDE = 10.0  # PnP thresholds: the scale of the loss of a fit from the guess
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
@@ -50,7 +51,7 @@ class Refined:
 
 def frame_pose(
     camera: Camera,
-    matches: Correspondences,
+    matches: Correspondences | ProjectionBlock,
     config: Config,
     *,
     iterations: int = RANSAC_ITERATIONS,
@@ -62,18 +63,19 @@ def frame_pose(
 
     Args:
         camera: its lens.
-        matches: of one frame.
+        matches: of one frame, taken without weights.
         config: ``pnp_threshold_px``, ``seed``.
         iterations: samples of MAGSAC, at most.
 
     Returns:
         None if too few matches agree on an extrinsic, or if they leave a direction of it free.
     """
-    matches = select_evenly(matches, _MAX_SAMPLE)
-    start = ransac_pnp(camera, matches, config, iterations=iterations)
+    step = -(-len(matches) // _MAX_SAMPLE) or None
+    points_lidar_m, pixels_px = matches.points_lidar_m[::step], matches.pixels_px[::step]
+    block = ProjectionBlock(camera.lens, points_lidar_m, pixels_px)
+    start = ransac_pnp(camera, block, config, iterations=iterations)
     if start is None:
         return None
-    block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
     refined = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
     return refined.T_camera_lidar[0] if refined.found[0] else None
 
@@ -100,7 +102,7 @@ def normalized(camera: Camera, pixels_px: Array) -> Array:
 
 def ransac_pnp(
     camera: Camera,
-    matches: Correspondences,
+    matches: Correspondences | ProjectionBlock,
     config: Config,
     *,
     iterations: int = RANSAC_ITERATIONS,
@@ -134,6 +136,22 @@ def ransac_pnp(
     T[:3, 3] = translation.ravel()
     T[:3] = turn.T @ T[:3]
     return T
+
+
+def pose_near_guess(
+    camera: Camera, matches: Correspondences | ProjectionBlock, config: Config
+) -> Array | None:
+    """(4, 4) T_camera_lidar by a robust fit from the camera's own, None of too few matches.
+
+    Its loss is wide, to be found from farther than the PnP threshold. Arguments as of `frame_pose`.
+    """
+    if len(matches) < MIN_MATCHES:
+        return None
+    block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
+    wide = block.rescale(scale=_WIDE * config.pnp_threshold_px)
+    start, runs = camera.T_camera_lidar[None], np.array([[0, len(block)]])
+    T_camera_lidar: Array = fit_frames(wide, runs, start, tolerance=COARSE).T_camera_lidar[0]
+    return T_camera_lidar
 
 
 def _plane_of_most(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ class Solution:
         """The terms of the objective that were used."""
         return self.objective.terms
 
-    @property
+    @cached_property
     def solved_rig(self) -> Rig:
         """The rig with the estimated extrinsics."""
         return self.rig.moved_to(self.T_camera_lidar)

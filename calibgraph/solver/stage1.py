@@ -13,11 +13,18 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import twists_between
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from calibgraph.solver.grid import frame_edges
-from calibgraph.solver.pnp import frame_pose, ransac_pnp, refine_frames, select_evenly
+from calibgraph.solver.pnp import (
+    frame_pose,
+    pose_near_guess,
+    ransac_pnp,
+    refine_frames,
+    select_evenly,
+)
 from calibgraph.solver.rotation_median import median_rotation
 from factors import ProjectionBlock, to_runs
 
@@ -125,13 +132,17 @@ class FramePoses:
 
 
 def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> FramePoses:
-    """The poses of all frames at once, from one that MAGSAC finds for all of them together.
+    """The poses of all frames at once, from one for all of them together.
 
     Found are those that explain the majority of the frame's correspondences: no other pose can
-    explain more. Three of them do not count, which any pose explains.
+    explain more. Three of them do not count, which any pose explains. So if all are found from a
+    fit that starts at the guess, nothing is left for MAGSAC to find.
     """
-    start = ransac_pnp(camera, select_evenly(rows, COMMON_SAMPLE), config)
-    return frames_from(start, camera, rows, config)
+    sample = select_evenly(rows, COMMON_SAMPLE)
+    near = frames_from(pose_near_guess(camera, sample, config), camera, rows, config)
+    if near.found.all():
+        return near
+    return frames_from(ransac_pnp(camera, sample, config), camera, rows, config)
 
 
 def frames_from(
@@ -161,26 +172,34 @@ def aggregate_frames(
         frames: how many there are in all.
         config: ``aggregate``.
     """
-    kept = poses[are_near_median(poses)]
+    median = median_pose(poses) if len(poses) else None
+    near = are_near_median(poses, median)
+    kept, T_hat = poses[near], median
+    if config.aggregate != "median" or not near.all():
+        T_hat = aggregate(kept, config.aggregate) if len(kept) else None
     return CameraStage1(
-        T_camera_lidar=aggregate(kept, config.aggregate) if len(kept) else None,
+        T_camera_lidar=T_hat,
         by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),
         per_frame=kept,
         failed_frames=frames - len(kept),
     )
 
 
-def are_near_median(T_camera_lidar: Array) -> NDArray[np.bool_]:
+def are_near_median(T_camera_lidar: Array, median: Array | None = None) -> NDArray[np.bool_]:
     """(f,) which of (f, 4, 4) per-frame estimates are no outliers among them.
 
     An outlier is more than 6 times the median distance from their median, in rotation or
     translation, and more than 0.05 degrees or 1 cm. Of fewer than 3, none is one.
+
+    Args:
+        T_camera_lidar: (f, 4, 4).
+        median: (4, 4) of them, see :func:`median_pose`; None: computed.
     """
     if len(T_camera_lidar) < 3:  # noqa: PLR2004
         return np.ones(len(T_camera_lidar), dtype=np.bool_)
-    rotations, translations = _parts(T_camera_lidar)
-    angles = (rotations * geodesic_median(rotations).inv()).magnitude()
-    lengths = np.linalg.norm(translations - np.median(translations, axis=0), axis=1)
+    median = median_pose(T_camera_lidar) if median is None else median
+    angles = np.linalg.norm(twists_between(T_camera_lidar, median)[:, :3], axis=1)
+    lengths = np.linalg.norm(T_camera_lidar[:, :3, 3] - median[:3, 3], axis=1)
     near = [
         distances <= max(least, _OUTLIER * float(np.median(distances)))
         for distances, least in ((angles, _ALIKE_RAD), (lengths, _ALIKE_M))
@@ -197,14 +216,14 @@ def aggregate(T_camera_lidar: Array, how: str) -> Array:
             ``mean``: arithmetic and chordal; ``mode``: half-sample mode of each component, the
             rotation's in the tangent at its median.
     """
+    if how == "median":
+        return median_pose(T_camera_lidar)
     T = np.eye(4)
     rotations, translations = _parts(T_camera_lidar)
-    median = geodesic_median(rotations)
-    if how == "median":
-        rotation, T[:3, 3] = median, np.median(translations, axis=0)
-    elif how == "mean":
+    if how == "mean":
         rotation, T[:3, 3] = rotations.mean(), translations.mean(axis=0)
     elif how == "mode":
+        median = geodesic_median(rotations)
         tangents = (rotations * median.inv()).as_rotvec()
         mode = np.array([half_sample_mode(column) for column in tangents.T])
         rotation = Rotation.from_rotvec(mode) * median
@@ -212,6 +231,15 @@ def aggregate(T_camera_lidar: Array, how: str) -> Array:
     else:
         raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
     T[:3, :3] = rotation.as_matrix()
+    return T
+
+
+def median_pose(T_camera_lidar: Array) -> Array:
+    """(4, 4) of (f, 4, 4): component-wise for the translation, geodesic L1 for the rotation."""
+    T = np.eye(4)
+    rotations, translations = _parts(T_camera_lidar)
+    T[:3, :3] = geodesic_median(rotations).as_matrix()
+    T[:3, 3] = np.median(translations, axis=0)
     return T
 
 
@@ -229,7 +257,9 @@ def geodesic_median(rotations: Rotation) -> Rotation:
 def _medoid(rotations: Rotation) -> int:
     """Index of the rotation with the least sum of angles to the others; of many, to a selection."""
     quaternions = rotations.as_quat()
-    places = np.unique(np.linspace(0, len(quaternions) - 1, _MEDOID_OF).round().astype(int))
+    places = np.arange(len(quaternions))
+    if len(places) > _MEDOID_OF:
+        places = np.linspace(0, len(quaternions) - 1, _MEDOID_OF).round().astype(int)
     selection = quaternions[places]
     cosines = np.abs(selection @ selection.T).clip(max=1.0)
     return int(places[np.argmin(np.arccos(cosines).sum(axis=0))])

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
@@ -66,13 +65,7 @@ def _starts(
     yield T_lidar_camera
     if block.information is not None or config.stage1 == "rig":
         return
-    table = Correspondences.from_arrays(
-        camera="camera",
-        frame=0,
-        pixels_px=block.block.pixels_px,
-        points_lidar_m=block.block.points_lidar_m,
-    )
-    by_pnp = frame_pose(camera, table, config)
+    by_pnp = frame_pose(camera, block.block, config)
     if by_pnp is not None:
         yield to_T_lidar_camera(by_pnp)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +67,8 @@ def restart_checks(evidence: Evidence) -> Checks:
     solution = evidence.of_correspondences.solution
     T_camera_lidar = solution.T_camera_lidar
     displaced = [
-        perturb_extrinsics(
-            T_camera_lidar, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
-        )
-        for seed in range(RESTARTS)
+        {name: T_delta @ T for T_delta, (name, T) in zip(each, T_camera_lidar.items(), strict=True)}
+        for each in _displacements(len(T_camera_lidar))
     ]
     ends = _ends_from(solution, displaced)
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
@@ -87,6 +85,20 @@ def restart_checks(evidence: Evidence) -> Checks:
             threshold("restart_translation").check(centimetres, name=name),
         ]
     return checks
+
+
+@cache
+def _displacements(cameras: int) -> list[list[Array]]:
+    """Per restart, the (4, 4) T_delta of so many cameras."""
+    unmoved = {str(camera): np.eye(4) for camera in range(cameras)}
+    return [
+        [
+            *perturb_extrinsics(
+                unmoved, rotation_deg=RESTART_DEG, translation_m=RESTART_M, seed=seed
+            ).values()
+        ]
+        for seed in range(RESTARTS)
+    ]
 
 
 def _ends_from(solution: Solution, starts: list[Transforms]) -> list[Transforms | None]:
@@ -156,7 +168,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     row = threshold("competing_solution")
     block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
-    left_out = block.select(~ours).as_table(camera=camera)
+    left_out = block.block.select(~ours)
     T = None
     if len(left_out):
         iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))

@@ -40,14 +40,13 @@ _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals, and how much depends on the focal length."""
     solution = evidence.of_correspondences.solution
-
+    cameras = solution.solved_rig.cameras
     findings, metadata = evidence.findings, solution.correspondences.metadata
 
     def of_camera(name: str) -> list[Check]:
-        camera = solution.rig.cameras[name].moved_to(solution.T_camera_lidar[name])
         block = evidence.fitted_blocks[name]
         of_place = findings.place_variance * frames_of_one_place(metadata, block.frame_numbers)
-        return check_intrinsics(camera, block, solution.scales[name], of_place)
+        return check_intrinsics(cameras[name], block, solution.scales[name], of_place)
 
     names = [*evidence.fitted_blocks]
     return dict(zip(names, map_on_cores(of_camera, names), strict=True))

@@ -180,7 +180,7 @@ def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
 def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
     block = world(LENSES["pinhole"], count).rescale(scale=3.0, sigma=0.7)
     poses = [TRUTH.retract(np.full(6, step)) for step in (0.0, 1e-3, -0.02)]
-    found = block.gradients_at_each(poses)
+    found = block.gradients_at_each(np.array([pose.inverse().matrix() for pose in poses]))
     for gradient, pose in zip(found, poses, strict=True):
         expected = block.sums(pose).gradient
         scale = np.abs(expected).max() or 1.0  # sums in another order: rounding alone

@@ -54,10 +54,9 @@ class ShardedProjection:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
         return square_root(self.sums(T_lidar_camera))
 
-    def gradients_at_each(self, poses: Sequence[gtsam.Pose3]) -> Array:
-        """(p, 6) b at each of some T_lidar_camera."""
-        each = np.array([pose.matrix() for pose in poses])
-        return np.asarray(np.sum(self._call("gradients", each), axis=0))
+    def gradients_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p, 6) b at each of (p, 4, 4) poses."""
+        return np.asarray(np.sum(self._call("gradients", T_camera_lidar), axis=0))
 
     def _call(self, method: str, T: Array) -> list[Any]:
         given = (self.stage, self.camera, T, self.loss_scale, self.sigma)

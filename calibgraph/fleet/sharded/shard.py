@@ -98,6 +98,11 @@ class Shard:
         table = self._kept.table
         return table.select(np.isin(table.frame, numbers))
 
+    def are_all_found(self, camera: str, start: Array | None) -> bool:
+        """Whether a pose near all frames of a camera leads to one of each, see ``frames_from``."""
+        frames = frames_from(start, self._rig.cameras[camera], self._rows[camera], self._config)
+        return bool(frames.found.all())
+
     def stage1(self, camera: str, start: Array | None) -> tuple[Array, Numbers]:
         """(f, 4, 4) T_camera_lidar of the frames that PnP solves; (f,) their numbers."""
         rows, model = self._rows[camera], self._rig.cameras[camera]
@@ -133,9 +138,9 @@ class Shard:
         return np.concatenate([sums.hessian[_UPPER], sums.gradient, [sums.cost]])
 
     def gradients(self, stage: str, camera: str, T: Array, scale: float, sigma: float) -> Array:
-        """(p, 6) b at each of (p, 4, 4) T_lidar_camera."""
+        """(p, 6) b at each of (p, 4, 4) T_camera_lidar."""
         block = self._blocks[stage, camera].block.rescale(scale=scale, sigma=sigma)
-        return block.gradients_at_each([gtsam.Pose3(pose) for pose in T])
+        return block.gradients_at_each(T)
 
     def frame_gradients(self, stage: str, camera: str, T: Array, scale: ResidualScale) -> Array:
         """(f, 6) of each frame at a (4, 4) T_lidar_camera."""

@@ -24,7 +24,7 @@ from calibgraph.solver.frame_weights import (
     falling_logarithms,
     find_consensus,
 )
-from calibgraph.solver.pnp import ransac_pnp
+from calibgraph.solver.pnp import pose_near_guess, ransac_pnp
 from calibgraph.solver.stage1 import COMMON_SAMPLE, CameraStage1, Stage1, aggregate_frames
 
 Array = NDArray[np.float64]
@@ -102,7 +102,9 @@ def _stage1_of(
     places = even_places(counts, COMMON_SAMPLE)
     rows = workers.call("rows_at", name, each=[(some,) for some in places])
     sample = concatenate([part for part in rows if len(part)])
-    start = ransac_pnp(rig.cameras[name], sample, config)
+    start = pose_near_guess(rig.cameras[name], sample, config)
+    if not all(workers.call("are_all_found", name, start)):
+        start = ransac_pnp(rig.cameras[name], sample, config)
     poses, numbers = zip(*workers.call("stage1", name, start), strict=True)
     frames = sum(len(file.cameras[name].numbers) for file in files)
     return aggregate_frames(np.concatenate(poses), np.concatenate(numbers), frames, config)
