@@ -71,9 +71,13 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
         seed: of the search.
         places: metadata of correspondences, which name the frames of each place, and repeated ones.
     """
-    if camera.model == "equirectangular":  # the format determines it: the pose alone is free
-        return LensEvidence(gain=_search(camera, scores, 0, seed)[1])
-    best, gain = _search(camera, scores, _TO_CENTRE, seed)
+    frames = np.unique(scores.frame)
+    copies = len(frames) / len(np.unique(number_by_place(places, frames)))
+    searched = 0 if camera.model == "equirectangular" else _TO_CENTRE  # the format determines it
+    best, gain = _search(camera, scores, searched, seed)
+    gain /= math.sqrt(copies)  # chance agreement of copies repeats
+    if not searched:  # the pose alone is free
+        return LensEvidence(gain=gain)
     shape = _shape(camera, scores, seed, places)
     rough = _fit_at_peaks(camera, scores, best, places)
     if rough is None:

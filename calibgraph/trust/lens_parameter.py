@@ -138,8 +138,8 @@ def check_parameter(found: LensParameter, by: str, better: str) -> Check:
         by: RESIDUALS or IMAGES.
         better: the lens that would be right, in words.
     """
-    row = threshold("lens")
-    status = row.grade(found.probability)
+    row, probability = threshold("lens"), found.probability
+    status = row.grade(probability)
     text = (
         f"by the {by}, {better} ({found.significance} sigma) would move the camera by "
         f"{found.moved_deg:.2g} deg, {found.moved_cm:.2g} cm"
@@ -147,7 +147,7 @@ def check_parameter(found: LensParameter, by: str, better: str) -> Check:
     if status != "PASS":
         text += f"; {row.advice}"
     name = f"{found.name} by the {by}: {row.name}"
-    check = row.describe(found.probability, status, text, name=name)
+    check = row.describe(probability, status, text, name=name)
     return replace(check, kind=KINDS[by][found.name])
 
 

@@ -88,7 +88,9 @@ def test_a_wrong_lens_is_named_and_measured(
 
 
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
-    found = measure(change_lens(truth, np.array([0.03, 0.0, 0.0, 0.0])), same_place=range(6))
+    camera = change_lens(truth, np.array([0.03, 0.0, 0.0, 0.0]))
+    found, apart = measure(camera, same_place=range(6)), measure(camera)
+    assert found.gain == pytest.approx(apart.gain / math.sqrt(6))
     assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found.parameters)
     assert abs(found.parameters[0].values[0]) > 0.01  # noqa: PLR2004
 
