@@ -138,8 +138,8 @@ class Doubt:
 
     @property
     def of_error_bar(self) -> bool:
-        """Whether it is a doubt, and rather by a wide error bar than by checks."""
-        return self.status != "PASS" and self.by_error_bar >= self.by_checks
+        """Whether it is a WARN, and rather by a wide error bar than by checks."""
+        return self.status == "WARN" and self.by_error_bar >= self.by_checks
 
     @property
     def advice(self) -> str:

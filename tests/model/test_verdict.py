@@ -54,6 +54,7 @@ def test_what_looks_odd_right_or_wrong_is_no_lack_of_data() -> None:
         (Verdict((), Doubt(0.5, 0.6)), "FAIL"),
     ):
         assert (verdict.status, verdict.cannot_tell, verdict.label) == (status, False, status)
+        assert not any("cannot tell" in reason for reason in verdict.reasons)
 
 
 def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
