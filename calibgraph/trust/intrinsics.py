@@ -100,12 +100,9 @@ def fill_displacement_fields(camera: Camera, pixels_px: Array, fields: Array) ->
 
 
 def _free(name: str, fit: AugmentedFit, camera: Camera) -> LensParameter:
-    """exp(twist) turns the camera by its rotation's length, and moves the centre by the other's."""
-    degrees = float(np.degrees(np.linalg.norm(fit.twist[:3])))
-    centimetres = 100 * float(np.linalg.norm(fit.twist[3:]))
     k = camera.intrinsics_px
     unit = np.array([k.fx, k.fy]) if name == "principal point" else np.ones(1)
-    return LensParameter(name, fit.values, fit.sigmas, unit, degrees, centimetres)
+    return LensParameter(name, fit.values, fit.sigmas, unit, fit.twist)
 
 
 def _check_sensitivity(twist: Array) -> Check:

@@ -94,10 +94,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
 
 def _parameter(name: str, fit: AugmentedFit, number: int) -> LensParameter:
     value, sigma = fit.values[number : number + 1], fit.sigmas[number : number + 1]
-    twist = fit.compensating[:, number] * value
-    degrees = float(np.degrees(np.linalg.norm(twist[:3])))
-    centimetres = 100 * float(np.linalg.norm(twist[3:]))
-    return LensParameter(name, value, sigma, np.ones(1), degrees, centimetres)
+    return LensParameter(name, value, sigma, np.ones(1), fit.compensating[:, number] * value)
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[Array, float]:

@@ -46,16 +46,24 @@ class LensParameter:
         sigmas: (k,) their standard deviations, frames as clusters.
         unit: (k,) of the values, for ``size`` and ``sigma``: the focal lengths [px] of a principal
             point, else one.
-        moved_deg: how far the camera turns.
-        moved_cm: how far the camera's centre moves.
+        twist: (6,) rotation [rad] and translation [m] by which the camera moves.
     """
 
     name: str
     values: Array
     sigmas: Array
     unit: Array
-    moved_deg: float
-    moved_cm: float
+    twist: Array
+
+    @property
+    def moved_deg(self) -> float:
+        """How far the camera turns."""
+        return float(np.degrees(np.linalg.norm(self.twist[:3])))
+
+    @property
+    def moved_cm(self) -> float:
+        """How far the camera's centre moves."""
+        return 100 * float(np.linalg.norm(self.twist[3:]))
 
     @property
     def size(self) -> float:

@@ -15,7 +15,13 @@ from calibgraph.trust.lens_parameter import (
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
-    return LensParameter(name, np.array([size]), np.array([sigma]), np.ones(1), 0.0, moved_cm)
+    return LensParameter(
+        name,
+        np.array([size]),
+        np.array([sigma]),
+        np.ones(1),
+        np.array([0, 0, 0, 0, 0, moved_cm / 100]),
+    )
 
 
 def test_a_parameter_of_which_the_residuals_say_nothing_raises_no_doubt() -> None:
