@@ -157,7 +157,8 @@ def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: igno
         if not _factorize(products, limits[2], units, root):
             return factors[:k], products[:k, :k], weights, errors, False
         _solve(products, units, root, solution)
-        factors[:k] = solution
+        for i in range(k):  # an assignment to a slice would compile its error message: 2 s
+            factors[i] = solution[i]
         if _move(columns, which, factors, errors) < limits[1] * scale:
             break
     return factors[:k], products[:k, :k], weights, errors, True
