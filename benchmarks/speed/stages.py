@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import json
 import resource
 import subprocess
@@ -124,7 +125,10 @@ class StageSampler:
 
     def _sample(self) -> None:
         """Add the time since the last sample to the stages that used it."""
-        stacks, clocks = sys._current_frames(), dict(_thread_clocks())
+        gc.disable()  # in it, a collection can stop all threads (CPython's issue 106883)
+        stacks = sys._current_frames()
+        gc.enable()
+        clocks = dict(_thread_clocks())
         used = {key: max(0.0, clocks[key] - self._clocks.get(key, 0.0)) for key in clocks}
         del used[threading.get_ident()]
         now = time.perf_counter(), time.process_time()
