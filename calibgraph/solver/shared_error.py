@@ -1,4 +1,7 @@
-"""The error that all frames of a recording share, which the scatter between frames cannot show."""
+"""The error that all frames of a recording share, beside the sandwich of the paper's presets.
+
+With the preset ``auto`` it is part of ``calibgraph.solver.error_model``.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
-from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
+from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.curvature import Curvature
-from calibgraph.solver.pair_refinement import PAIR_SIGMA_M, PAIR_SIGMA_RAD, PairFit
+from calibgraph.solver.pair_refinement import pair_sigmas
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
-
-_USUAL_DOF = 6.0  # degrees of freedom that the usual size of the shared error counts for
-
 
 def shared_scatter(
     findings: MatcherFindings,
@@ -55,53 +55,7 @@ def shared_scatter(
 
 def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]) -> Array:
     """(6 N, 6 N) covariance of the error of relative poses from images, half in each camera."""
-    of_pair = np.diag(pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M) ** 2)
+    of_pair = np.diag(pair_sigmas() ** 2)
     seen = {name for pair in pairs for name in (pair.a, pair.b)}
     cameras = np.diag([float(name in seen) for name in T_camera_lidar])
     return np.asarray(np.kron(cameras, of_pair / 2))
-
-
-def error_over_usual(
-    T_camera_lidar: Mapping[str, Array], covariance: Array, fits: Sequence[PairFit]
-) -> float:
-    """Variance of the shared error over its usual one, by what cameras see in common; at least 1.
-
-    The correspondences place each camera by itself; images place them relative to each other, much
-    better. The difference, over pairs that span each group of tied cameras, is chi-squared
-    distributed if the covariances are right, with six degrees of freedom per pair. The usual size
-    counts as six of them. It is never taken for less than usual: what displaces all cameras alike
-    is not seen between them.
-
-    Args:
-        T_camera_lidar: (4, 4) of all cameras, by their correspondences.
-        covariance: (6 N, 6 N) of these.
-        fits: where the images place them.
-    """
-    cameras, chosen = list(T_camera_lidar), _spanning(fits)
-    if not chosen:
-        return 1.0
-    apart, to_pairs, of_images = [], [], np.zeros((6 * len(chosen), 6 * len(chosen)))
-    for number, fit in enumerate(chosen):
-        T_b_a = relative_transform(T_camera_lidar[fit.b], T_camera_lidar[fit.a])
-        apart.append(twist_between(T_b_a, fit.T_b_a))
-        to_pair = np.zeros((6, len(covariance)))
-        to_pair[:, pose_rows(cameras.index(fit.a))] = -gtsam.Pose3(T_b_a).AdjointMap()
-        to_pair[:, pose_rows(cameras.index(fit.b))] = np.eye(6)
-        to_pairs.append(to_pair)
-        of_images[pose_rows(number), pose_rows(number)] = fit.covariance
-    jacobian, step = np.concatenate(to_pairs), np.concatenate(apart)
-    whole = jacobian @ covariance @ jacobian.T + of_images
-    chi_squared = float(step @ np.linalg.solve(whole, step))
-    return max(1.0, (_USUAL_DOF + chi_squared) / (_USUAL_DOF + len(step)))
-
-
-def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:
-    """Pairs that tie each group of cameras once: those with the most features first."""
-    body: dict[str, str] = {}
-    chosen = []
-    for fit in sorted(fits, key=lambda fit: -fit.features):
-        one, two = (body.setdefault(name, name) for name in (fit.a, fit.b))
-        if one != two and fit.features >= ENOUGH_SURFACES:
-            chosen.append(fit)
-            body = {name: one if of == two else of for name, of in body.items()}
-    return chosen

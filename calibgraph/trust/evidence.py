@@ -19,16 +19,17 @@ from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
+from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.repeats import frames_of_one_place
-from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
+from calibgraph.solver.shared_error import error_between, shared_scatter
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
-from calibgraph.trust.observability import prior_shares
+from calibgraph.trust.observability import prior_shares, shares_of_marginal
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -128,23 +129,29 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N) by the scatter, plus the error that all the matcher's frames share."""
+        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich.
+
+        Cameras that are held are unknown by a radian and a metre.
+        """
+        solution = self.solution
+        if solution.config.preset == "auto":
+            return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.error_over_usual * self._shared(self.solution.inliers, self.curvature)
-        return (
-            self.scatter
-            + shared
-            + error_between(self.solution.T_camera_lidar, self.solution.inliers.pairs)
-        )
+        shared = self._shared(solution.inliers, self.curvature)
+        return self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
 
     @cached_property
-    def error_over_usual(self) -> float:
-        """Variance of the shared error over its usual one, by what cameras see in common."""
-        own = self.of_correspondences
-        if own is self or own.joint_covariance is None:
-            return 1.0
-        return error_over_usual(own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits)
+    def errors(self) -> ErrorFit | None:
+        """The error model of the solution; None with the paper's presets."""
+        solution = self.solution
+        return solution.errors or fit_errors(
+            solution.inliers,
+            solution.T_camera_lidar,
+            solution.scales,
+            solution.correspondences.metadata,
+            solution.held,
+        )
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
@@ -195,7 +202,9 @@ class Evidence:
     @cached_property
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
-        return prior_shares(self.solution, self.robust_hessians)
+        if self.errors is None:
+            return prior_shares(self.solution, self.robust_hessians)
+        return shares_of_marginal(self.solution, self.errors.fit.covariance)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
@@ -240,6 +249,12 @@ class Evidence:
         free = solution.inliers.data_only()
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
+        if solution.config.preset == "auto":
+            metadata = solution.correspondences.metadata
+            errors = fit_errors(free, T_camera_lidar, solution.scales, metadata)
+            if errors is None:
+                return DataOnly(T_camera_lidar, None)
+            return DataOnly(errors.T_camera_lidar, errors.fit.covariance)
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
         curvature = curvature_at(free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar))
         scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)

@@ -96,6 +96,11 @@ class ShardedBlock:
         """How many frames they come from."""
         return sum(map(len, self.frame_parts))
 
+    @property
+    def frame_counts(self) -> Numbers:
+        """(f,) of the correspondences of each frame."""
+        return np.concatenate(self.count_parts)
+
     def with_frames(self, stage: str, parts: Sequence[tuple[Numbers, Numbers]]) -> ShardedBlock:
         """What is left, by numbers and counts of the frames in each file."""
         frames, counts = zip(*parts, strict=True)

@@ -1,0 +1,272 @@
+"""The error model of a solution: ``calibgraph.solver.hierarchy`` filled in, fitted, and sized.
+
+What matches of one frame share is not stated by any matcher but shows in the scatter between
+frames. Within a place it is summed up as K, the covariance of a camera's pose by all its frames in
+units of that of independent matches: with H = L L^T the Hessian of independent matches,
+K = L^T (H_t^-1 G H_t^-1) L, where G is the scatter of the frames' gradients about their place's
+mean, with an allowance for few frames, and H_t the true Hessian. The matches of a place stay as
+they are, independent; what their covariance lacks, K - 1, belongs to the pose a_cp, together with
+what the frames of a place share by the matcher's statement (``place_variance``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm, usual_excess
+from calibgraph.solver.component_sizes import sized_components
+from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.factor_graph import Optimum, join, pose_key
+from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, start_poses
+from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.repeats import split_places
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_LEAST_SIGMA = 1e-6  # rad and m: what is stated to be exact is so to a micrometre
+_LEAST_EXCESS = 1e-3  # of the variance of independent matches
+_WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
+"""Information of a pose within sight, so that few matches have an inverse."""
+
+_ROUNDS, _SETTLED = 3, 0.05  # of fitting and sizing; relative change of the sizes
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorFit:
+    """The error model of a solution, at its minimum.
+
+    Attributes:
+        model: with the sizes that fit the data.
+        fit: its minimum and marginals.
+        places: the numbers of the frames of each place.
+        sizes: variances over the usual ones: of what is shared everywhere, and of places.
+    """
+
+    model: Hierarchy
+    fit: HierarchyFit
+    places: tuple[Numbers, ...]
+    sizes: tuple[float, float]
+
+    @property
+    def T_camera_lidar(self) -> dict[str, Array]:
+        """Per camera, (4, 4)."""
+        return self.fit.T_camera_lidar(self.model)
+
+
+def weigh_errors(
+    inliers: Objective,
+    optimum: Optimum,
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    held: Sequence[str] = (),
+) -> tuple[ErrorFit | None, Optimum]:
+    """The minimum under the error model, where it differs from that of independent matches.
+
+    Where there is nothing but the matches of one place, their minimum is that of both; it stays,
+    and no model is made. Arguments and what is None as of :func:`fit_errors`.
+    """
+    several = inliers.blocks and len(places_of(inliers, metadata)) > 1
+    if not (several or inliers.pairs or inliers.rig.relative_poses):
+        return None, optimum
+    found = fit_errors(inliers, optimum.T_camera_lidar, scales, metadata, held)
+    if found is None:
+        return None, optimum
+    fit, T = found.fit, found.T_camera_lidar
+    return found, Optimum(T, fit.cost, optimum.iterations + fit.iterations, fit.converged)
+
+
+def fit_errors(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    held: Sequence[str] = (),
+) -> ErrorFit | None:
+    """Fit poses and sizes of the errors, from the minimum for independent matches.
+
+    Args:
+        inliers: after the gate.
+        T_camera_lidar: its minimum.
+        scales: of the residuals.
+        metadata: of the correspondences, with the matcher's error and the places.
+        held: cameras that nothing determines; they are known to a radian and a metre.
+
+    Returns:
+        None without correspondences, with a preset of the paper, or where a direction of a camera
+        is not determined.
+    """
+    if inliers.config.preset != "auto" or not inliers.uses_correspondences or not inliers.blocks:
+        return None
+    places = places_of(inliers, metadata)
+    model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
+    fit, usual, sizes = fit_hierarchy(model, start_poses(model, T_camera_lidar)), model.components, (1.0, 1.0)
+    if fit is None:
+        return None
+    for _ in range(_ROUNDS):
+        components, new = sized_components(usual, model, fit)
+        if np.allclose(new, sizes, rtol=_SETTLED, atol=0.0):
+            break
+        model, sizes = replace(model, components=components), new
+        again = fit_hierarchy(model, fit.poses)
+        if again is None:
+            break
+        fit = again
+    return ErrorFit(model, fit, tuple(places), sizes)
+
+
+def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
+    """The numbers of the frames of each place, over all cameras."""
+    blocks = [block.frame_numbers for block in inliers.blocks.values()]
+    frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
+    if not all(isinstance(block, CameraBlock) for block in inliers.blocks.values()):
+        return [frames]  # of a table in many files: sums over places are not to be had
+    return split_places(metadata, frames)
+
+
+def error_model(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    places: Sequence[Numbers],
+    held: Sequence[str] = (),
+) -> Hierarchy:
+    """The model with usual sizes; arguments as of :func:`fit_errors`."""
+    findings, usual = MatcherFindings.from_metadata(metadata), error_components()
+    cameras = tuple(T_camera_lidar)
+    half = np.array(findings.systematic_sigmas) / np.sqrt(2)
+    of_place = np.array([findings.place_rotation_rad, findings.place_translation_m])
+    everywhere = np.sqrt(np.maximum(half**2 - of_place**2, 0.0))
+    at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
+    blocks = {}
+    for name, block in inliers.blocks.items():
+        placed = PlacedBlock.of(block, scales[name], places)
+        within = _within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
+        at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
+        blocks[name] = placed
+    components = Components(
+        cloud=_covariance(*everywhere),
+        cloud_at_place=_covariance(*of_place),
+        camera=_covariance(*half),
+        pairs=_covariance(*(pair_sigmas()[[0, 3]] / np.sqrt(2))),
+        at_place=at_place,
+        robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
+    )
+    graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
+    return Hierarchy(cameras, blocks, _placed_pairs(inliers.pairs, places), graph, components)
+
+
+def _covariance(rotation_rad: float, translation_m: float) -> Array:
+    sigmas = pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m)
+    return np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
+
+
+def _held_graph(
+    cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Sequence[str]
+) -> gtsam.NonlinearFactorGraph:
+    graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
+    for name in held:
+        pose = to_T_lidar_camera(T_camera_lidar[name])
+        graph.add(gtsam.PriorFactorPose3(pose_key(cameras, name), pose, unit))
+    return graph
+
+
+def _placed_pairs(
+    pairs: Sequence[PairTerm], places: Sequence[Numbers]
+) -> list[tuple[int, PairTerm]]:
+    """Each term at each place, its information that of features which err as usual in a frame."""
+    found = []
+    for pair in pairs:
+        own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
+        deflated = pair.deflate(usual_excess(own))
+        for place, frames in enumerate(places):
+            rows = np.isin(deflated.frame, frames)
+            if rows.any():
+                found.append((place, deflated.select(rows)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class WithinPlace:
+    """What a camera's matches of one place share, in units of independent matches.
+
+    Attributes:
+        excess: (6, 6) K - 1 of the module's text, positive semidefinite.
+        true: (6, 6) L^T H_t^-1 L.
+        roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
+        frames: (P,) of each place.
+    """
+
+    excess: Array
+    true: Array
+    roots: Array
+    frames: Array
+
+    def at_place(self, place_variance: float) -> Array:
+        """(P, 6, 6) covariance of a_cp about m_c."""
+        shared = place_variance * self.frames[:, None, None] * self.true
+        inverse = np.linalg.inv(self.roots)
+        covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
+        return (covariance + covariance.transpose(0, 2, 1)) / 2
+
+
+def _within_place(
+    inliers: Objective, name: str, T_camera_lidar: Array, scale: Any, placed: PlacedBlock
+) -> WithinPlace:
+    block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
+    hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
+    root = np.linalg.cholesky(hessians.sum(axis=0) + _WEAK)
+    robust = robust_hessian(block.with_scale(scale), pose)
+    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + _WEAK
+    scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
+    inverse = np.linalg.inv(true)
+    covariance = root.T @ inverse @ scatter @ inverse @ root
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 - np.eye(6))
+    return WithinPlace(
+        excess=(vectors * np.maximum(values, _LEAST_EXCESS)) @ vectors.T,
+        true=root.T @ inverse @ root,
+        roots=np.linalg.cholesky(hessians + _WEAK),
+        frames=placed.frames,
+    )
+
+
+def frame_scatter(
+    block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array
+) -> Array:
+    """(6, 6) covariance of the sum of all frames' gradients, about the means of their places.
+
+    Args:
+        block: of one camera.
+        gradients: (f, 6) of its frames.
+        placed: the same matches, with the place of each frame.
+        true: (6, 6) Hessian.
+    """
+    place, counts = placed.place_of_frame, placed.count_of_frame
+    total = np.zeros((len(placed.frames), 6))
+    np.add.at(total, place, gradients)
+    share = counts / np.bincount(place, counts, len(placed.frames))[place]
+    apart = gradients - share[:, None] * total[place]
+    frames, free = len(gradients), len(gradients) - len(np.unique(place))
+    usual = 1 + error_components().frame_correlation * (len(block) / frames - 1)
+    count = free + 1.0  # as many frames of one place
+    scatter = with_pseudo_frames(
+        apart.T @ apart, true, np.full(6, count), usual * true * count / frames
+    )
+    return scatter * frames / count
+
+
