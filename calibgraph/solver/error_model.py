@@ -29,7 +29,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
 from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
-from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, start_poses
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize, start_poses
 from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.repeats import split_places
@@ -61,6 +61,21 @@ class ErrorFit:
     fit: HierarchyFit
     places: tuple[Numbers, ...]
     sizes: tuple[float, float]
+
+    def with_shared_size(self, least: float) -> ErrorFit:
+        """The same minimum, with covariances of what is shared everywhere of at least this size."""
+        ratio = least / self.sizes[0]
+        if ratio <= 1.0:
+            return self
+        parts = self.model.components
+        model = replace(
+            self.model,
+            components=replace(
+                parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera
+            ),
+        )
+        fit = linearize(model, self.fit)
+        return replace(self, model=model, fit=fit, sizes=(least, self.sizes[1]))
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -207,19 +222,19 @@ class WithinPlace:
 
     Attributes:
         excess: (6, 6) K - 1 of the module's text, positive semidefinite.
-        true: (6, 6) L^T H_t^-1 L.
+        efficiency: of independent matches: their true variance over that of H, in the mean.
         roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
         frames: (P,) of each place.
     """
 
     excess: Array
-    true: Array
+    efficiency: float
     roots: Array
     frames: Array
 
     def at_place(self, place_variance: float) -> Array:
         """(P, 6, 6) covariance of a_cp about m_c."""
-        shared = place_variance * self.frames[:, None, None] * self.true
+        shared = place_variance * self.efficiency * self.frames[:, None, None] * np.eye(6)
         inverse = np.linalg.inv(self.roots)
         covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
         return (covariance + covariance.transpose(0, 2, 1)) / 2
@@ -239,7 +254,7 @@ def _within_place(
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 - np.eye(6))
     return WithinPlace(
         excess=(vectors * np.maximum(values, _LEAST_EXCESS)) @ vectors.T,
-        true=root.T @ inverse @ root,
+        efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
         roots=np.linalg.cholesky(hessians + _WEAK),
         frames=placed.frames,
     )

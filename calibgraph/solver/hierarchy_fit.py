@@ -302,6 +302,17 @@ def fit_hierarchy(
             break
         converged = equations.cost - found[1].cost <= relative_tolerance * equations.cost
         (poses, equations), iterations = found, iterations + 1
+    return _to_fit(poses, equations, iterations, converged)
+
+
+def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
+    """A fit with the marginals of another model at the same poses."""
+    return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
+
+
+def _to_fit(
+    poses: Poses, equations: Equations, iterations: int, converged: bool
+) -> HierarchyFit:
     hessian, _, solved = equations.reduced()
     return HierarchyFit(
         poses,

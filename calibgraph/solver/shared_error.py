@@ -1,7 +1,4 @@
-"""The error that all frames of a recording share, beside the sandwich of the paper's presets.
-
-With the preset ``auto`` it is part of ``calibgraph.solver.error_model``.
-"""
+"""The error that all frames of a recording share, which the scatter between frames cannot show."""
 
 from __future__ import annotations
 
@@ -11,11 +8,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
+from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
 from calibgraph.solver.curvature import Curvature
-from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.pair_refinement import PairFit, pair_sigmas
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
@@ -59,3 +57,50 @@ def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]
     seen = {name for pair in pairs for name in (pair.a, pair.b)}
     cameras = np.diag([float(name in seen) for name in T_camera_lidar])
     return np.asarray(np.kron(cameras, of_pair / 2))
+
+
+def error_over_usual(
+    T_camera_lidar: Mapping[str, Array], covariance: Array, fits: Sequence[PairFit]
+) -> float:
+    """Variance of the shared error over its usual one, by what cameras see in common; at least 1.
+
+    The correspondences place each camera by itself; images place them relative to each other, much
+    better. The difference, over pairs that span each group of tied cameras, is chi-squared
+    distributed if the covariances are right, with six degrees of freedom per pair. The usual size
+    counts as six of them. It is never taken for less than usual: what displaces all cameras alike
+    is not seen between them.
+
+    Args:
+        T_camera_lidar: (4, 4) of all cameras, by their correspondences.
+        covariance: (6 N, 6 N) of these.
+        fits: where the images place them.
+    """
+    cameras, chosen = list(T_camera_lidar), _spanning(fits)
+    if not chosen:
+        return 1.0
+    apart, to_pairs, of_images = [], [], np.zeros((6 * len(chosen), 6 * len(chosen)))
+    for number, fit in enumerate(chosen):
+        T_b_a = relative_transform(T_camera_lidar[fit.b], T_camera_lidar[fit.a])
+        apart.append(twist_between(T_b_a, fit.T_b_a))
+        to_pair = np.zeros((6, len(covariance)))
+        to_pair[:, pose_rows(cameras.index(fit.a))] = -gtsam.Pose3(T_b_a).AdjointMap()
+        to_pair[:, pose_rows(cameras.index(fit.b))] = np.eye(6)
+        to_pairs.append(to_pair)
+        of_images[pose_rows(number), pose_rows(number)] = fit.covariance
+    jacobian, step = np.concatenate(to_pairs), np.concatenate(apart)
+    whole = jacobian @ covariance @ jacobian.T + of_images
+    chi_squared = float(step @ np.linalg.solve(whole, step))
+    usual_dof = error_components().shared_dof
+    return max(1.0, (usual_dof + chi_squared) / (usual_dof + len(step)))
+
+
+def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:
+    """Pairs that tie each group of cameras once: those with the most features first."""
+    body: dict[str, str] = {}
+    chosen = []
+    for fit in sorted(fits, key=lambda fit: -fit.features):
+        one, two = (body.setdefault(name, name) for name in (fit.a, fit.b))
+        if one != two and fit.features >= ENOUGH_SURFACES:
+            chosen.append(fit)
+            body = {name: one if of == two else of for name, of in body.items()}
+    return chosen

@@ -25,7 +25,7 @@ from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.repeats import frames_of_one_place
-from calibgraph.solver.shared_error import error_between, shared_scatter
+from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
@@ -138,20 +138,33 @@ class Evidence:
             return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self._shared(solution.inliers, self.curvature)
+        shared = self.error_over_usual * self._shared(solution.inliers, self.curvature)
         return self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
 
     @cached_property
     def errors(self) -> ErrorFit | None:
-        """The error model of the solution; None with the paper's presets."""
+        """The error model of the solution; None with the paper's presets.
+
+        What all matches share is at least as large as the images of pairs show, also where the loss
+        has given these up.
+        """
         solution = self.solution
-        return solution.errors or fit_errors(
+        found = solution.errors or fit_errors(
             solution.inliers,
             solution.T_camera_lidar,
             solution.scales,
             solution.correspondences.metadata,
             solution.held,
         )
+        return None if found is None else found.with_shared_size(self.error_over_usual)
+
+    @cached_property
+    def error_over_usual(self) -> float:
+        """Variance of the shared error over its usual one, by what cameras see in common."""
+        own = self.of_correspondences
+        if own is self or own.joint_covariance is None:
+            return 1.0
+        return error_over_usual(own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits)
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
