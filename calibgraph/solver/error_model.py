@@ -4,9 +4,10 @@ What matches of one frame share is not stated by any matcher but shows in the sc
 frames. Within a place it is summed up as K, the covariance of a camera's pose by all its frames in
 units of that of independent matches: with H = L L^T the Hessian of independent matches,
 K = L^T (H_t^-1 G H_t^-1) L, where G is the scatter of the frames' gradients about their place's
-mean, with an allowance for few frames, and H_t the true Hessian. The matches of a place stay as
-they are, independent; what their covariance lacks, K - 1, belongs to the pose a_cp, together with
-what the frames of a place share by the matcher's statement (``place_variance``).
+mean, with an allowance for few frames, and H_t the true Hessian. The matches of a place stay
+independent, with the least variance k of K, at most 1; what their covariance lacks, K - k, belongs
+to the pose a_cp, together with what the frames of a place share by the matcher's statement
+(``place_variance``).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _LEAST_SIGMA = 1e-6  # rad and m: what is stated to be exact is so to a micrometre
-_LEAST_EXCESS = 1e-3  # of the variance of independent matches
+_LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 _WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
@@ -173,7 +174,7 @@ def error_model(
         placed = PlacedBlock.of(block, scales[name], places)
         within = _within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
-        blocks[name] = placed
+        blocks[name] = placed.with_variance(within.least)
     components = Components(
         cloud=_covariance(*everywhere),
         cloud_at_place=_covariance(*of_place),
@@ -221,12 +222,14 @@ class WithinPlace:
     """What a camera's matches of one place share, in units of independent matches.
 
     Attributes:
-        excess: (6, 6) K - 1 of the module's text, positive semidefinite.
+        least: k of the module's text.
+        excess: (6, 6) K - k, positive definite.
         efficiency: of independent matches: their true variance over that of H, in the mean.
         roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
         frames: (P,) of each place.
     """
 
+    least: float
     excess: Array
     efficiency: float
     roots: Array
@@ -251,9 +254,11 @@ def _within_place(
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     inverse = np.linalg.inv(true)
     covariance = root.T @ inverse @ scatter @ inverse @ root
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 - np.eye(6))
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
     return WithinPlace(
-        excess=(vectors * np.maximum(values, _LEAST_EXCESS)) @ vectors.T,
+        least=least,
+        excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
         efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
         roots=np.linalg.cholesky(hessians + _WEAK),
         frames=placed.frames,

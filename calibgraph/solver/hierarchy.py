@@ -16,7 +16,7 @@ o_p^-1 n_b. Priors and measured relative poses act on x_c.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -109,6 +109,12 @@ class PlacedBlock:
     def frames(self) -> Numbers:
         """(P,) of each place."""
         return np.bincount(self.place_of_frame, minlength=len(self.edges) - 1)
+
+    def with_variance(self, factor: float) -> PlacedBlock:
+        """With the variance of its matches multiplied, and the loss bending where it did."""
+        root = factor**0.5
+        block = self.block.rescale(scale=self.block.scale / root, sigma=self.block.sigma * root)
+        return replace(self, block=block)
 
     def sums(self, T_camera_cloud: Array) -> BlockSums:
         """H, b and c of each place at a pose of its own, (P, 4, 4), stacked."""

@@ -197,7 +197,7 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
 
 
 def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
-    """With matches far more exact than what is stated, these are all there is."""
+    """Of what is stated, of the scatter of frames, and of independent matches."""
     table = table_of(pair, 8, False, [])
     metadata = {**table.metadata, "place_variance": 0.0}
     errors = solve_model(pair, replace(table, metadata=metadata), pairs=False)
