@@ -22,14 +22,15 @@ class MatcherComponents:
 
     Attributes:
         systematic_rotation_rad, systematic_translation_m: of what all its frames share.
-        place_rotation_rad, place_translation_m: the part of it that all cameras share at a place, and
-            that differs from place to place.
+        camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of what a camera's frames of a place share besides, over the variance of one
             frame's matches if they were independent.
     """
 
     systematic_rotation_rad: float
     systematic_translation_m: float
+    camera_share: float
     place_rotation_rad: float
     place_translation_m: float
     place_variance: float
@@ -84,6 +85,7 @@ def error_components() -> ErrorComponents:
             name: MatcherComponents(
                 systematic_rotation_rad=float(np.radians(one["systematic_rotation_deg"])),
                 systematic_translation_m=one["systematic_translation_m"],
+                camera_share=one["camera_share"],
                 place_rotation_rad=float(np.radians(one["place_rotation_deg"])),
                 place_translation_m=one["place_translation_m"],
                 place_variance=one["place_variance"],

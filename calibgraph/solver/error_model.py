@@ -71,9 +71,7 @@ class ErrorFit:
         parts = self.model.components
         model = replace(
             self.model,
-            components=replace(
-                parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera
-            ),
+            components=replace(parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera),
         )
         fit = linearize(model, self.fit)
         return replace(self, model=model, fit=fit, sizes=(least, self.sizes[1]))
@@ -130,7 +128,11 @@ def fit_errors(
         return None
     places = places_of(inliers, metadata)
     model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
-    fit, usual, sizes = fit_hierarchy(model, start_poses(model, T_camera_lidar)), model.components, (1.0, 1.0)
+    fit, usual, sizes = (
+        fit_hierarchy(model, start_poses(model, T_camera_lidar)),
+        model.components,
+        (1.0, 1.0),
+    )
     if fit is None:
         return None
     for _ in range(_ROUNDS):
@@ -165,9 +167,8 @@ def error_model(
     """The model with usual sizes; arguments as of :func:`fit_errors`."""
     findings, usual = MatcherFindings.from_metadata(metadata), error_components()
     cameras = tuple(T_camera_lidar)
-    half = np.array(findings.systematic_sigmas) / np.sqrt(2)
-    of_place = np.array([findings.place_rotation_rad, findings.place_translation_m])
-    everywhere = np.sqrt(np.maximum(half**2 - of_place**2, 0.0))
+    whole, share = np.square(findings.systematic_sigmas), findings.camera_share
+    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
     blocks = {}
     for name, block in inliers.blocks.items():
@@ -176,10 +177,10 @@ def error_model(
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
         blocks[name] = placed.with_variance(within.least)
     components = Components(
-        cloud=_covariance(*everywhere),
+        cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
-        camera=_covariance(*half),
-        pairs=_covariance(*(pair_sigmas()[[0, 3]] / np.sqrt(2))),
+        camera=_covariance(*(share * whole)),
+        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
     )
@@ -187,9 +188,8 @@ def error_model(
     return Hierarchy(cameras, blocks, _placed_pairs(inliers.pairs, places), graph, components)
 
 
-def _covariance(rotation_rad: float, translation_m: float) -> Array:
-    sigmas = pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m)
-    return np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
+def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
+    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
 
 
 def _held_graph(
@@ -265,9 +265,7 @@ def _within_place(
     )
 
 
-def frame_scatter(
-    block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array
-) -> Array:
+def frame_scatter(block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array) -> Array:
     """(6, 6) covariance of the sum of all frames' gradients, about the means of their places.
 
     Args:
@@ -288,5 +286,3 @@ def frame_scatter(
         apart.T @ apart, true, np.full(6, count), usual * true * count / frames
     )
     return scatter * frames / count
-
-

@@ -92,7 +92,10 @@ class PlacedBlock:
             scale: of their residuals.
             places: the frame numbers of each place.
         """
-        numbers, place = np.concatenate(places), np.repeat(np.arange(len(places)), [*map(len, places)])
+        numbers, place = (
+            np.concatenate(places),
+            np.repeat(np.arange(len(places)), [*map(len, places)]),
+        )
         order = np.argsort(numbers)
         of_frame = place[order][np.searchsorted(numbers, camera.frame_numbers, sorter=order)]
         if len(places) == 1:

@@ -135,7 +135,7 @@ def shared_edges(model: Hierarchy, poses: Poses) -> Edges:
 
 
 def placed_edges(model: Hierarchy, poses: Poses) -> Edges:
-    """o to o_p and m_c to a_cp, with the loss of places."""
+    """O to o_p and m_c to a_cp, with the loss of places."""
     N, parts = len(model.cameras), model.components
     first, flat = np.tile(np.r_[3 * N, N : 2 * N], model.places), poses.placed.reshape(-1, 4, 4)
     information = parts.place_information.reshape(-1, 6, 6)
@@ -310,9 +310,7 @@ def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
     return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
 
 
-def _to_fit(
-    poses: Poses, equations: Equations, iterations: int, converged: bool
-) -> HierarchyFit:
+def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:
     hessian, _, solved = equations.reduced()
     return HierarchyFit(
         poses,

@@ -18,6 +18,7 @@ from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
+
 def shared_scatter(
     findings: MatcherFindings,
     T_camera_lidar: Mapping[str, Array],
@@ -27,8 +28,8 @@ def shared_scatter(
     """(6 N, 6 N) covariance of the gradient, by the error that all frames share.
 
     Three parts. The cloud is displaced as a rigid body, for all cameras alike, and the matches of
-    each camera are displaced by themselves: each with half the variance of ``systematic_sigmas``.
-    And frames of one place show the same objects, so that a part of their error repeats: as
+    each camera are displaced by themselves: each with its share of the variance of
+    ``systematic_sigmas``. And frames of one place show the same objects, so that a part of their error repeats: as
     ``place_variance`` times the covariance of one frame's matches, if they were independent. Their
     scatter, in which this part is missing, is added elsewhere.
 
@@ -39,10 +40,11 @@ def shared_scatter(
         repeats: per camera with correspondences, how many frames share a place, in the mean.
     """
     rotation_rad, translation_m = findings.systematic_sigmas
-    half = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2) / 2
+    whole = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
+    camera, cloud = findings.camera_share * whole, (1.0 - findings.camera_share) * whole
     cameras = list(T_camera_lidar)
     to_cameras = np.concatenate([gtsam.Pose3(T).AdjointMap() for T in T_camera_lidar.values()])
-    displaced = to_cameras @ half @ to_cameras.T + np.kron(np.eye(len(cameras)), half)
+    displaced = to_cameras @ cloud @ to_cameras.T + np.kron(np.eye(len(cameras)), camera)
     matches = curvature.of_correspondences
     scatter = np.asarray(matches @ displaced @ matches)
     for name, repeated in repeats.items():

@@ -19,8 +19,8 @@ from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
+from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
@@ -139,7 +139,9 @@ class Evidence:
         if self.scatter is None:
             return None
         shared = self.error_over_usual * self._shared(solution.inliers, self.curvature)
-        return self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
+        return (
+            self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
+        )
 
     @cached_property
     def errors(self) -> ErrorFit | None:

@@ -17,7 +17,6 @@ from calibgraph.model.findings import MatcherFindings
 Array = NDArray[np.float64]
 
 
-
 @dataclass(frozen=True, eq=False)
 class ImageResult:
     """The outcome of one image.

@@ -34,7 +34,6 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress
 
-
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
 """The round that follows a search, if it is confident of all cameras. With a sparse LiDAR, poses of
