@@ -128,11 +128,8 @@ def fit_errors(
         return None
     places = places_of(inliers, metadata)
     model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
-    fit, usual, sizes = (
-        fit_hierarchy(model, start_poses(model, T_camera_lidar)),
-        model.components,
-        (1.0, 1.0),
-    )
+    usual, sizes = model.components, (1.0, 1.0)
+    fit = fit_hierarchy(model, start_poses(model, T_camera_lidar))
     if fit is None:
         return None
     for _ in range(_ROUNDS):
@@ -233,7 +230,7 @@ class WithinPlace:
     excess: Array
     efficiency: float
     roots: Array
-    frames: Array
+    frames: Numbers
 
     def at_place(self, place_variance: float) -> Array:
         """(P, 6, 6) covariance of a_cp about m_c."""
@@ -260,7 +257,7 @@ def _within_place(
         least=least,
         excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
         efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
-        roots=np.linalg.cholesky(hessians + _WEAK),
+        roots=np.asarray(np.linalg.cholesky(hessians + _WEAK)),
         frames=placed.frames,
     )
 

@@ -92,10 +92,8 @@ class PlacedBlock:
             scale: of their residuals.
             places: the frame numbers of each place.
         """
-        numbers, place = (
-            np.concatenate(places),
-            np.repeat(np.arange(len(places)), [*map(len, places)]),
-        )
+        numbers = np.concatenate(places)
+        place = np.repeat(np.arange(len(places)), [len(frames) for frames in places])
         order = np.argsort(numbers)
         of_frame = place[order][np.searchsorted(numbers, camera.frame_numbers, sorter=order)]
         if len(places) == 1:
@@ -176,8 +174,8 @@ def hierarchy_graph(model: Hierarchy) -> gtsam.NonlinearFactorGraph:
                 block = model.blocks[name].at_place(place)
                 graph.add(pair_block_factor(cloud_key(place), key, block))
     for place, term in model.pairs:
-        keys = [gtsam.symbol("n", model.cameras.index(name)) for name in (term.a, term.b)]
-        graph.add(placed_pair_factor(cloud_key(place), *keys, term.block))
+        key_a, key_b = (gtsam.symbol("n", model.cameras.index(n)) for n in (term.a, term.b))
+        graph.add(placed_pair_factor(cloud_key(place), key_a, key_b, term.block))
     return join(graph, model.pose_graph)
 
 

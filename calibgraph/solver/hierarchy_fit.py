@@ -201,7 +201,7 @@ class Equations:
     def step(self, damping: float) -> tuple[Array, Array]:
         """Of the shared poses, and of those of each place."""
         hessian, gradient, solved = self.reduced(damping)
-        shared = -np.linalg.solve(hessian, gradient)
+        shared: Array = -np.linalg.solve(hessian, gradient)
         return shared, -(solved[..., :-1] @ shared + solved[..., -1])
 
     def _add_shared(self, model: Hierarchy, poses: Poses) -> None:
@@ -269,7 +269,7 @@ class Equations:
             factor = graph.at(index)
             jacobian, right = factor.linearize(values).jacobian()
             self.cost += float(right @ right)
-            numbers = [gtsam.symbolIndex(key) for key in factor.keys()]
+            numbers = [gtsam.symbolIndex(key) for key in list(factor.keys())]
             self._add_blocks(numbers, jacobian.T @ jacobian, -jacobian.T @ right)
 
     def _add_blocks(self, numbers: list[int], hessian: Array, gradient: Array) -> None:
@@ -314,9 +314,9 @@ def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool
     hessian, _, solved = equations.reduced()
     return HierarchyFit(
         poses,
-        np.linalg.inv(hessian),
+        np.asarray(np.linalg.inv(hessian)),
         solved[..., :-1],
-        np.linalg.inv(equations.of_places()),
+        np.asarray(np.linalg.inv(equations.of_places())),
         equations.distances,
         equations.cost,
         iterations,

@@ -84,7 +84,7 @@ def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
 
 
 def pair_sigmas() -> Array:
-    """(6,) of a relative pose from images: errors of lenses and surfaces, which all frames share."""
+    """(6,) of a relative pose from images: of lenses and surfaces, which all frames share."""
     sizes = error_components()
     return pose_sigmas(rotation_rad=sizes.pair_rotation_rad, translation_m=sizes.pair_translation_m)
 

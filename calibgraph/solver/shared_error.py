@@ -29,9 +29,9 @@ def shared_scatter(
 
     Three parts. The cloud is displaced as a rigid body, for all cameras alike, and the matches of
     each camera are displaced by themselves: each with its share of the variance of
-    ``systematic_sigmas``. And frames of one place show the same objects, so that a part of their error repeats: as
-    ``place_variance`` times the covariance of one frame's matches, if they were independent. Their
-    scatter, in which this part is missing, is added elsewhere.
+    ``systematic_sigmas``. And frames of one place show the same objects, so that a part of their
+    error repeats: as ``place_variance`` times the covariance of one frame's matches, if they were
+    independent. Their scatter, in which this part is missing, is added elsewhere.
 
     Args:
         findings: the matcher's error.
