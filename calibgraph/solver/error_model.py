@@ -39,7 +39,7 @@ from factors import pose_sigmas
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-_LEAST_SIGMA = 1e-6  # rad and m: what is stated to be exact is so to a micrometre
+_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 _WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
@@ -165,6 +165,10 @@ def error_model(
     findings, usual = MatcherFindings.from_metadata(metadata), error_components()
     cameras = tuple(T_camera_lidar)
     whole, share = np.square(findings.systematic_sigmas), findings.camera_share
+    if not whole.any() and inliers.pairs:  # nothing is stated, and there is what may contradict
+        unknown = usual.matchers["unknown"]
+        whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
+        share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
     blocks = {}

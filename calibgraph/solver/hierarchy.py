@@ -44,7 +44,8 @@ class Components:
         camera: (6, 6) of all matches of a camera, in its axes.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
-        robust_scale: distance [sigmas] at which Cauchy's loss of a place bends; infinite: none.
+        robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
+            infinite: none.
     """
 
     cloud: Array
@@ -195,4 +196,4 @@ def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
 
 def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
     noise = _noise(covariance)
-    return noise if np.isinf(scale) else robust_noise(noise, loss="cauchy", scale=scale)
+    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)

@@ -27,7 +27,7 @@ Index = NDArray[np.intp]
 TOLERANCE = 1e-7
 """Relative change of the cost at which it stops: some 1e-5 of the smallest standard deviations."""
 
-_SINGULAR = 1e-13  # smallest over largest eigenvalue: rounding noise
+_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 
 _DAMPINGS = (0.0, *10.0 ** np.arange(-4, 5))
 """Of the diagonal: the first that descends; mostly none is needed."""
@@ -95,7 +95,7 @@ class Edges:
         error: (n, 6) log(first^-1 second).
         to_first, to_second: (n, 6, 6) its derivatives.
         information: (n, 6, 6) without the loss.
-        robust_scale: of Cauchy's loss.
+        robust_scale: of the loss of Geman and McClure.
     """
 
     first: Index
@@ -114,14 +114,12 @@ class Edges:
     @cached_property
     def cost(self) -> Array:
         """(n,) by the loss."""
-        if np.isinf(self.robust_scale):
-            return self.squared
-        return np.asarray(self.robust_scale**2 * np.log1p(self.squared / self.robust_scale**2))
+        return np.asarray(self.squared / (1.0 + self.squared / self.robust_scale**2))
 
     @cached_property
     def weight(self) -> Array:
         """(n,) the loss' derivative."""
-        return np.asarray(1.0 / (1.0 + self.squared / self.robust_scale**2))
+        return np.asarray((1.0 + self.squared / self.robust_scale**2) ** -2)
 
 
 def shared_edges(model: Hierarchy, poses: Poses) -> Edges:
@@ -191,17 +189,21 @@ class Equations:
         P, L = self.distances.shape
         return self.placed.transpose(0, 1, 3, 2, 4).reshape(P, 6 * L, 6 * L)
 
-    @property
-    def is_determined(self) -> bool:
-        """Whether the cameras are, in all directions, but for rounding noise."""
-        hessian = self.reduced()[0]
-        values = np.linalg.eigvalsh(unit_diagonal(hessian)[0])
-        return bool(np.isfinite(values).all() and values[0] > _SINGULAR * values[-1])
+    def is_determined(self, cameras: int) -> bool:
+        """Whether x of so many cameras is, in all directions, but for rounding noise."""
+        hessian, rows = self.reduced()[0], 6 * cameras
+        others = np.linalg.solve(hessian[rows:, rows:], hessian[rows:, :rows])
+        of_cameras = hessian[:rows, :rows] - hessian[:rows, rows:] @ others
+        diagonal = np.diag(of_cameras)
+        if not np.isfinite(of_cameras).all() or diagonal.min() <= 0:
+            return False
+        values = np.linalg.eigvalsh(unit_diagonal(of_cameras)[0])
+        return bool(values[0] > _SINGULAR * values[-1])
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Of the shared poses, and of those of each place."""
         hessian, gradient, solved = self.reduced(damping)
-        shared: Array = -np.linalg.solve(hessian, gradient)
+        shared = -np.asarray(np.linalg.solve(hessian, gradient))
         return shared, -(solved[..., :-1] @ shared + solved[..., -1])
 
     def _add_shared(self, model: Hierarchy, poses: Poses) -> None:
@@ -293,7 +295,7 @@ def fit_hierarchy(
         None if a direction is not determined.
     """
     poses, equations, iterations, converged = start, Equations(model, start), 0, False
-    if not equations.is_determined:
+    if not equations.is_determined(len(model.cameras)):
         return None
     while iterations < MAX_ITERATIONS and not converged:
         found = _descend(model, poses, equations)
