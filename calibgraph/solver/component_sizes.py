@@ -9,7 +9,7 @@ poses) e is 0, the trace is 6 n, and the size is the usual one.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,44 +20,57 @@ from calibgraph.solver.hierarchy_fit import HierarchyFit, placed_edges, shared_e
 
 Array = NDArray[np.float64]
 
+_SETTLED = 0.05  # relative change of the sizes
 
-def sized_components(
-    usual: Components, model: Hierarchy, fit: HierarchyFit
-) -> tuple[Components, tuple[float, float]]:
-    """The usual components, times the sizes that a fit shows.
+
+@dataclass(frozen=True)
+class Sizes:
+    """Variances over the usual ones.
+
+    Attributes:
+        shared: of what all places share: the cloud, the cameras' matches, their pairs.
+        cloud: of the cloud at one place.
+        cameras: of a camera's matches at one place.
+    """
+
+    shared: float = 1.0
+    cloud: float = 1.0
+    cameras: float = 1.0
+
+    def scale(self, usual: Components) -> Components:
+        """Components of these sizes."""
+        return replace(
+            usual,
+            cloud=self.shared * usual.cloud,
+            camera=self.shared * usual.camera,
+            pairs=self.shared * usual.pairs,
+            cloud_at_place=self.cloud * usual.cloud_at_place,
+            at_place=self.cameras * usual.at_place,
+        )
+
+    def is_near(self, other: Sizes) -> bool:
+        """Whether all are the same but for some percent."""
+        return np.allclose(astuple(self), astuple(other), rtol=_SETTLED, atol=0.0)
+
+
+def sizes_of(model: Hierarchy, fit: HierarchyFit, present: Sizes) -> Sizes:
+    """The sizes that a fit shows.
 
     What is shared everywhere is never taken for smaller than usual: what displaces all cameras
     alike is not seen. Nor is what places share, where there are few of them.
 
     Args:
-        usual: of size 1.
         model: of the present sizes.
         fit: its minimum.
-
-    Returns:
-        The components; the sizes of what is shared everywhere, and of places.
+        present: of the model.
     """
-    prior, present = error_components(), model.components
-    shared = _size(
-        *_shared_evidence(model, fit), present.cloud[0, 0] / usual.cloud[0, 0], prior.shared_dof
-    )
-    placed = _size(
-        *_placed_evidence(model, fit),
-        present.cloud_at_place[0, 0] / usual.cloud_at_place[0, 0],
-        prior.place_dof,
-    )
-    shared = max(shared, 1.0)
-    if model.places < prior.least_places:
-        placed = max(placed, 1.0)
-    sized = replace(
-        usual,
-        cloud=shared * usual.cloud,
-        camera=shared * usual.camera,
-        pairs=shared * usual.pairs,
-        cloud_at_place=placed * usual.cloud_at_place,
-        at_place=placed * usual.at_place,
-    )
-    return sized, (shared, placed)
+    prior = error_components()
+    shared = _size(*_shared_evidence(model, fit), present.shared, prior.shared_dof)
+    squared, free = _placed_evidence(model, fit)
+    cloud = _size(squared[0], free[0], present.cloud, prior.place_dof)
+    cameras = _size(squared[1:].sum(), free[1:].sum(), present.cameras, prior.place_dof)
+    least = 1.0 if model.places < prior.least_places else 0.0
+    return Sizes(max(shared, 1.0), max(cloud, least), max(cameras, least))
 
 
 def _size(squared: float, free: float, present: float, prior_dof: float) -> float:
@@ -79,21 +92,22 @@ def _shared_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[float, float]
     return float(edges.squared.sum()), 6.0 * len(edges.error) - float(trace)
 
 
-def _placed_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[float, float]:
-    """The same of places, by their weights in the loss."""
+def _placed_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
+    """(1 + N,) the same of the cloud and of each camera at places, by their weights in the loss."""
     edges = placed_edges(model, fit.poses)
     weighted = edges.information * edges.weight[:, None, None]
     P, L = fit.distances.shape
     slope = fit.place_slope.reshape(P, L, 6, -1)
-    own, trace = fit.place_covariance, 0.0
+    traces = np.zeros(P * L)
     for number in range(P * L):
         place, local, shared = number // L, number % L, 6 * edges.first[number]
         # The place's pose is -slope times the shared ones, and varies about it by itself.
         gain = -edges.to_second[number] @ slope[place, local]
         gain[:, shared : shared + 6] += edges.to_first[number]
         rows = slice(6 * local, 6 * local + 6)
-        by_itself = edges.to_second[number] @ own[place, rows, rows] @ edges.to_second[number].T
+        own = fit.place_covariance[place, rows, rows]
+        by_itself = edges.to_second[number] @ own @ edges.to_second[number].T
         known = gain @ fit.shared_covariance @ gain.T + by_itself
-        trace += float(np.sum(weighted[number] * known))
-    squared = float((edges.weight * edges.squared).sum())
-    return squared, 6.0 * float(edges.weight.sum()) - trace
+        traces[number] = np.sum(weighted[number] * known)
+    squared = (edges.weight * edges.squared).reshape(P, L).sum(axis=0)
+    return squared, (6.0 * edges.weight - traces).reshape(P, L).sum(axis=0)

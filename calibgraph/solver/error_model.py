@@ -25,7 +25,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
-from calibgraph.solver.component_sizes import sized_components
+from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
@@ -44,7 +44,7 @@ _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what th
 _WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
-_ROUNDS, _SETTLED = 3, 0.05  # of fitting and sizing; relative change of the sizes
+_ROUNDS = 5  # of fitting and sizing
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +55,17 @@ class ErrorFit:
         model: with the sizes that fit the data.
         fit: its minimum and marginals.
         places: the numbers of the frames of each place.
-        sizes: variances over the usual ones: of what is shared everywhere, and of places.
+        sizes: of its components, over the usual ones.
     """
 
     model: Hierarchy
     fit: HierarchyFit
     places: tuple[Numbers, ...]
-    sizes: tuple[float, float]
+    sizes: Sizes
 
     def with_shared_size(self, least: float) -> ErrorFit:
         """The same minimum, with covariances of what is shared everywhere of at least this size."""
-        ratio = least / self.sizes[0]
+        ratio = least / self.sizes.shared
         if ratio <= 1.0:
             return self
         parts = self.model.components
@@ -74,7 +74,7 @@ class ErrorFit:
             components=replace(parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera),
         )
         fit = linearize(model, self.fit)
-        return replace(self, model=model, fit=fit, sizes=(least, self.sizes[1]))
+        return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -128,19 +128,19 @@ def fit_errors(
         return None
     places = places_of(inliers, metadata)
     model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
-    usual, sizes = model.components, (1.0, 1.0)
+    usual, sizes = model.components, Sizes()
     fit = fit_hierarchy(model, start_poses(model, T_camera_lidar))
     if fit is None:
         return None
     for _ in range(_ROUNDS):
-        components, new = sized_components(usual, model, fit)
-        if np.allclose(new, sizes, rtol=_SETTLED, atol=0.0):
+        found = sizes_of(model, fit, sizes)
+        if found.is_near(sizes):
             break
-        model, sizes = replace(model, components=components), new
-        again = fit_hierarchy(model, fit.poses)
+        resized = replace(model, components=found.scale(usual))
+        again = fit_hierarchy(resized, fit.poses)
         if again is None:
             break
-        fit = again
+        model, fit, sizes = resized, again, found
     return ErrorFit(model, fit, tuple(places), sizes)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.error_components import error_components
+from calibgraph.model.threshold import Threshold
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.error_model import ErrorFit
@@ -81,13 +82,12 @@ def _check(places: Sequence[PlaceAgreement]) -> list[Check]:
     far = max(places, key=lambda place: place.sigmas)
     few = min(places, key=lambda place: place.inliers)
     return [
-        _describe("place_distance", far.sigmas, far),
-        _describe("place_inliers", few.inliers, few),
+        _describe(threshold("place_distance"), far.sigmas, far),
+        _describe(threshold("place_inliers"), few.inliers, few),
     ]
 
 
-def _describe(key: str, value: float, place: PlaceAgreement) -> Check:
-    row = threshold(key)
+def _describe(row: Threshold, value: float, place: PlaceAgreement) -> Check:
     status = row.grade(value)
     number = f"{value:.2g} {row.unit}".rstrip()
     advice = "" if status == "PASS" else f": {row.advice}"
