@@ -44,7 +44,8 @@ _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what th
 _WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
-_ROUNDS = 5  # of fitting and sizing
+_ROUNDS = 3  # of fitting and sizing
+_COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,11 @@ class ErrorFit:
         )
         fit = linearize(model, self.fit)
         return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
+
+    def without_pose_graph(self) -> HierarchyFit | None:
+        """The fit without priors and measured relative poses, of the same sizes."""
+        model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
+        return fit_hierarchy(model, self.fit.poses)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -129,19 +135,17 @@ def fit_errors(
     places = places_of(inliers, metadata)
     model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
     usual, sizes = model.components, Sizes()
-    fit = fit_hierarchy(model, start_poses(model, T_camera_lidar))
-    if fit is None:
-        return None
+    fit = fit_hierarchy(
+        model, start_poses(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
+    )
     for _ in range(_ROUNDS):
-        found = sizes_of(model, fit, sizes)
-        if found.is_near(sizes):
+        found = sizes if fit is None else sizes_of(model, fit, sizes)
+        if fit is None or found.is_near(sizes):
             break
-        resized = replace(model, components=found.scale(usual))
-        again = fit_hierarchy(resized, fit.poses)
-        if again is None:
-            break
-        model, fit, sizes = resized, again, found
-    return ErrorFit(model, fit, tuple(places), sizes)
+        model, sizes = replace(model, components=found.scale(usual)), found
+        fit = fit_hierarchy(model, fit.poses, relative_tolerance=_COARSE_TOLERANCE)
+    fit = None if fit is None else fit_hierarchy(model, fit.poses)
+    return None if fit is None else ErrorFit(model, fit, tuple(places), sizes)
 
 
 def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:

@@ -68,6 +68,21 @@ class Components:
         return np.linalg.inv(np.concatenate([cloud, self.at_place], axis=1))
 
 
+def place_of(frame: Numbers, places: Sequence[Numbers]) -> Numbers:
+    """(n,) the index of the place of each frame number, of places that hold all; else, of another.
+
+    Args:
+        frame: (n,).
+        places: the frame numbers of each place.
+    """
+    numbers = np.concatenate(places)
+    place = np.repeat(np.arange(len(places)), [len(frames) for frames in places])
+    order = np.argsort(numbers)
+    nearest = np.searchsorted(numbers, frame, sorter=order)
+    found: Numbers = place[order][np.minimum(nearest, len(numbers) - 1)]
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedBlock:
     """One camera's correspondences, place by place.
@@ -93,10 +108,7 @@ class PlacedBlock:
             scale: of their residuals.
             places: the frame numbers of each place.
         """
-        numbers = np.concatenate(places)
-        place = np.repeat(np.arange(len(places)), [len(frames) for frames in places])
-        order = np.argsort(numbers)
-        of_frame = place[order][np.searchsorted(numbers, camera.frame_numbers, sorter=order)]
+        of_frame = place_of(camera.frame_numbers, places)
         if len(places) == 1:
             counts = camera.frame_counts
             edges = np.array([0, len(camera)])

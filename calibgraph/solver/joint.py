@@ -118,6 +118,7 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         camera_matches=matches,
         before_pairs=alone.optimum if inliers.pairs else None,
         errors=errors,
+        errors_before_pairs=alone.errors if inliers.pairs else None,
     )
 
 

@@ -48,6 +48,7 @@ class Solution:
         before_pairs: the optimum without it; None if no pair of cameras had enough.
         held: cameras that nothing determines; they stay where the rig has them.
         errors: the error model that the optimum is of; None where it is that of the objective.
+        errors_before_pairs: likewise, of ``before_pairs``.
     """
 
     rig: Rig
@@ -62,6 +63,7 @@ class Solution:
     before_pairs: Optimum | None = None
     held: tuple[str, ...] = ()
     errors: ErrorFit | None = None
+    errors_before_pairs: ErrorFit | None = None
 
     @property
     def T_camera_lidar(self) -> Transforms:
@@ -96,7 +98,9 @@ class Solution:
             name: {**of_camera, **count_places(table.metadata, self.inliers.blocks.get(name))}
             for name, of_camera in self.counts.items()
         }
-        return replace(self, correspondences=table, counts=counts, errors=None)
+        return replace(
+            self, correspondences=table, counts=counts, errors=None, errors_before_pairs=None
+        )
 
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
@@ -104,5 +108,10 @@ class Solution:
             return self
         alone = replace(self.inliers, pairs=())
         return replace(
-            self, inliers=alone, optimum=self.before_pairs, before_pairs=None, errors=None
+            self,
+            inliers=alone,
+            optimum=self.before_pairs,
+            before_pairs=None,
+            errors=self.errors_before_pairs,
+            errors_before_pairs=None,
         )

@@ -261,6 +261,10 @@ class Evidence:
         solution = self.solution
         if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
             return None
+        if self.errors is not None and set(self.errors.model.blocks) == set(self.cameras):
+            fit, model = self.errors.without_pose_graph(), self.errors.model
+            if fit is not None:
+                return DataOnly(fit.T_camera_lidar(model), fit.covariance)
         free = solution.inliers.data_only()
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar

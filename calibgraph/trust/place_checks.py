@@ -13,9 +13,11 @@ from calibgraph.model.threshold import Threshold
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.hierarchy import place_of
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
 
+Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 
@@ -62,10 +64,10 @@ def place_agreements(evidence: Evidence, errors: ErrorFit, camera: str) -> list[
     ]
 
 
-def _count(block: CameraBlock, places: Sequence[Numbers]) -> Numbers:
+def _count(block: CameraBlock, places: Sequence[Numbers]) -> Array:
     """(P,) correspondences at each place."""
-    numbers, counts = block.frame_numbers, block.frame_counts
-    return np.array([int(counts[np.isin(numbers, frames)].sum()) for frames in places])
+    place = place_of(block.frame_numbers, places)
+    return np.asarray(np.bincount(place, block.frame_counts, len(places)), dtype=np.float64)
 
 
 def place_checks(evidence: Evidence) -> Checks:
