@@ -80,7 +80,7 @@ class ErrorFit:
     def without_pose_graph(self) -> HierarchyFit | None:
         """The fit without priors and measured relative poses, of the same sizes."""
         model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
-        return fit_hierarchy(model, self.fit.poses)
+        return fit_hierarchy(model, self.fit.poses, relative_tolerance=_COARSE_TOLERANCE)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:

@@ -163,8 +163,16 @@ class Equations:
         self._add_pairs(model, poses)
         self._add_pose_graph(model, poses)
 
-    def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+    @cached_property
+    def reduced(self) -> tuple[Array, Array, Array]:
+        """The places eliminated, without damping: see :meth:`eliminate`."""
+        return self.eliminate(0.0)
+
+    def eliminate(self, damping: float) -> tuple[Array, Array, Array]:
         """The places eliminated.
+
+        Args:
+            damping: by which the diagonals grow.
 
         Returns:
             (G, G) Hessian and (G,) gradient of the shared poses; (P, L, G + 1): the step of a place
@@ -175,8 +183,9 @@ class Equations:
         shared = self.shared[:free, :free].transpose(0, 2, 1, 3).reshape(6 * free, 6 * free).copy()
         placed = self.of_places().copy()
         across = self.across[:, :, :free].transpose(0, 1, 3, 2, 4).reshape(P, 6 * L, 6 * free)
-        for matrix in (shared, placed):
-            np.einsum("...ii->...i", matrix)[...] *= 1.0 + damping
+        if damping:
+            for matrix in (shared, placed):
+                np.einsum("...ii->...i", matrix)[...] *= 1.0 + damping
         own = self.placed_gradient.reshape(P, 6 * L, 1)
         solved = np.linalg.solve(placed, np.concatenate([across, own], axis=2))
         removed = across.reshape(-1, 6 * free).T @ solved.reshape(-1, 6 * free + 1)
@@ -191,7 +200,7 @@ class Equations:
 
     def is_determined(self, cameras: int) -> bool:
         """Whether x of so many cameras is, in all directions, but for rounding noise."""
-        hessian, rows = self.reduced()[0], 6 * cameras
+        hessian, rows = self.reduced[0], 6 * cameras
         others = np.linalg.solve(hessian[rows:, rows:], hessian[rows:, :rows])
         of_cameras = hessian[:rows, :rows] - hessian[:rows, rows:] @ others
         diagonal = np.diag(of_cameras)
@@ -202,7 +211,7 @@ class Equations:
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Of the shared poses, and of those of each place."""
-        hessian, gradient, solved = self.reduced(damping)
+        hessian, gradient, solved = self.eliminate(damping) if damping else self.reduced
         shared = -np.asarray(np.linalg.solve(hessian, gradient))
         return shared, -(solved[..., :-1] @ shared + solved[..., -1])
 
@@ -315,7 +324,7 @@ def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
 
 
 def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:
-    hessian, _, solved = equations.reduced()
+    hessian, _, solved = equations.reduced
     return HierarchyFit(
         poses,
         np.asarray(np.linalg.inv(hessian)),
