@@ -261,7 +261,12 @@ class Evidence:
         solution = self.solution
         if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
             return None
-        if self.errors is not None and set(self.errors.model.blocks) == set(self.cameras):
+        measured = bool(solution.rig.relative_poses)  # which may be far from the matches' minimum
+        if (
+            self.errors is not None
+            and not measured
+            and len(self.errors.model.blocks) == len(self.cameras)
+        ):
             fit, model = self.errors.without_pose_graph(), self.errors.model
             if fit is not None:
                 return DataOnly(fit.T_camera_lidar(model), fit.covariance)

@@ -102,10 +102,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("outlier_frames", "share of outlier frames", "at most", 0.35, 0.9, "share",
               "How many frames lie apart from where frames are densest?", _COUNTED,
               "a minority of the frames decides; check what differs between them"),
-    Threshold("place_distance", "distance of a place from the others", "at most", 4.0, math.inf,
+    Threshold("place_distance", "distance of a place from the others", "at most", 5.0, math.inf,
               "sigma", "Does each place agree with the others, of three and more?",
-              "99 % of Gaussian errors of six numbers are under 4.1; 301 places of rendered "
-              "streets and of KITTI were under 2.4.", "it counts little; look at its frames"),
+              "Of Gaussian errors of six numbers 1 in 3000 is farther; 426 places of rendered "
+              "streets and of KITTI are under 3.5.", "it counts little; look at its frames"),
     Threshold("place_inliers", "inlier share of a place over that of the others", "at least", 0.5,
               0.0, "", "Does each place have as many inliers as the others?",
               "At a place whose cloud is turned by 1 deg it is 0.05.",
