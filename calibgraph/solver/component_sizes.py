@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.hierarchy import Components, Hierarchy
-from calibgraph.solver.hierarchy_fit import HierarchyFit, placed_edges, shared_edges
+from calibgraph.solver.hierarchy_fit import HierarchyFit
+from calibgraph.solver.hierarchy_poses import placed_edges, shared_edges
 
 Array = NDArray[np.float64]
 

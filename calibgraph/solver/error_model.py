@@ -30,7 +30,8 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
 from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
-from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize, start_poses
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize
+from calibgraph.solver.hierarchy_poses import start_poses
 from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.repeats import split_places

@@ -20,7 +20,8 @@ from calibgraph import (
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.hierarchy import Components, Hierarchy, hierarchy_graph
-from calibgraph.solver.hierarchy_fit import HierarchyFit, Poses, fit_hierarchy, start_poses
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy
+from calibgraph.solver.hierarchy_poses import Poses, start_poses
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
 from tests.solver.test_camera_pairs import simulated_pairs
