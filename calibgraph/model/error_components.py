@@ -52,6 +52,7 @@ class ErrorComponents:
         least_places: from so many on the size of places may be found smaller than usual.
         robust_sigmas: distance at which the loss of a place bends.
         robust_places: from so many on there is one.
+        contradiction_sigmas: from so far on a measured relative pose takes no part.
     """
 
     matchers: dict[str, MatcherComponents]
@@ -66,6 +67,7 @@ class ErrorComponents:
     least_places: int
     robust_sigmas: float
     robust_places: int
+    contradiction_sigmas: float
 
 
 @cache
@@ -103,4 +105,5 @@ def error_components() -> ErrorComponents:
         least_places=sizes["least_places"],
         robust_sigmas=sizes["robust_sigmas"],
         robust_places=sizes["robust_places"],
+        contradiction_sigmas=sizes["contradiction_sigmas"],
     )

@@ -26,6 +26,7 @@ from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.component_sizes import Sizes, sizes_of
+from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
@@ -58,12 +59,14 @@ class ErrorFit:
         fit: its minimum and marginals.
         places: the numbers of the frames of each place.
         sizes: of its components, over the usual ones.
+        alone: the same without measured relative poses and priors, where some are measured.
     """
 
     model: Hierarchy
     fit: HierarchyFit
     places: tuple[Numbers, ...]
     sizes: Sizes
+    alone: ErrorFit | None = None
 
     def with_shared_size(self, least: float) -> ErrorFit:
         """The same minimum, with covariances of what is shared everywhere of at least this size."""
@@ -99,16 +102,55 @@ def weigh_errors(
     """The minimum under the error model, where it differs from that of independent matches.
 
     Where there is nothing but the matches of one place, their minimum is that of both; it stays,
-    and no model is made. Arguments and what is None as of :func:`fit_errors`.
+    and no model is made. Measured relative poses that contradict the correspondences take no part,
+    so that one that is wrong, or two cameras that are swapped, do not move the others. Arguments
+    and what is None as of :func:`fit_errors`.
     """
     several = inliers.blocks and len(places_of(inliers, metadata)) > 1
     if not (several or inliers.pairs or inliers.rig.relative_poses):
         return None, optimum
-    found = fit_errors(inliers, optimum.T_camera_lidar, scales, metadata, held)
+    alone, T = None, optimum.T_camera_lidar
+    if inliers.rig.relative_poses:
+        alone = fit_alone(inliers, T, scales, metadata)
+    if alone is not None:
+        agreeing = _without_contradictions(inliers, alone)
+        T = T if agreeing is inliers else T | alone.T_camera_lidar
+        inliers = agreeing
+    found = fit_errors(inliers, T, scales, metadata, held)
     if found is None:
         return None, optimum
+    found = replace(found, alone=alone)
     fit, T = found.fit, found.T_camera_lidar
     return found, Optimum(T, fit.cost, optimum.iterations + fit.iterations, fit.converged)
+
+
+def fit_alone(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+) -> ErrorFit | None:
+    """The fit of the correspondences and pairs alone; what is None as of :func:`fit_errors`."""
+    if inliers.config.preset != "auto" or not inliers.uses_correspondences:
+        return None
+    free = inliers.data_only()
+    start = {name: T_camera_lidar[name] for name in free.cameras}
+    return fit_errors(free, free.minimize(start, scales).T_camera_lidar, scales, metadata)
+
+
+def _without_contradictions(inliers: Objective, alone: ErrorFit) -> Objective:
+    """Without the relative poses that the correspondences of both their cameras contradict."""
+    cameras, limit = alone.model.cameras, error_components().contradiction_sigmas
+    measured, T = inliers.rig.relative_poses, alone.T_camera_lidar
+    kept = tuple(
+        pair
+        for pair in measured
+        if not {pair.a, pair.b} <= set(cameras)
+        or relative_pose_conflict(pair, cameras, T, alone.fit.covariance).largest <= limit
+    )
+    if len(kept) == len(measured):
+        return inliers
+    return replace(inliers, rig=inliers.rig.model_copy(update={"relative_poses": kept}))
 
 
 def fit_errors(
