@@ -12,7 +12,7 @@ from calibgraph.model.perturbation import perturb
 from calibgraph.trust.thresholds import threshold
 from tests.conftest import make_camera, make_pair, stereo_relative_pose
 
-TURN_DEG = 1.0  # of the relative pose that is wrong; its sigma is 0.06
+TURN_DEG = 30.0  # of the relative pose that is wrong, as if cameras were exchanged
 
 
 @pytest.fixture(scope="module")
