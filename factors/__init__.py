@@ -21,6 +21,7 @@ from factors.pair import (
     pair_chain,
     pair_projection_factor,
     pair_sums,
+    placed_pair_factor,
     surface_factor,
 )
 from factors.pose import (
@@ -51,6 +52,7 @@ __all__ = [
     "pair_chain",
     "pair_projection_factor",
     "pair_sums",
+    "placed_pair_factor",
     "pose_sigmas",
     "projection_factor",
     "projection_residual",

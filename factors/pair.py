@@ -61,6 +61,37 @@ def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomF
     return _factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
 
 
+def placed_pair_factor(
+    key_cloud: int, key_a: int, key_b: int, block: PairBlock
+) -> gtsam.CustomFactor:
+    """As :func:`pair_block_factor`, with the cloud displaced: on ``T_lidar_cloud`` and both poses.
+
+    The block's poses are T_cloud_a = T_lidar_cloud^-1 T_lidar_a, and T_cloud_b likewise.
+
+    Args:
+        key_cloud: the variable ``T_lidar_cloud``.
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        block: of features of camera A, seen in camera B.
+    """
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        cloud, *cameras = (values.atPose3(key) for key in (key_cloud, key_a, key_b))
+        found, jacobian = _error_and_jacobian(block, *(cloud.between(pose) for pose in cameras))
+        if jacobians is not None:
+            chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
+            jacobians[0] = np.asfortranarray(jacobian @ chain)
+            jacobians[1] = np.asfortranarray(jacobian[:, :6])
+            jacobians[2] = np.asfortranarray(jacobian[:, 6:])
+        return found
+
+    rows = 13 if isinstance(block, SurfaceBlock) else 7
+    noise = gtsam.noiseModel.Unit.Create(rows)
+    return gtsam.CustomFactor(noise, [key_cloud, key_a, key_b], error)
+
+
 def _error_and_jacobian(
     block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
 ) -> tuple[Array, Array]:

@@ -61,7 +61,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
     for name, T in run.solution.T_camera_lidar.items():
         np.testing.assert_array_equal(alone.T_camera_lidar[name], T)
     np.testing.assert_allclose(
-        tied.solution.T_camera_lidar["left"], run.solution.T_camera_lidar["left"], atol=1e-6
+        tied.solution.T_camera_lidar["left"], run.solution.T_camera_lidar["left"], atol=1e-5
     )
     features = {n: c.get("common_features") for n, c in tied.solution.counts.items()}
     assert features["left"] is None and (features[PAIR[0]] or 0) > 50
@@ -106,7 +106,7 @@ def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: 
     assert read.camera_matches is not None
     assert len(read.camera_matches) == len(result.camera_matches)
     sigmas = result.sigmas("->".join(PAIR))
-    assert sigmas is not None and sigmas[0].max() < 0.05 and sigmas[1].max() < 1
+    assert sigmas is not None and sigmas[0].max() < 0.1 and sigmas[1].max() < 1.5
     replace(result, camera_matches=None).save(tmp_path)
     assert not (tmp_path / "camera_matches.parquet").exists()
     result.camera_matches.save(tmp_path / "camera_matches.parquet")  # not marked as a result's

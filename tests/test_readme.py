@@ -74,7 +74,7 @@ def test_the_table_of_the_last_round_repeats_the_solve(result: calibgraph.Calibr
     again = calibgraph.solve(result.rig, result.correspondences)
     for name, T in result.T_camera_lidar.items():
         delta = calibgraph.evaluate(again.rig, result.rig).cameras[name]
-        assert delta.rotation_error_deg < 0.01, name
+        assert delta.rotation_error_deg < 0.02, name  # without what cameras see in common
         assert delta.translation_error_cm < 0.2, name
         assert T.shape == (4, 4)
 

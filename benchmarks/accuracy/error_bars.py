@@ -1,19 +1,22 @@
 """Error bars over many rendered scenes with sensors that err, each scene once.
 
     python -m benchmarks.accuracy.error_bars --scenes out/error_bars --groups 0:72 --jobs 2
+    python -m benchmarks.accuracy.error_bars --groups 12:16 --streets 20
 
 A group is a sensor with errors of its own, and five streets that it drove through, three frames
 each: one place. Rigs, beams and the size of the errors change from group to group. The second table
-solves again with the correspondences of one, two and five of a group's streets. NEES is the squared
-error in the metric of its covariance; its mean over 6 should be 1.
+solves again with the correspondences of one, two, five, ten and twenty of a group's streets, as far
+as it has as many; the third with those of five, changed: a relative pose is known, a camera has no
+matches or few, frames are repeated. NEES is the squared error in the metric of its covariance; its
+mean over 6 should be 1.
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +30,9 @@ from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import (
     Camera,
     Config,
+    Correspondences,
     Intrinsics,
+    RelativePose,
     Rig,
     calibrate,
     load_camera_matches,
@@ -37,8 +42,9 @@ from calibgraph import (
     perturb,
     simulate_street,
 )
-from calibgraph.model.camera_matches import concatenate_camera_matches
+from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
 from calibgraph.model.correspondences import concatenate
+from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import draw_scan_errors
@@ -46,6 +52,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.evidence import Evidence
 
 STREETS = 5
+_FURTHER = 100_000  # seeds of more streets than that
 FRAMES, STEP_M = 3, 4.0
 SIZES = (0.0, 0.5, 1.0, 2.0)
 GUESS_DEG, GUESS_M = 1.0, 0.1
@@ -88,11 +95,15 @@ def main() -> None:
     cases = [
         Key("scene", RIGS[group % len(RIGS)][0], str(SIZES[group // len(RIGS) % len(SIZES)]), seed)
         for group in range(first, last)
-        for seed in range(2000 + STREETS * group, 2000 + STREETS * (group + 1))
+        for seed in seeds_of(group, arguments.streets)
     ]
     work = partial(run_case, scenes=arguments.scenes)
     records = ledger.records_of(arguments, cases, work)
-    tables = [report(records), report_places(records, arguments.scenes)]
+    tables = [
+        report(records),
+        report_places(records, arguments.scenes),
+        report_changes(records, arguments.scenes),
+    ]
     ledger.publish_cases("accuracy.error_bars", tables, records, record=arguments.record)
 
 
@@ -105,6 +116,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument(
         "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[12, 72]
     )
+    parser.add_argument("--streets", type=int, default=STREETS, help="of each sensor")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "error_bars.jsonl")
     parser.add_argument("--summary", type=Path, help="print the tables of a file, run no scene")
@@ -112,9 +124,20 @@ def parse_options() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def seeds_of(group: int, streets: int) -> list[int]:
+    """The seeds of a group's streets: five in a row, and further ones."""
+    first = [2000 + STREETS * group + street for street in range(min(streets, STREETS))]
+    return first + [_FURTHER + 100 * group + street for street in range(STREETS, streets)]
+
+
+def group_of(seed: int) -> int:
+    """The group that a street is of."""
+    return (seed - _FURTHER) // 100 if seed >= _FURTHER else (seed - 2000) // STREETS
+
+
 def run_case(case: Key, scenes: Path) -> Record:
     """Render one street, calibrate from near the truth, keep the tables beside it."""
-    group = (case.seed - 2000) // STREETS
+    group = group_of(case.seed)
     _, make_rig, beams = RIGS[group % len(RIGS)]
     folder, truth = scenes / f"scene_{case.seed}", make_rig()
     size, rng = float(case.data), np.random.default_rng([7, group])
@@ -171,25 +194,83 @@ def _calibration(nees_over_6: Iterable[float]) -> tuple[str, str]:
 
 def report_places(records: Sequence[Record], scenes: Path) -> Table:
     """A row per number of places and size of the errors: cameras and pairs."""
-    found: dict[tuple[int, str, str], list[float]] = {}
-    sizes = {record["seed"]: record["data"] for record in records if "cameras" in record}
-    for first in sorted(seed for seed in sizes if (seed - 2000) % STREETS == 0):
-        seeds = [seed for seed in range(first, first + STREETS) if seed in sizes]
-        for places in (1, 2, STREETS):
-            for start in range(0, len(seeds) - places + 1, places):
-                folders = [scenes / f"scene_{seed}" for seed in seeds[start : start + places]]
-                for what, nees in solve_places(folders):
-                    found.setdefault((places, sizes[first], what), []).append(nees / 6)
+    found: dict[tuple[int, str, str], list[Found]] = {}
+    for size, folders in streets_of_groups(records, scenes):
+        for places in (1, 2, STREETS, 10, 20):
+            for start in range(0, len(folders) - places + 1, places):
+                for what in solve_streets(load_streets(folders[start : start + places])):
+                    found.setdefault((places, size, what.of), []).append(what)
     rows = [
-        (str(places), size, what, str(len(values)), *_calibration(values))
-        for (places, size, what), values in sorted(found.items())
+        (str(places), size, of, *_cells(values))
+        for (places, size, of), values in sorted(found.items())
     ]
-    columns = ("places", "sensor errors", "of", "results", "mean NEES / 6", "in the 95 % region")
+    columns = ("places", "sensor errors", "of", *_CELLS)
     return Table("Streets of one sensor solved together", columns, tuple(rows))
 
 
-def solve_places(folders: Sequence[Path]) -> Iterator[tuple[str, float]]:
-    """NEES of each camera, and of each next to the one before it, by the tables of some streets."""
+def report_changes(records: Sequence[Record], scenes: Path) -> Table:
+    """A row per change and size of the errors: five places."""
+    found: dict[tuple[str, str, str], list[Found]] = {}
+    for size, folders in streets_of_groups(records, scenes):
+        if len(folders) < STREETS:
+            continue
+        streets = load_streets(folders[:STREETS])
+        for name, change in CHANGES.items():
+            rng = np.random.default_rng([11, int(folders[0].name.split("_")[1])])
+            for what in solve_streets(change(streets, rng)):
+                found.setdefault((name, size, what.of), []).append(what)
+    rows = [(*key, *_cells(values)) for key, values in found.items()]
+    columns = ("five places", "sensor errors", "of", *_CELLS)
+    return Table("Streets of one sensor solved together, changed", columns, tuple(rows))
+
+
+_CELLS = ("results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "[cm]")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The error of one camera, or of one next to the one before it."""
+
+    of: str
+    nees_over_6: float
+    degrees: float
+    centimetres: float
+
+
+def _cells(values: Sequence[Found]) -> tuple[str, ...]:
+    deg, cm = (np.median([getattr(one, unit) for one in values])
+               for unit in ("degrees", "centimetres"))  # fmt: skip
+    nees = _calibration(one.nees_over_6 for one in values)
+    return str(len(values)), *nees, f"{deg:.3f}", f"{cm:.2f}"
+
+
+def streets_of_groups(records: Sequence[Record], scenes: Path) -> Iterator[tuple[str, list[Path]]]:
+    """Of each group the size of the sensor's errors, and its streets."""
+    sizes = {record["seed"]: record["data"] for record in records if "cameras" in record}
+    for group in sorted({group_of(seed) for seed in sizes}):
+        seeds = sorted(seed for seed in sizes if group_of(seed) == group)
+        yield sizes[seeds[0]], [scenes / f"scene_{seed}" for seed in seeds]
+
+
+@dataclass(frozen=True)
+class Streets:
+    """What is solved together.
+
+    Attributes:
+        truth: the rig as it is.
+        start: the rig to start from, with relative poses if any are known.
+        table: of all streets, with places.
+        matches: of pairs of cameras; None without any.
+    """
+
+    truth: Rig
+    start: Rig
+    table: Correspondences
+    matches: CameraMatches | None
+
+
+def load_streets(folders: Sequence[Path]) -> Streets:
+    """The tables of some streets of one sensor."""
     truth, tables, pairs, places = load_rig(folders[0] / "reference.yaml"), [], [], []
     for number, folder in enumerate(folders):
         table, add = load_correspondences(folder / "correspondences.parquet"), number * FRAMES
@@ -199,11 +280,18 @@ def solve_places(folders: Sequence[Path]) -> Iterator[tuple[str, float]]:
             matches = load_camera_matches(folder / "camera_matches.parquet")
             pairs.append(replace(matches, frame=matches.frame + add))
     joined = concatenate(tables)
-    joined = replace(joined, metadata={**joined.metadata, "places": places})
+    stated = asdict(error_components().matchers["structure"])  # also where tables are older
+    joined = replace(joined, metadata={**joined.metadata, **stated, "places": places})
+    matches = concatenate_camera_matches(pairs) if pairs else None
+    return Streets(truth, load_rig(folders[0] / "result.yaml"), joined, matches)
+
+
+def solve_streets(streets: Streets) -> Iterator[Found]:
+    """Of each camera, and of each next to the one before it."""
+    truth = streets.truth
     solved = solve_joint(
-        load_rig(folders[0] / "result.yaml"), joined,
-        Config(stage1="rig", learnt_weights=False),
-        camera_matches=concatenate_camera_matches(pairs) if pairs else None,
+        streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
+        camera_matches=streets.matches,
     )  # fmt: skip
     joint = Evidence(solved, guess=truth).joint_covariance
     assert joint is not None
@@ -211,15 +299,64 @@ def solve_places(folders: Sequence[Path]) -> Iterator[tuple[str, float]]:
     for place, name in enumerate(T):
         errors.append(twist_between(T[name], truth.cameras[name].T_camera_lidar))
         rows = slice(6 * place, 6 * place + 6)
-        yield "camera", _nees(errors[-1], joint[rows, rows])
+        yield _found("camera", errors[-1], joint[rows, rows])
         if place:
             T_b_a = relative_transform(T[name], T[list(T)[place - 1]])
             between = errors[place] - gtsam.Pose3(T_b_a).AdjointMap() @ errors[place - 1]
-            yield "pair", _nees(between, relative_covariance(joint, place - 1, place, T_b_a))
+            of_pair = relative_covariance(joint, place - 1, place, T_b_a)
+            yield _found("pair", between, of_pair)
 
 
-def _nees(error: np.ndarray, covariance: np.ndarray) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
+def _found(of: str, error: np.ndarray, covariance: np.ndarray) -> Found:
+    nees = float(error @ np.linalg.solve(covariance, error))
+    degrees, metres = (float(np.linalg.norm(part)) for part in (error[:3], error[3:]))
+    return Found(of, nees / 6, float(np.degrees(degrees)), 100 * metres)
+
+
+def without_pairs(streets: Streets, rng: np.random.Generator) -> Streets:
+    """What cameras see in common is not used."""
+    return replace(streets, matches=None)
+
+
+def tied(streets: Streets, rng: np.random.Generator) -> Streets:
+    """The relative pose of the first two cameras is measured, to 0.02 deg and 0.3 cm."""
+    sigmas = {"rotation_sigma_rad": np.radians(0.02), "translation_sigma_m": 0.003}
+    a, b = list(streets.truth.cameras)[:2]
+    T = streets.truth.T_camera_lidar
+    error = np.repeat([*sigmas.values()], 3) * rng.standard_normal(6)
+    measured = relative_transform(T[a], T[b]) @ gtsam.Pose3.Expmap(error).matrix()
+    pose = RelativePose(a=a, b=b, T_a_b=measured, **sigmas)
+    start = streets.start.model_copy(update={"relative_poses": (pose,)})
+    return replace(streets, start=start, matches=None)
+
+
+def few_frames(streets: Streets, rng: np.random.Generator, *, count: int) -> Streets:
+    """The first camera has matches in so many frames alone."""
+    table, first = streets.table, next(iter(streets.truth.cameras))
+    own = table.camera_index == table.cameras.index(first)
+    kept = table.select(~own | (table.frame < count))
+    return replace(streets, table=kept, matches=None)
+
+
+def repeated(streets: Streets, rng: np.random.Generator) -> Streets:
+    """The frames of the first street ten times, as if they were of other places."""
+    first = streets.table.select(streets.table.frame < FRAMES)
+    more = [replace(first, frame=first.frame + 1000 * copy) for copy in range(1, 10)]
+    table = replace(concatenate([streets.table, *more]), metadata=streets.table.metadata)
+    return replace(streets, table=table)
+
+
+CHANGES: dict[str, Callable[[Streets, np.random.Generator], Streets]] = {
+    "as they are": lambda streets, rng: streets,
+    "without pairs": without_pairs,
+    "tied by 0.02 deg 0.3 cm": tied,
+    "first camera without matches, tied": lambda streets, rng: tied(
+        few_frames(streets, rng, count=0), rng
+    ),
+    "1 frame of the first camera": partial(few_frames, count=1),
+    "3 frames of the first camera": partial(few_frames, count=3),
+    "first street 10 times": repeated,
+}
 
 
 if __name__ == "__main__":

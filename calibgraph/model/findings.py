@@ -22,6 +22,9 @@ _NUMBERS = {
     "range_translation_m": 100.0,
     "systematic_rotation_rad": math.pi,
     "systematic_translation_m": 100.0,
+    "camera_share": 1.0,
+    "place_rotation_rad": math.pi,
+    "place_translation_m": 100.0,
     "place_variance": 1e6,
 }
 
@@ -41,6 +44,8 @@ class MatcherFindings:
             if unknown.
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             error that all its frames share.
+        camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of the error that frames of one place share, over that of one frame's
             matches if they were independent.
     """
@@ -55,6 +60,9 @@ class MatcherFindings:
     range_translation_m: float | None = None
     systematic_rotation_rad: float = 0.0
     systematic_translation_m: float = 0.0
+    camera_share: float = 0.5
+    place_rotation_rad: float = 0.0
+    place_translation_m: float = 0.0
     place_variance: float = 0.0
 
     @staticmethod

@@ -23,6 +23,15 @@ def invert(T_a_b: Array) -> Array:
     return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
 
 
+def invert_each(T_a_b: Array) -> Array:
+    """(f, 4, 4) T_b_a of as many rigid transforms: faster than :func:`invert`."""
+    inverse = np.zeros_like(T_a_b)
+    inverse[..., :3, :3] = T_a_b[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T_a_b[..., :3, 3:]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
 def relative_transform(T_a_c: Array, T_b_c: Array) -> Array:
     """(4, 4) T_a_b = T_a_c T_b_c^-1: of two cameras, from both extrinsics (paper, Eq. 3)."""
     T_a_b: Array = T_a_c @ np.linalg.inv(T_b_c)

@@ -75,6 +75,11 @@ class CameraBlock:
         """How many frames they come from."""
         return len(self.frame_edges) - 1
 
+    @property
+    def frame_counts(self) -> NDArray[np.int64]:
+        """(f,) of the correspondences of each frame."""
+        return np.diff(self.frame_edges)
+
     def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) which correspondences belong to frames of some numbers."""
         edges = self.frame_edges

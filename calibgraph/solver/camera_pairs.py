@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
+from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.residual_scale import (
@@ -39,11 +40,6 @@ Kind = Literal["surface", "point"]
 
 MIN_PAIR_MATCHES = 12
 """Of fewer matches the residuals' spread, and with it their weight, is not known."""
-
-USUAL_CORRELATION = 0.2
-"""Of the errors of two matches of one frame. It multiplies the variance of n matches by
-1 + 0.2 (n - 1), and counts where frames are few: simulated errors that are half the frame's have
-0.5, matches of ``structure`` on recordings about 0.1."""
 
 ENOUGH_SURFACES = 50
 """Features on surfaces from which on a pair has no epipolar term: a spread of 0.3 px then leaves
@@ -82,6 +78,12 @@ class PairTerm:
         """With residuals divided by sigma, and the loss's scale in units of it."""
         block = self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma_px)
         return replace(self, block=block)
+
+    def deflate(self, excess: float) -> PairTerm:
+        """With its information divided by so much, and the loss bending where it did."""
+        root = excess**0.5
+        scale, sigma = self.block.scale / root, self.block.sigma * root
+        return replace(self, block=self.block.rescale(scale=scale, sigma=sigma))
 
     def errors_px(self, T_camera_lidar: Mapping[str, Array]) -> Array:
         """(n,) lengths of the residuals; infinite where B cannot see the point."""
@@ -137,7 +139,7 @@ def usual_excess(terms: Sequence[PairTerm]) -> float:
     """
     numbers = np.concatenate([term.frame for term in terms])
     frames = max(1, len(np.unique(numbers)))
-    return 1 + USUAL_CORRELATION * max(0.0, len(numbers) / frames - 1)
+    return 1 + error_components().pair_correlation * max(0.0, len(numbers) / frames - 1)
 
 
 def pair_terms(

@@ -8,8 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.camera_pairs import USUAL_CORRELATION, PairTerm, usual_excess
+from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.curvature import (
     Curvature,
     add_pair_hessians,
@@ -26,12 +27,10 @@ ENOUGH_FRAMES = 5
 """From so many on, the scatter between frames decides about the error bar; with fewer, mostly what
 is usual of matches."""
 
-PSEUDO_FRAMES = 6.0
+PSEUDO_FRAMES = error_components().pseudo_frames
 """Frames that are added with the scatter along each principal direction. A covariance of six
 numbers from few frames is too small for their joint error (its inverse, by (F - 1) / (F - 8) for F
 frames)."""
-
-_USUAL_FRAMES = 0.5  # as many frames as what is usual counts for
 
 _FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
@@ -83,12 +82,12 @@ def cluster_robust_covariance(
 def usual_scatter(inliers: Objective, T_camera_lidar: Transforms, curvature: Curvature) -> Array:
     """(6 N, 6 N) scatter of all frames' gradients if matches are correlated as usual.
 
-    Of n independent matches it is their Hessian; USUAL_CORRELATION multiplies it.
+    Of n independent matches it is their Hessian; with a correlation r, 1 + r (n - 1) times that.
     """
     cameras, usual = list(T_camera_lidar), np.zeros_like(curvature.whole)
     for name, block in inliers.blocks.items():
         rows = pose_rows(cameras.index(name))
-        excess = USUAL_CORRELATION * (len(block) / block.frames - 1)
+        excess = error_components().frame_correlation * (len(block) / block.frames - 1)
         usual[rows, rows] = (1 + excess) * curvature.of_correspondences[rows, rows]
     for pair in inliers.pairs:
         own = np.zeros_like(usual)
@@ -151,7 +150,8 @@ def with_pseudo_frames(
         mean = along * count / np.maximum(count - 1.0, 1.0)
     else:
         prior = _along(vectors, usual * of_frame) / PSEUDO_FRAMES
-        mean = (_USUAL_FRAMES * prior + count * along) / (_USUAL_FRAMES + count - 1.0)
+        usual_frames = error_components().usual_frames
+        mean = (usual_frames * prior + count * along) / (usual_frames + count - 1.0)
     allowed: Array = scatter + (vectors * (PSEUDO_FRAMES * mean)) @ vectors.T
     return allowed
 

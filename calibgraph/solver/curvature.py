@@ -35,8 +35,8 @@ class Curvature:
 
     Attributes:
         of_correspondences: of each camera's own.
-        measured: of the measured relative poses, times their weight: the covariance of their
-            gradients if their sigmas hold.
+        measured: of the measured relative poses: the covariance of their gradients if their sigmas
+            hold.
         whole: of all terms, with 1 for what nothing determines (``held`` cameras).
     """
 
@@ -97,16 +97,15 @@ def curvature_at(
     own = np.zeros((6 * len(cameras), 6 * len(cameras)))
     for name, hessian in robust_hessians.items():
         rows = pose_rows(cameras.index(name))
-        own[rows, rows] = _if_convex(hessian + gates.get(name, 0.0), hessian)
-    weight = inliers.relative_pose_weight
-    measured = relative_pose_graph(cameras, inliers.rig.relative_poses, weight=weight**2)
+        own[rows, rows] = convex_hessian(hessian + gates.get(name, 0.0), hessian)
+    measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
     whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
     add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
     whole += unknown([name in held for name in cameras])
     return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
 
 
-def _if_convex(hessian: Array, otherwise: Array) -> Array:
+def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     """The Hessian if it is positive definite; few matches near the gate may spoil it."""
     return hessian if np.linalg.eigvalsh(hessian)[0] > 0 else otherwise
 

@@ -6,7 +6,6 @@ prior and between factors are the paper's terms.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -123,16 +122,16 @@ def relative_prior_graph(
 
 
 def relative_pose_graph(
-    cameras: Sequence[str], relative_poses: Iterable[RelativePose], *, weight: float = 1.0
+    cameras: Sequence[str], relative_poses: Iterable[RelativePose]
 ) -> gtsam.NonlinearFactorGraph:
-    """Independently known relative poses of the rig, with their own sigmas, times a weight."""
+    """Independently known relative poses of the rig, with their own sigmas."""
     return _graph(
         relative_pose_factor(
             pose_key(cameras, pair.a),
             pose_key(cameras, pair.b),
             pair.T_a_b,
-            rotation_sigma_rad=pair.rotation_sigma_rad / math.sqrt(weight),
-            translation_sigma_m=pair.translation_sigma_m / math.sqrt(weight),
+            rotation_sigma_rad=pair.rotation_sigma_rad,
+            translation_sigma_m=pair.translation_sigma_m,
         )
         for pair in relative_poses
     )
@@ -145,8 +144,6 @@ def objective_graph(
     T_hat: Mapping[str, Array],
     config: Config,
     terms: Terms,
-    *,
-    relative_pose_weight: float = 1.0,
 ) -> gtsam.NonlinearFactorGraph:
     """The whole objective (paper, Eq. 5), and the measured relative poses of the rig.
 
@@ -160,7 +157,6 @@ def objective_graph(
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar.
         config: lambda, mu and the pairs of the relative prior.
         terms: which terms of Eq. 5 take part; with ``priors`` and ``stage1``, the priors alone.
-        relative_pose_weight: of the measured relative poses, see ``Objective``.
     """
     cameras = list(rig.cameras)
     lambda_, mu = config.prior_weight, config.relative_prior_weight
@@ -170,8 +166,7 @@ def objective_graph(
         blocks = {}
     return join(                                           # minimize over T_1 ... T_N:
         projection_graph(cameras, blocks),                 # sum rho(|w (u - pi(T_i, p))|^2)
-        relative_pose_graph(cameras, rig.relative_poses,   # + measured relative poses (ours)
-                            weight=relative_pose_weight),
+        relative_pose_graph(cameras, rig.relative_poses),  # + measured relative poses (ours)
         prior_graph(cameras, T_hat, weight=lambda_),       # + lambda sum_i |log(T_hat_i^-1 T_i)|^2
         relative_prior_graph(cameras, T_hat, weight=mu,    # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
                              pairs=config.relative_prior_pairs),

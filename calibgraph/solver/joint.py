@@ -13,8 +13,8 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
+from calibgraph.solver.error_model import weigh_errors
 from calibgraph.solver.frame_weights import weigh_all_frames
-from calibgraph.solver.information import weigh_relative_poses
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
@@ -77,15 +77,14 @@ def solve_joint(
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
-    with watch("relative_poses"):                                          # ours: their weight
-        objective, inliers, optimum = weigh_relative_poses(
-            objective, inliers, optimum, scales, kept.table.metadata
-        )
+    with watch("error_model"):                                             # ours: shared errors
+        errors, optimum = weigh_errors(inliers, optimum, scales, kept.table.metadata, held)
 
     counts = count_correspondences(kept, objective, inliers, pairwise, frames.outlier_frames)
     seconds = watch.seconds
     found = Solution(
-        rig, kept.table, objective, inliers, scales, optimum, counts, seconds, held=held
+        rig, kept.table, objective, inliers, scales, optimum, counts, seconds,
+        held=held, errors=errors,
     )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
@@ -106,6 +105,10 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     by_place = replace(matches, frame=frame)
     with watch("camera_pairs"):
         inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_place)
+    with watch("error_model"):
+        errors, optimum = weigh_errors(
+            inliers, optimum, alone.scales, solution.correspondences.metadata, alone.held
+        )
     return replace(
         alone,
         inliers=inliers,
@@ -114,6 +117,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         timings_s={**solution.timings_s, **watch.seconds},
         camera_matches=matches,
         before_pairs=alone.optimum if inliers.pairs else None,
+        errors=errors,
+        errors_before_pairs=alone.errors if inliers.pairs else None,
     )
 
 

@@ -54,8 +54,6 @@ class Objective:
             scale that it was drawn at; before it, empty.
         relative_tolerance: of Levenberg-Marquardt.
         pairs: what cameras see in common, each term with its sigma.
-        relative_pose_weight: how many times over the correspondences count their information, as if
-            each were independent. Measured relative poses, which do not, are multiplied by it.
     """
 
     rig: Rig
@@ -66,7 +64,6 @@ class Objective:
     gated: Mapping[str, tuple[CameraBlock, Array, ResidualScale]] = field(default_factory=dict)
     relative_tolerance: float = RELATIVE_TOLERANCE
     pairs: tuple[PairTerm, ...] = ()
-    relative_pose_weight: float = 1.0
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -94,14 +91,7 @@ class Objective:
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
         """All terms but the reprojection term: priors and measured relative poses."""
-        return objective_graph(
-            self.rig,
-            {},
-            self.T_hat,
-            self.config,
-            self.terms,
-            relative_pose_weight=self.relative_pose_weight,
-        )
+        return objective_graph(self.rig, {}, self.T_hat, self.config, self.terms)
 
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:
@@ -121,10 +111,6 @@ class Objective:
     def with_tolerance(self, relative_tolerance: float) -> Objective:
         """The same objective, with less exact minima."""
         return self._with(relative_tolerance=relative_tolerance)
-
-    def weigh_relative_poses(self, weight: float) -> Objective:
-        """The same objective with another weight of the measured relative poses."""
-        return replace(self, relative_pose_weight=weight)
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences, and the pairs of their frames."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
+from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import (
     pose_rows,
     relative_covariance,
@@ -24,10 +25,6 @@ from calibgraph.solver.objective import Objective, Scales
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]
-
-PAIR_SIGMA_RAD, PAIR_SIGMA_M = np.radians(0.02), 0.004
-"""Standard deviation per axis of a relative pose from the images of one scene: the scatter between
-the sequences 00, 01, 06 and 07 of KITTI. Errors of lenses and surfaces, which all frames share."""
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
 _PAIR_RESCALINGS = 6
@@ -84,6 +81,12 @@ def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
             own = [other for other in terms if {other.a, other.b} == pair]
             found[pair] = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
     return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
+
+
+def pair_sigmas() -> Array:
+    """(6,) of a relative pose from images: of lenses and surfaces, which all frames share."""
+    sizes = error_components()
+    return pose_sigmas(rotation_rad=sizes.pair_rotation_rad, translation_m=sizes.pair_translation_m)
 
 
 def fit_pair(
@@ -163,9 +166,8 @@ def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> 
             of_a = held[cameras.index(a)]
             T = fit_pair((a, b), terms, rig.T_camera_lidar, of_a)
             both = covariance_of_fit((a, b), terms, T, of_a)
-            shared = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
             own = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
-            fits.append(PairFit(a, b, terms, T, own + np.diag(shared**2)))
+            fits.append(PairFit(a, b, terms, T, own + np.diag(pair_sigmas() ** 2)))
     return fits
 
 

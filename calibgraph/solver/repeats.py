@@ -60,9 +60,12 @@ def frames_of_one_place(metadata: Mapping[str, Any], frame: Numbers) -> float:
 
 def split_places(metadata: Mapping[str, Any], frame: Numbers) -> list[Numbers]:
     """The numbers of a camera's frames, place by place; arguments as of `frames_of_one_place`."""
-    places = [frame[np.isin(frame, place)] for place in _lists_of_frames(metadata, PLACES)]
-    named = np.concatenate([np.empty(0, dtype=np.int64), *places])
-    return [place for place in (*places, np.setdiff1d(frame, named)) if len(place)]
+    lists = _lists_of_frames(metadata, PLACES)
+    place_of = {number: place for place, numbers in enumerate(lists) for number in numbers}
+    place = np.array([place_of.get(number, len(lists)) for number in frame.tolist()], np.int64)
+    order = np.argsort(place, kind="stable")
+    edges = np.flatnonzero(np.diff(place[order])) + 1
+    return [part for part in np.split(frame[order], edges) if len(part)]
 
 
 def _lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:

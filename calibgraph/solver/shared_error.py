@@ -8,16 +8,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
 from calibgraph.solver.curvature import Curvature
-from calibgraph.solver.pair_refinement import PAIR_SIGMA_M, PAIR_SIGMA_RAD, PairFit
+from calibgraph.solver.pair_refinement import PairFit, pair_sigmas
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
-
-_USUAL_DOF = 6.0  # degrees of freedom that the usual size of the shared error counts for
 
 
 def shared_scatter(
@@ -29,10 +28,10 @@ def shared_scatter(
     """(6 N, 6 N) covariance of the gradient, by the error that all frames share.
 
     Three parts. The cloud is displaced as a rigid body, for all cameras alike, and the matches of
-    each camera are displaced by themselves: each with half the variance of ``systematic_sigmas``.
-    And frames of one place show the same objects, so that a part of their error repeats: as
-    ``place_variance`` times the covariance of one frame's matches, if they were independent. Their
-    scatter, in which this part is missing, is added elsewhere.
+    each camera are displaced by themselves: each with its share of the variance of
+    ``systematic_sigmas``. And frames of one place show the same objects, so that a part of their
+    error repeats: as ``place_variance`` times the covariance of one frame's matches, if they were
+    independent. Their scatter, in which this part is missing, is added elsewhere.
 
     Args:
         findings: the matcher's error.
@@ -41,10 +40,11 @@ def shared_scatter(
         repeats: per camera with correspondences, how many frames share a place, in the mean.
     """
     rotation_rad, translation_m = findings.systematic_sigmas
-    half = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2) / 2
+    whole = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
+    camera, cloud = findings.camera_share * whole, (1.0 - findings.camera_share) * whole
     cameras = list(T_camera_lidar)
     to_cameras = np.concatenate([gtsam.Pose3(T).AdjointMap() for T in T_camera_lidar.values()])
-    displaced = to_cameras @ half @ to_cameras.T + np.kron(np.eye(len(cameras)), half)
+    displaced = to_cameras @ cloud @ to_cameras.T + np.kron(np.eye(len(cameras)), camera)
     matches = curvature.of_correspondences
     scatter = np.asarray(matches @ displaced @ matches)
     for name, repeated in repeats.items():
@@ -55,7 +55,7 @@ def shared_scatter(
 
 def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]) -> Array:
     """(6 N, 6 N) covariance of the error of relative poses from images, half in each camera."""
-    of_pair = np.diag(pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M) ** 2)
+    of_pair = np.diag(pair_sigmas() ** 2)
     seen = {name for pair in pairs for name in (pair.a, pair.b)}
     cameras = np.diag([float(name in seen) for name in T_camera_lidar])
     return np.asarray(np.kron(cameras, of_pair / 2))
@@ -92,7 +92,8 @@ def error_over_usual(
     jacobian, step = np.concatenate(to_pairs), np.concatenate(apart)
     whole = jacobian @ covariance @ jacobian.T + of_images
     chi_squared = float(step @ np.linalg.solve(whole, step))
-    return max(1.0, (_USUAL_DOF + chi_squared) / (_USUAL_DOF + len(step)))
+    usual_dof = error_components().shared_dof
+    return max(1.0, (usual_dof + chi_squared) / (usual_dof + len(step)))
 
 
 def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:

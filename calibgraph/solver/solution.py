@@ -15,6 +15,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.factor_graph import Optimum
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.repeats import PLACES, split_places
@@ -46,6 +47,8 @@ class Solution:
         camera_matches: what cameras see in common; None if it was not given.
         before_pairs: the optimum without it; None if no pair of cameras had enough.
         held: cameras that nothing determines; they stay where the rig has them.
+        errors: the error model that the optimum is of; None where it is that of the objective.
+        errors_before_pairs: likewise, of ``before_pairs``.
     """
 
     rig: Rig
@@ -59,6 +62,8 @@ class Solution:
     camera_matches: CameraMatches | None = None
     before_pairs: Optimum | None = None
     held: tuple[str, ...] = ()
+    errors: ErrorFit | None = None
+    errors_before_pairs: ErrorFit | None = None
 
     @property
     def T_camera_lidar(self) -> Transforms:
@@ -93,11 +98,20 @@ class Solution:
             name: {**of_camera, **count_places(table.metadata, self.inliers.blocks.get(name))}
             for name, of_camera in self.counts.items()
         }
-        return replace(self, correspondences=table, counts=counts)
+        return replace(
+            self, correspondences=table, counts=counts, errors=None, errors_before_pairs=None
+        )
 
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
         if self.before_pairs is None:
             return self
         alone = replace(self.inliers, pairs=())
-        return replace(self, inliers=alone, optimum=self.before_pairs, before_pairs=None)
+        return replace(
+            self,
+            inliers=alone,
+            optimum=self.before_pairs,
+            before_pairs=None,
+            errors=self.errors_before_pairs,
+            errors_before_pairs=None,
+        )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
+from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, with_pseudo_frames
 from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.factor_graph import relative_pose_graph
@@ -18,7 +19,7 @@ from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 from calibgraph.tracking.window import kept_pairs, pose_priors
-from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
+from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
 from factors import pose_sigmas

@@ -27,6 +27,7 @@ from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
+from calibgraph.trust.place_checks import place_checks
 from calibgraph.trust.rematch_checks import (
     last_round_checks,
     rematch_checks,
@@ -51,6 +52,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     matcher_checks,             # what the matcher reported: search, learned shares, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?
+    place_checks,               # does a place contradict the others?
     repeated_frame_checks,      # how many are of one place, or copies?
     assumed_spread_checks,      # does the configured loss scale suit the residuals?
     held_out_checks,            # does it explain frames that it was not fitted to?

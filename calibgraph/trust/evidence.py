@@ -18,8 +18,10 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
+from calibgraph.solver.error_model import ErrorFit, fit_alone, fit_errors
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
@@ -27,8 +29,8 @@ from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
-from calibgraph.trust.estimate import Conflict, Estimate, relative_pose_conflict
-from calibgraph.trust.observability import prior_shares
+from calibgraph.trust.estimate import Estimate
+from calibgraph.trust.observability import prior_shares, shares_of_marginal
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -128,15 +130,36 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N) by the scatter, plus the error that all the matcher's frames share."""
+        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich.
+
+        Cameras that are held are unknown by a radian and a metre.
+        """
+        solution = self.solution
+        if solution.config.preset == "auto":
+            return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.error_over_usual * self._shared(self.solution.inliers, self.curvature)
+        shared = self.error_over_usual * self._shared(solution.inliers, self.curvature)
         return (
-            self.scatter
-            + shared
-            + error_between(self.solution.T_camera_lidar, self.solution.inliers.pairs)
+            self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
         )
+
+    @cached_property
+    def errors(self) -> ErrorFit | None:
+        """The error model of the solution; None with the paper's presets.
+
+        What all matches share is at least as large as the images of pairs show, also where the loss
+        has given these up.
+        """
+        solution = self.solution
+        found = solution.errors or fit_errors(
+            solution.inliers,
+            solution.T_camera_lidar,
+            solution.scales,
+            solution.correspondences.metadata,
+            solution.held,
+        )
+        return None if found is None else found.with_shared_size(self.error_over_usual)
 
     @cached_property
     def error_over_usual(self) -> float:
@@ -195,7 +218,9 @@ class Evidence:
     @cached_property
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
-        return prior_shares(self.solution, self.robust_hessians)
+        if self.errors is None:
+            return prior_shares(self.solution, self.robust_hessians)
+        return shares_of_marginal(self.solution, self.errors.fit.covariance)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
@@ -237,9 +262,13 @@ class Evidence:
         solution = self.solution
         if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
             return None
+        if (found := self._data_only_by_errors) is not None:
+            return found
         free = solution.inliers.data_only()
         start = {name: solution.T_camera_lidar[name] for name in free.cameras}
         T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
+        if solution.config.preset == "auto":
+            return DataOnly(T_camera_lidar, None)
         blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
         curvature = curvature_at(free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar))
         scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
@@ -247,6 +276,20 @@ class Evidence:
             return DataOnly(T_camera_lidar, None)
         shared = self._shared(free, curvature) + error_between(T_camera_lidar, free.pairs)
         return DataOnly(T_camera_lidar, scatter + shared)
+
+    @property
+    def _data_only_by_errors(self) -> DataOnly | None:
+        """The same by the error model, None where there is none."""
+        solution, errors = self.solution, self.errors
+        if errors is not None and errors.alone is None and not solution.rig.relative_poses:
+            fit = errors.without_pose_graph()  # near its minimum already
+            if fit is not None and len(errors.model.blocks) == len(self.cameras):
+                return DataOnly(fit.T_camera_lidar(errors.model), fit.covariance)
+        alone = None if errors is None else errors.alone
+        if alone is None:
+            metadata, T = solution.correspondences.metadata, solution.T_camera_lidar
+            alone = fit_alone(solution.inliers, T, solution.scales, metadata)
+        return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.consensus import maximize_score, sum_scores
-from calibgraph.matching.structure.matcher import PLACE_VARIANCE
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.model.error_components import error_components
 from calibgraph.model.rig import Camera
 from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
@@ -172,7 +172,8 @@ def _fit_at_peaks(
     table = extract_correspondences(extended, start, "camera")
     table = replace(table, frame=number_by_place(places, table.frame))
     jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
-    shared = PLACE_VARIANCE * frames_of_one_place(places, np.unique(table.frame))
+    variance = error_components().matchers["structure"].place_variance
+    shared = variance * frames_of_one_place(places, np.unique(table.frame))
     return fit_augmented(camera, table, jacobian_px, shared_variance=shared)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,24 @@ def prior_shares(solution: Solution, robust_hessians: Mapping[str, Array]) -> di
     for name, of_camera in robust_hessians.items():
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += of_camera
-    influence = np.diag(np.linalg.pinv(hessian, hermitian=True) @ priors).reshape(-1, 6)
+    return _mean_influence(np.linalg.pinv(hessian, hermitian=True) @ priors, cameras)
+
+
+def shares_of_marginal(solution: Solution, covariance: Array) -> dict[str, float]:
+    """As :func:`prior_shares`, beside matches that share their errors.
+
+    Args:
+        solution: of the joint solve.
+        covariance: (6 N, 6 N) marginal of its error model.
+    """
+    T_camera_lidar = solution.T_camera_lidar
+    cameras = list(T_camera_lidar)
+    priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
+    return _mean_influence(covariance @ priors, cameras)
+
+
+def _mean_influence(of_priors: Array, cameras: Sequence[str]) -> dict[str, float]:
+    influence = np.diag(of_priors).reshape(-1, 6)
     return {
         name: float(np.clip(influence[place].mean(), 0.0, 1.0))
         for place, name in enumerate(cameras)

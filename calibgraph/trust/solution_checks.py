@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.verdict import Check
+from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
-from calibgraph.trust.estimate import Conflict, Estimate
+from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
 

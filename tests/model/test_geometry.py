@@ -14,6 +14,7 @@ from calibgraph.model.geometry import (
     angle_deg,
     camera_center,
     invert,
+    invert_each,
     local_coordinates,
     point_in_lidar,
     pose_difference,
@@ -42,6 +43,9 @@ INVERTING = {
     "calibgraph/fleet/standing.py": NO_TRANSFORM,
     "calibgraph/matching/cmrnext/training/samples.py": "a camera matrix K",
     "calibgraph/solver/augmented_fit.py": NO_TRANSFORM,
+    "calibgraph/solver/error_model.py": NO_TRANSFORM,
+    "calibgraph/solver/hierarchy.py": NO_TRANSFORM,
+    "calibgraph/solver/hierarchy_fit.py": NO_TRANSFORM,
     "calibgraph/tracking/assessment.py": NO_TRANSFORM,
     "calibgraph/tracking/cause.py": NO_TRANSFORM,
     "calibgraph/tracking/epoch_summary.py": NO_TRANSFORM,
@@ -155,6 +159,11 @@ def test_only_the_geometry_inverts_transforms() -> None:
                 found.add(path.relative_to(package.parent).as_posix())
     assert "calibgraph/model/geometry.py" in found
     assert found == {"calibgraph/model/geometry.py", *INVERTING}
+
+
+def test_many_rigid_transforms_are_inverted_as_any_matrix() -> None:
+    T = np.array([[random_transform(seed) for seed in range(row, row + 3)] for row in range(2)])
+    np.testing.assert_allclose(invert_each(T), np.linalg.inv(T), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-7, 9e-3, 1.1e-2, 0.5, 1.8])

@@ -13,7 +13,7 @@ from calibgraph.model.geometry import relative_covariance, relative_transform
 from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.curvature import Curvature
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.pair_refinement import PAIR_SIGMA_M, PAIR_SIGMA_RAD, PairFit, fit_pairs
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, pair_sigmas
 from calibgraph.solver.shared_error import (
     error_between,
     error_over_usual,
@@ -71,9 +71,9 @@ def test_the_error_of_images_is_between_cameras_that_share_features_alone(pair: 
     relative = relative_covariance(
         error_between(T, terms), 0, 1, relative_transform(T["right"], T["left"])
     )
-    own = pose_sigmas(rotation_rad=PAIR_SIGMA_RAD, translation_m=PAIR_SIGMA_M)
     # Half of the pair's variance is in the left camera, half a metre away, which adds to it.
-    assert np.sqrt(np.diag(relative)) == pytest.approx(own, abs=0.5 * PAIR_SIGMA_RAD)
+    own = pair_sigmas()
+    assert np.sqrt(np.diag(relative)) == pytest.approx(own, abs=0.5 * own[0])
 
 
 @pytest.mark.parametrize("size", [2.0, 4.0])

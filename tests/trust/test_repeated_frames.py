@@ -86,7 +86,7 @@ def test_the_part_that_a_place_shares_falls_with_the_number_of_places(pair: Rig)
     table = simulated(pair, frames=8)
     found = []
     for places in ([], [[0, 1], [2, 3], [4, 5], [6, 7]]):
-        named = {"place_variance": 1e4, "places": places}
+        named = {"place_variance": 300.0, "places": places}
         result = solve(pair, replace(table, metadata={**table.metadata, **named}))
         covariance = result.covariance["left"]
         assert covariance is not None

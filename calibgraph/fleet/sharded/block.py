@@ -46,6 +46,15 @@ class ShardedProjection:
     loss_scale: float
     sigma: float
 
+    @property
+    def scale(self) -> float:
+        """As of ``ProjectionBlock``."""
+        return self.loss_scale
+
+    def rescale(self, *, scale: float, sigma: float) -> ShardedProjection:
+        """As of ``ProjectionBlock``."""
+        return replace(self, loss_scale=scale, sigma=sigma)
+
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c at a pose: 28 numbers of each file."""
         return unpack_sums(np.sum(self._call("sums", T_lidar_camera.matrix()), axis=0))
@@ -95,6 +104,11 @@ class ShardedBlock:
     def frames(self) -> int:
         """How many frames they come from."""
         return sum(map(len, self.frame_parts))
+
+    @property
+    def frame_counts(self) -> Numbers:
+        """(f,) of the correspondences of each frame."""
+        return np.concatenate(self.count_parts)
 
     def with_frames(self, stage: str, parts: Sequence[tuple[Numbers, Numbers]]) -> ShardedBlock:
         """What is left, by numbers and counts of the frames in each file."""

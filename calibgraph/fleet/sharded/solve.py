@@ -28,7 +28,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve, to_calibration
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.information import weigh_relative_poses
+from calibgraph.solver.error_model import weigh_errors
 from calibgraph.solver.joint import count_correspondences, solve_joint
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.preprocess import Preprocessed
@@ -150,14 +150,12 @@ def solve_with(
         report("pass2", 0, 1)
         inliers = objective.without_outliers(rough, scales)
         optimum = inliers.minimize(rough, scales)
-        objective, inliers, optimum = weigh_relative_poses(
-            objective, inliers, optimum, scales, sample.metadata
-        )
+        errors, optimum = weigh_errors(inliers, optimum, scales, sample.metadata, held)
     repeated = {name: sum(file.repeated[name] for file in files) for name in rig.cameras}
     kept = Preprocessed(sample, counts, repeated)
     found = count_correspondences(kept, objective, inliers, pairwise, outliers)
     solution = Solution(rig, sample, objective, inliers, scales, optimum, found, watch.seconds,
-                        held=held)
+                        held=held, errors=errors)
     return solution, sample
 # fmt: on
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
 from calibgraph.matching.cmrnext.flow_matching import MatchingJob
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 
 Array = NDArray[np.float64]
-
-SYSTEMATIC_ROTATION_RAD = float(np.radians(0.06))
-SYSTEMATIC_TRANSLATION_M = 0.025
-"""Error per axis that all frames share, for weights without such values: root mean square of the
-authors' published errors on four data sets, over up to 4541 frames each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +60,13 @@ def list_failed_frames(results: Mapping[str, Sequence[ImageResult]]) -> dict[str
 def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
     """Failed frames, in the last round the probes, and the shared error of the last network."""
     failed = list_failed_frames(results)
-    rotation, translation = (
-        last.config.get(key) for key in ("systematic_rotation_rad", "systematic_translation_m")
-    )
+    usual = asdict(error_components().matchers["cmrnext"])
+    stated = {key: last.config[key] for key in usual if last.config.get(key) is not None}
     return MatcherFindings(
         failed_share={name: len(failed[name]) / len(each) for name, each in results.items()},
         start_dependence=_medians(results, "start_dependence"),
         recall=_medians(results, "recall"),
-        systematic_rotation_rad=SYSTEMATIC_ROTATION_RAD if rotation is None else rotation,
-        systematic_translation_m=SYSTEMATIC_TRANSLATION_M if translation is None else translation,
+        **{**usual, **stated},
     )
 
 

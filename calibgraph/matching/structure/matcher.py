@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -28,20 +28,11 @@ from calibgraph.matching.structure.shift_scores import (
     score_frame,
 )
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress
-
-SYSTEMATIC_ROTATION_RAD = float(np.radians(0.09))
-SYSTEMATIC_TRANSLATION_M = 0.02
-"""Error per axis that the frames of a scene share: its root mean square over recorded scenes of two
-rigs, each from a few places. Synthetic scenes are better."""
-PLACE_VARIANCE = 8.0
-"""The error that frames of one place share besides, which is larger where there is less to match:
-in variances of one frame's matches. With it, the normalised squared error over 6 of 15 cameras
-(KITTI 00, 05 to 08, raw 0005 and 0051, a VLP-16) is 1.1 in the mean, 0.75 in the median; with 4 it
-is 1.4, with 16 0.8."""
 
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
@@ -223,9 +214,7 @@ class StructureMatcher:
         reach = SearchRange(self.levels[0].rotation_rad, self.levels[0].translation_m)
         findings = MatcherFindings(
             z_score=z_scores,
-            systematic_rotation_rad=SYSTEMATIC_ROTATION_RAD,
-            systematic_translation_m=SYSTEMATIC_TRANSLATION_M,
-            place_variance=PLACE_VARIANCE,
+            **asdict(error_components().matchers["structure"]),
             range_rotation_deg=reach.rotation_deg,
             range_translation_m=reach.translation_m,
         )

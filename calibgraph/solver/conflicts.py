@@ -1,0 +1,64 @@
+"""Measured relative poses beside the correspondences' own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import invert, relative_covariance, relative_transform
+from calibgraph.model.rig import RelativePose
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """The difference of a measured relative pose from the correspondences' estimate of it.
+
+    Attributes:
+        pair: the relative pose of the rig file.
+        difference: (6,) tangent from measured to estimated T_a_b: rotation [rad], translation [m],
+            along the axes of b.
+        sigmas: (6,) standard deviations expected of it: the measurement's and the estimate's.
+    """
+
+    pair: RelativePose
+    difference: Array
+    sigmas: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest component of the difference, in its standard deviations."""
+        return float(np.abs(self.difference / self.sigmas).max())
+
+
+def relative_pose_conflict(
+    pair: RelativePose,
+    cameras: tuple[str, ...],
+    T_camera_lidar: Mapping[str, Array],
+    covariance: Array | None,
+) -> Conflict:
+    """The difference of a relative pose from an estimate, and the sigma expected of it.
+
+    Args:
+        pair: the measured relative pose.
+        cameras: names in the order of the covariance.
+        T_camera_lidar: per camera, (4, 4) from the correspondences alone.
+        covariance: (6 N, 6 N) of these, or None.
+    """
+    estimated = relative_transform(T_camera_lidar[pair.a], T_camera_lidar[pair.b])
+    difference = gtsam.Pose3.Logmap(gtsam.Pose3(invert(pair.T_a_b) @ estimated))
+    variance = (
+        pose_sigmas(rotation_rad=pair.rotation_sigma_rad, translation_m=pair.translation_sigma_m)
+        ** 2
+    )
+    if covariance is not None:
+        places = cameras.index(pair.a), cameras.index(pair.b)
+        of_pair = relative_covariance(covariance, *places, invert(estimated))
+        variance = variance + np.diag(of_pair)
+    return Conflict(pair, difference, np.sqrt(variance))

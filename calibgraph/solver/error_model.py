@@ -1,0 +1,336 @@
+"""The error model of a solution: ``calibgraph.solver.hierarchy`` filled in, fitted, and sized.
+
+What matches of one frame share is not stated by any matcher but shows in the scatter between
+frames. Within a place it is summed up as K, the covariance of a camera's pose by all its frames in
+units of that of independent matches: with H = L L^T the Hessian of independent matches,
+K = L^T (H_t^-1 G H_t^-1) L, where G is the scatter of the frames' gradients about their place's
+mean, with an allowance for few frames, and H_t the true Hessian. The matches of a place stay
+independent, with the least variance k of K, at most 1; what their covariance lacks, K - k, belongs
+to the pose a_cp, together with what the frames of a place share by the matcher's statement
+(``place_variance``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm, usual_excess
+from calibgraph.solver.component_sizes import Sizes, sizes_of
+from calibgraph.solver.conflicts import relative_pose_conflict
+from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.factor_graph import Optimum, join, pose_key
+from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize
+from calibgraph.solver.hierarchy_poses import start_poses
+from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.repeats import split_places
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so
+_LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
+_WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
+"""Information of a pose within sight, so that few matches have an inverse."""
+
+_ROUNDS = 3  # of fitting and sizing
+_COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorFit:
+    """The error model of a solution, at its minimum.
+
+    Attributes:
+        model: with the sizes that fit the data.
+        fit: its minimum and marginals.
+        places: the numbers of the frames of each place.
+        sizes: of its components, over the usual ones.
+        alone: the same without measured relative poses and priors, where some are measured.
+    """
+
+    model: Hierarchy
+    fit: HierarchyFit
+    places: tuple[Numbers, ...]
+    sizes: Sizes
+    alone: ErrorFit | None = None
+
+    def with_shared_size(self, least: float) -> ErrorFit:
+        """The same minimum, with covariances of what is shared everywhere of at least this size."""
+        ratio = least / self.sizes.shared
+        if ratio <= 1.0:
+            return self
+        parts = self.model.components
+        model = replace(
+            self.model,
+            components=replace(parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera),
+        )
+        fit = linearize(model, self.fit)
+        return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
+
+    def without_pose_graph(self) -> HierarchyFit | None:
+        """The fit without priors and measured relative poses, of the same sizes."""
+        model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
+        return fit_hierarchy(model, self.fit.poses, relative_tolerance=_COARSE_TOLERANCE)
+
+    @property
+    def T_camera_lidar(self) -> dict[str, Array]:
+        """Per camera, (4, 4)."""
+        return self.fit.T_camera_lidar(self.model)
+
+
+def weigh_errors(
+    inliers: Objective,
+    optimum: Optimum,
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    held: Sequence[str] = (),
+) -> tuple[ErrorFit | None, Optimum]:
+    """The minimum under the error model, where it differs from that of independent matches.
+
+    Where there is nothing but the matches of one place, their minimum is that of both; it stays,
+    and no model is made. Measured relative poses that contradict the correspondences take no part,
+    so that one that is wrong, or two cameras that are swapped, do not move the others. Arguments
+    and what is None as of :func:`fit_errors`.
+    """
+    several = inliers.blocks and len(places_of(inliers, metadata)) > 1
+    if not (several or inliers.pairs or inliers.rig.relative_poses):
+        return None, optimum
+    alone, T = None, optimum.T_camera_lidar
+    if inliers.rig.relative_poses:
+        alone = fit_alone(inliers, T, scales, metadata)
+    if alone is not None:
+        agreeing = _without_contradictions(inliers, alone)
+        T = T if agreeing is inliers else T | alone.T_camera_lidar
+        inliers = agreeing
+    found = fit_errors(inliers, T, scales, metadata, held)
+    if found is None:
+        return None, optimum
+    found = replace(found, alone=alone)
+    fit, T = found.fit, found.T_camera_lidar
+    return found, Optimum(T, fit.cost, optimum.iterations + fit.iterations, fit.converged)
+
+
+def fit_alone(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+) -> ErrorFit | None:
+    """The fit of the correspondences and pairs alone; what is None as of :func:`fit_errors`."""
+    if inliers.config.preset != "auto" or not inliers.uses_correspondences:
+        return None
+    free = inliers.data_only()
+    start = {name: T_camera_lidar[name] for name in free.cameras}
+    return fit_errors(free, free.minimize(start, scales).T_camera_lidar, scales, metadata)
+
+
+def _without_contradictions(inliers: Objective, alone: ErrorFit) -> Objective:
+    """Without the relative poses that the correspondences of both their cameras contradict."""
+    cameras, limit = alone.model.cameras, error_components().contradiction_sigmas
+    measured, T = inliers.rig.relative_poses, alone.T_camera_lidar
+    kept = tuple(
+        pair
+        for pair in measured
+        if not {pair.a, pair.b} <= set(cameras)
+        or relative_pose_conflict(pair, cameras, T, alone.fit.covariance).largest <= limit
+    )
+    if len(kept) == len(measured):
+        return inliers
+    return replace(inliers, rig=inliers.rig.model_copy(update={"relative_poses": kept}))
+
+
+def fit_errors(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    held: Sequence[str] = (),
+) -> ErrorFit | None:
+    """Fit poses and sizes of the errors, from the minimum for independent matches.
+
+    Args:
+        inliers: after the gate.
+        T_camera_lidar: its minimum.
+        scales: of the residuals.
+        metadata: of the correspondences, with the matcher's error and the places.
+        held: cameras that nothing determines; they are known to a radian and a metre.
+
+    Returns:
+        None without correspondences, with a preset of the paper, or where a direction of a camera
+        is not determined.
+    """
+    if inliers.config.preset != "auto" or not inliers.uses_correspondences or not inliers.blocks:
+        return None
+    places = places_of(inliers, metadata)
+    model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
+    usual, sizes = model.components, Sizes()
+    fit = fit_hierarchy(
+        model, start_poses(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
+    )
+    for _ in range(_ROUNDS):
+        found = sizes if fit is None else sizes_of(model, fit, sizes)
+        if fit is None or found.is_near(sizes):
+            break
+        model, sizes = replace(model, components=found.scale(usual)), found
+        fit = fit_hierarchy(model, fit.poses, relative_tolerance=_COARSE_TOLERANCE)
+    fit = None if fit is None else fit_hierarchy(model, fit.poses)
+    return None if fit is None else ErrorFit(model, fit, tuple(places), sizes)
+
+
+def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
+    """The numbers of the frames of each place, over all cameras."""
+    blocks = [block.frame_numbers for block in inliers.blocks.values()]
+    frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
+    if not all(isinstance(block, CameraBlock) for block in inliers.blocks.values()):
+        return [frames]  # of a table in many files: sums over places are not to be had
+    return split_places(metadata, frames)
+
+
+def error_model(
+    inliers: Objective,
+    T_camera_lidar: Mapping[str, Array],
+    scales: Scales,
+    metadata: Mapping[str, Any],
+    places: Sequence[Numbers],
+    held: Sequence[str] = (),
+) -> Hierarchy:
+    """The model with usual sizes; arguments as of :func:`fit_errors`."""
+    findings, usual = MatcherFindings.from_metadata(metadata), error_components()
+    cameras = tuple(T_camera_lidar)
+    whole, share = np.square(findings.systematic_sigmas), findings.camera_share
+    if not whole.any() and inliers.pairs:  # nothing is stated, and there is what may contradict
+        unknown = usual.matchers["unknown"]
+        whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
+        share = unknown.camera_share
+    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
+    at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
+    blocks = {}
+    for name, block in inliers.blocks.items():
+        placed = PlacedBlock.of(block, scales[name], places)
+        within = _within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
+        at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
+        blocks[name] = placed.with_variance(within.least)
+    components = Components(
+        cloud=_covariance(*((1.0 - share) * whole)),
+        cloud_at_place=_covariance(*of_place),
+        camera=_covariance(*(share * whole)),
+        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
+        at_place=at_place,
+        robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
+    )
+    graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
+    return Hierarchy(cameras, blocks, _placed_pairs(inliers.pairs, places), graph, components)
+
+
+def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
+    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
+
+
+def _held_graph(
+    cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Sequence[str]
+) -> gtsam.NonlinearFactorGraph:
+    graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
+    for name in held:
+        pose = to_T_lidar_camera(T_camera_lidar[name])
+        graph.add(gtsam.PriorFactorPose3(pose_key(cameras, name), pose, unit))
+    return graph
+
+
+def _placed_pairs(
+    pairs: Sequence[PairTerm], places: Sequence[Numbers]
+) -> list[tuple[int, PairTerm]]:
+    """Each term at each place, its information that of features which err as usual in a frame."""
+    found = []
+    for pair in pairs:
+        own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
+        deflated = pair.deflate(usual_excess(own))
+        for place, frames in enumerate(places):
+            rows = np.isin(deflated.frame, frames)
+            if rows.any():
+                found.append((place, deflated.select(rows)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class WithinPlace:
+    """What a camera's matches of one place share, in units of independent matches.
+
+    Attributes:
+        least: k of the module's text.
+        excess: (6, 6) K - k, positive definite.
+        efficiency: of independent matches: their true variance over that of H, in the mean.
+        roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
+        frames: (P,) of each place.
+    """
+
+    least: float
+    excess: Array
+    efficiency: float
+    roots: Array
+    frames: Numbers
+
+    def at_place(self, place_variance: float) -> Array:
+        """(P, 6, 6) covariance of a_cp about m_c."""
+        shared = place_variance * self.efficiency * self.frames[:, None, None] * np.eye(6)
+        inverse = np.linalg.inv(self.roots)
+        covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
+        return (covariance + covariance.transpose(0, 2, 1)) / 2
+
+
+def _within_place(
+    inliers: Objective, name: str, T_camera_lidar: Array, scale: Any, placed: PlacedBlock
+) -> WithinPlace:
+    block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
+    hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
+    root = np.linalg.cholesky(hessians.sum(axis=0) + _WEAK)
+    robust = robust_hessian(block.with_scale(scale), pose)
+    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + _WEAK
+    scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
+    inverse = np.linalg.inv(true)
+    covariance = root.T @ inverse @ scatter @ inverse @ root
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
+    return WithinPlace(
+        least=least,
+        excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
+        efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
+        roots=np.asarray(np.linalg.cholesky(hessians + _WEAK)),
+        frames=placed.frames,
+    )
+
+
+def frame_scatter(block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array) -> Array:
+    """(6, 6) covariance of the sum of all frames' gradients, about the means of their places.
+
+    Args:
+        block: of one camera.
+        gradients: (f, 6) of its frames.
+        placed: the same matches, with the place of each frame.
+        true: (6, 6) Hessian.
+    """
+    place, counts = placed.place_of_frame, placed.count_of_frame
+    total = np.zeros((len(placed.frames), 6))
+    np.add.at(total, place, gradients)
+    share = counts / np.bincount(place, counts, len(placed.frames))[place]
+    apart = gradients - share[:, None] * total[place]
+    frames, free = len(gradients), len(gradients) - len(np.unique(place))
+    usual = 1 + error_components().frame_correlation * (len(block) / frames - 1)
+    count = free + 1.0  # as many frames of one place
+    scatter = with_pseudo_frames(
+        apart.T @ apart, true, np.full(6, count), usual * true * count / frames
+    )
+    return scatter * frames / count

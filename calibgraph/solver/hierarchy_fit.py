@@ -1,0 +1,273 @@
+"""The minimum and the marginals of ``calibgraph.solver.hierarchy``, place by place.
+
+The poses of a place meet only those that all places share. So its part of the normal equations is
+eliminated by itself (Schur complement), of all places at once: the steps are those of Gauss-Newton
+on the whole graph, at a fraction of the time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import adjoints, invert, invert_each
+from calibgraph.solver.factor_graph import MAX_ITERATIONS
+from calibgraph.solver.hierarchy import Hierarchy
+from calibgraph.solver.hierarchy_poses import Poses, placed_edges, shared_edges
+from factors import pair_sums, unit_diagonal
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-6
+"""Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
+
+_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
+
+_DAMPINGS = (0.0, *10.0 ** np.arange(-4, 5))
+"""Of the diagonal: the first that descends; mostly none is needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class HierarchyFit:
+    """The minimum.
+
+    Attributes:
+        poses: of all variables.
+        shared_covariance: (G, G) marginal of all shared poses but the identity, in their tangents.
+        place_slope: (P, L, G) the poses of a place move by minus this times the shared ones.
+        place_covariance: (P, L, L) of the poses of a place, the shared ones given.
+        distances: (P, 1 + N) in sigmas, of o_p from o and of a_cp from m_c.
+        cost: twice GTSAM's error.
+        iterations: of Gauss-Newton.
+        converged: whether it stopped by its tolerance.
+    """
+
+    poses: Poses
+    shared_covariance: Array
+    place_slope: Array
+    place_covariance: Array
+    distances: Array
+    cost: float
+    iterations: int
+    converged: bool
+
+    @property
+    def covariance(self) -> Array:
+        """(6 N, 6 N) marginal of all x_c, in their tangents."""
+        cameras = 6 * ((len(self.poses.shared) - 2) // 3)
+        return self.shared_covariance[:cameras, :cameras]
+
+    def T_camera_lidar(self, model: Hierarchy) -> dict[str, Array]:
+        """(4, 4) of every camera."""
+        return dict(zip(model.cameras, invert(self.poses.shared), strict=False))
+
+
+class Equations:
+    """The normal equations of all poses, in blocks: those of a place meet its own and the shared.
+
+    Attributes:
+        shared: (S, S, 6, 6); placed: (P, L, L, 6, 6); across: (P, L, S, 6, 6) of the Hessian.
+        shared_gradient: (S, 6); placed_gradient: (P, L, 6).
+        cost: twice GTSAM's error.
+        distances: (P, L) of the poses of a place from the shared ones, in sigmas.
+    """
+
+    def __init__(self, model: Hierarchy, poses: Poses) -> None:
+        S, (P, L) = len(poses.shared), poses.placed.shape[:2]
+        self.shared, self.shared_gradient = np.zeros((S, S, 6, 6)), np.zeros((S, 6))
+        self.placed, self.placed_gradient = np.zeros((P, L, L, 6, 6)), np.zeros((P, L, 6))
+        self.across, self.cost = np.zeros((P, L, S, 6, 6)), 0.0
+        self.distances = np.zeros((P, L))
+        self._add_shared(model, poses)
+        self._add_places(model, poses)
+        self._add_matches(model, poses)
+        self._add_pairs(model, poses)
+        self._add_pose_graph(model, poses)
+
+    @cached_property
+    def reduced(self) -> tuple[Array, Array, Array]:
+        """The places eliminated, without damping: see :meth:`eliminate`."""
+        return self.eliminate(0.0)
+
+    def eliminate(self, damping: float) -> tuple[Array, Array, Array]:
+        """The places eliminated.
+
+        Args:
+            damping: by which the diagonals grow.
+
+        Returns:
+            (G, G) Hessian and (G,) gradient of the shared poses; (P, L, G + 1): the step of a place
+            is minus its first G columns times the shared step, minus its last column.
+        """
+        P, L, S = self.across.shape[:3]
+        free = S - 1  # the identity is fixed
+        shared = self.shared[:free, :free].transpose(0, 2, 1, 3).reshape(6 * free, 6 * free).copy()
+        placed = self.of_places().copy()
+        across = self.across[:, :, :free].transpose(0, 1, 3, 2, 4).reshape(P, 6 * L, 6 * free)
+        if damping:
+            for matrix in (shared, placed):
+                np.einsum("...ii->...i", matrix)[...] *= 1.0 + damping
+        own = self.placed_gradient.reshape(P, 6 * L, 1)
+        solved = np.linalg.solve(placed, np.concatenate([across, own], axis=2))
+        removed = across.reshape(-1, 6 * free).T @ solved.reshape(-1, 6 * free + 1)
+        hessian = shared - removed[:, :-1]
+        gradient = self.shared_gradient[:free].ravel() - removed[:, -1]
+        return (hessian + hessian.T) / 2, gradient, solved
+
+    def of_places(self) -> Array:
+        """(P, 6 L, 6 L) Hessians of the poses of each place."""
+        P, L = self.distances.shape
+        return self.placed.transpose(0, 1, 3, 2, 4).reshape(P, 6 * L, 6 * L)
+
+    def is_determined(self, cameras: int) -> bool:
+        """Whether x of so many cameras is, in all directions, but for rounding noise."""
+        hessian, rows = self.reduced[0], 6 * cameras
+        others = np.linalg.solve(hessian[rows:, rows:], hessian[rows:, :rows])
+        of_cameras = hessian[:rows, :rows] - hessian[:rows, rows:] @ others
+        diagonal = np.diag(of_cameras)
+        if not np.isfinite(of_cameras).all() or diagonal.min() <= 0:
+            return False
+        values = np.linalg.eigvalsh(unit_diagonal(of_cameras)[0])
+        return bool(values[0] > _SINGULAR * values[-1])
+
+    def step(self, damping: float) -> tuple[Array, Array]:
+        """Of the shared poses, and of those of each place."""
+        hessian, gradient, solved = self.eliminate(damping) if damping else self.reduced
+        shared = -np.asarray(np.linalg.solve(hessian, gradient))
+        return shared, -(solved[..., :-1] @ shared + solved[..., -1])
+
+    def _add_shared(self, model: Hierarchy, poses: Poses) -> None:
+        edges = shared_edges(model, poses)
+        self.cost += float(edges.squared.sum())
+        for one, jacobian in ((edges.first, edges.to_first), (edges.second, edges.to_second)):
+            weighted = jacobian.transpose(0, 2, 1) @ edges.information
+            np.add.at(self.shared_gradient, one, (weighted @ edges.error[..., None])[..., 0])
+            np.add.at(self.shared, (one, edges.first), weighted @ edges.to_first)
+            np.add.at(self.shared, (one, edges.second), weighted @ edges.to_second)
+
+    def _add_places(self, model: Hierarchy, poses: Poses) -> None:
+        edges, (P, L) = placed_edges(model, poses), self.distances.shape
+        place, local = np.repeat(np.arange(P), L), np.tile(np.arange(L), P)
+        self.distances = np.sqrt(edges.squared).reshape(P, L)
+        self.cost += float(edges.cost.sum())
+        information = edges.information * edges.weight[:, None, None]
+        own = edges.to_second.transpose(0, 2, 1) @ information
+        shared = edges.to_first.transpose(0, 2, 1) @ information
+        error = edges.error[..., None]
+        self.placed[place, local, local] += own @ edges.to_second
+        self.placed_gradient[place, local] += (own @ error)[..., 0]
+        self.across[place, local, edges.first] += own @ edges.to_first
+        first = edges.first[:L]  # of every place the same, each once
+        of_all = (shared @ edges.to_first).reshape(P, L, 6, 6).sum(axis=0)
+        self.shared[first, first] += of_all
+        self.shared_gradient[first] += (shared @ error).reshape(P, L, 6).sum(axis=0)
+
+    def _add_matches(self, model: Hierarchy, poses: Poses) -> None:
+        """Correspondences, on o_p^-1 a_cp."""
+        for name, block in model.blocks.items():
+            local = 1 + model.cameras.index(name)
+            T_camera_cloud = invert_each(poses.placed[:, local]) @ poses.placed[:, 0]
+            sums = block.sums(T_camera_cloud)
+            cloud = -adjoints(T_camera_cloud)
+            by_cloud = sums.hessian @ cloud
+            self.cost += float(sums.cost.sum())
+            self.placed[:, 0, 0] += cloud.transpose(0, 2, 1) @ by_cloud
+            self.placed[:, local, 0] += by_cloud
+            self.placed[:, 0, local] += by_cloud.transpose(0, 2, 1)
+            self.placed[:, local, local] += sums.hessian
+            self.placed_gradient[:, 0] += np.einsum("pij,pi->pj", cloud, sums.gradient)
+            self.placed_gradient[:, local] += sums.gradient
+
+    def _add_pairs(self, model: Hierarchy, poses: Poses) -> None:
+        """Features that two cameras share, on o_p^-1 n_a and o_p^-1 n_b."""
+        N = len(model.cameras)
+        for place, term in model.pairs:
+            cloud = gtsam.Pose3(poses.placed[place, 0])
+            numbers = [2 * N + model.cameras.index(name) for name in (term.a, term.b)]
+            cameras = [gtsam.Pose3(poses.shared[number]) for number in numbers]
+            sums = pair_sums(term.block, *(cloud.between(pose) for pose in cameras))
+            chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
+            by_cloud = (chain.T @ sums.hessian).reshape(6, 2, 6).swapaxes(0, 1)
+            self.cost += float(sums.cost)
+            self.placed[place, 0, 0] += chain.T @ sums.hessian @ chain
+            self.placed_gradient[place, 0] += chain.T @ sums.gradient
+            self.across[place, 0, numbers] += by_cloud
+            self._add_blocks(numbers, sums.hessian, sums.gradient)
+
+    def _add_pose_graph(self, model: Hierarchy, poses: Poses) -> None:
+        """Priors and measured relative poses, on x_c."""
+        values, graph = gtsam.Values(), model.pose_graph
+        for camera in range(len(model.cameras)):
+            values.insert(gtsam.symbol("x", camera), gtsam.Pose3(poses.shared[camera]))
+        for index in range(graph.size()):
+            factor = graph.at(index)
+            jacobian, right = factor.linearize(values).jacobian()
+            self.cost += float(right @ right)
+            numbers = [gtsam.symbolIndex(key) for key in list(factor.keys())]
+            self._add_blocks(numbers, jacobian.T @ jacobian, -jacobian.T @ right)
+
+    def _add_blocks(self, numbers: list[int], hessian: Array, gradient: Array) -> None:
+        """Of one factor on some of the shared poses."""
+        blocks = hessian.reshape(len(numbers), 6, len(numbers), 6).swapaxes(1, 2)
+        self.shared[np.ix_(numbers, numbers)] += blocks
+        self.shared_gradient[numbers] += gradient.reshape(-1, 6)
+
+
+def fit_hierarchy(
+    model: Hierarchy, start: Poses, *, relative_tolerance: float = TOLERANCE
+) -> HierarchyFit | None:
+    """Minimize by Gauss-Newton, damped where a whole step does not descend.
+
+    Args:
+        model: of the error.
+        start: of all poses.
+        relative_tolerance: relative change of the cost at which it stops.
+
+    Returns:
+        None if a direction is not determined.
+    """
+    poses, equations, iterations, converged = start, Equations(model, start), 0, False
+    if not equations.is_determined(len(model.cameras)):
+        return None
+    while iterations < MAX_ITERATIONS and not converged:
+        found = _descend(model, poses, equations)
+        if found is None:  # to rounding, this is the minimum
+            converged = True
+            break
+        converged = equations.cost - found[1].cost <= relative_tolerance * equations.cost
+        (poses, equations), iterations = found, iterations + 1
+    return _to_fit(poses, equations, iterations, converged)
+
+
+def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
+    """A fit with the marginals of another model at the same poses."""
+    return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
+
+
+def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:
+    hessian, _, solved = equations.reduced
+    return HierarchyFit(
+        poses,
+        np.asarray(np.linalg.inv(hessian)),
+        solved[..., :-1],
+        np.asarray(np.linalg.inv(equations.of_places())),
+        equations.distances,
+        equations.cost,
+        iterations,
+        converged,
+    )
+
+
+def _descend(
+    model: Hierarchy, poses: Poses, equations: Equations
+) -> tuple[Poses, Equations] | None:
+    for damping in _DAMPINGS:
+        there = poses.moved(*equations.step(damping))
+        tried = Equations(model, there)
+        if tried.cost <= equations.cost:
+            return there, tried
+    return None

@@ -1,0 +1,214 @@
+"""The error model: the eliminated form is the whole graph of stock factors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from calibgraph import (
+    Config,
+    Correspondences,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    simulate_correspondences,
+)
+from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.solver.error_model import ErrorFit, fit_errors
+from calibgraph.solver.hierarchy import Components, Hierarchy, hierarchy_graph
+from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy
+from calibgraph.solver.hierarchy_poses import Poses, start_poses
+from calibgraph.solver.joint import solve_joint
+from factors import ProjectionBlock, pair_sums, placed_pair_factor
+from tests.solver.test_camera_pairs import simulated_pairs
+
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
+STATED = {
+    "systematic_rotation_rad": 1.5e-3,
+    "systematic_translation_m": 0.02,
+    "place_rotation_rad": 7e-4,
+    "place_translation_m": 0.006,
+    "place_variance": 8.0,
+}
+PLACES = {"one": [], "four": [[0, 1], [2, 3], [4, 5]]}
+CASES = [
+    (rig, pairs, tied, silent, places, frames)
+    for rig in ("pair", "mixed_rig")
+    for pairs, tied, silent, places, frames in (
+        (False, False, False, "one", 8),
+        (True, False, False, "four", 8),
+        (False, True, True, "four", 8),
+        (True, True, False, "one", 8),
+        (True, True, False, "four", 8),
+        (False, True, False, "one", 1),
+    )
+]
+
+
+@pytest.mark.parametrize(("rig_name", "pairs", "tied", "silent", "places", "frames"), CASES)
+def test_the_eliminated_form_is_the_whole_graph(
+    rig_name: str, pairs: bool, tied: bool, silent: bool, places: str, frames: int,
+    request: pytest.FixtureRequest,
+) -> None:  # fmt: skip
+    """In optimum and marginal covariance; silent: the first camera has no matches."""
+    rig: Rig = request.getfixturevalue(rig_name)
+    rig = tie(rig) if tied else rig
+    errors = solve_model(rig, table_of(rig, frames, silent, PLACES[places]), pairs=pairs)
+    model = with_correlations(errors.model)
+    T = errors.T_camera_lidar
+    eliminated = fit_hierarchy(model, start_poses(model, T), relative_tolerance=0.0)
+    assert eliminated is not None
+    values, covariance = solve_whole(model, eliminated)
+    for camera in range(len(model.cameras)):
+        found = values.atPose3(gtsam.symbol("x", camera)).matrix()
+        np.testing.assert_allclose(eliminated.poses.shared[camera], found, rtol=0, atol=1e-9)
+    sigmas = np.sqrt(np.diag(covariance))
+    unit = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(eliminated.covariance / unit, covariance / unit, rtol=0, atol=1e-9)
+    graph = hierarchy_graph(model)
+    assert eliminated.cost == pytest.approx(2 * graph.error(values), rel=1e-9)
+
+
+def tie(rig: Rig) -> Rig:
+    """The first two cameras, 0.1 deg and 1 cm off."""
+    a, b = list(rig.cameras)[:2]
+    T = rig.T_camera_lidar
+    off = gtsam.Pose3.Expmap(np.repeat([1e-3, 0.006], 3)).matrix()
+    measured = RelativePose(
+        a=a, b=b, T_a_b=relative_transform(T[a], T[b]) @ off,
+        rotation_sigma_rad=1e-3, translation_sigma_m=0.005,
+    )  # fmt: skip
+    return rig.model_copy(update={"relative_poses": (measured,)})
+
+
+def table_of(
+    rig: Rig, frames: int, silent: bool, places: Sequence[Sequence[int]]
+) -> Correspondences:
+    table = simulate_correspondences(rig, frames=frames, matches=80, errors=ERRORS, seed=0)
+    if silent:
+        table = table.select(table.camera_index != table.cameras.index(next(iter(rig.cameras))))
+    return replace(table, metadata={**table.metadata, **STATED, "places": list(places)})
+
+
+def solve_model(rig: Rig, table: Correspondences, *, pairs: bool) -> ErrorFit:
+    matches = simulated_pairs(rig, count=40) if pairs else None
+    solution = solve_joint(rig, table, Config(learnt_weights=False), camera_matches=matches)
+    errors = solution.errors or fit_errors(
+        solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata
+    )
+    assert errors is not None
+    return errors
+
+
+def with_correlations(model: Hierarchy) -> Hierarchy:
+    """The same, with covariances that are neither diagonal nor equal."""
+    rng = np.random.default_rng(1)
+
+    def mixed(covariance: np.ndarray) -> np.ndarray:
+        mix = np.eye(6) + 0.2 * rng.standard_normal((6, 6))
+        scale = np.sqrt(np.diag(covariance))
+        return (scale[:, None] * mix) @ (scale[:, None] * mix).T
+
+    parts = model.components
+    at_place = np.array([[mixed(one) for one in place] for place in parts.at_place])
+    return replace(
+        model,
+        components=Components(
+            *(mixed(c) for c in (parts.cloud, parts.cloud_at_place, parts.camera, parts.pairs)),
+            at_place,
+            parts.robust_scale,
+        ),
+    )
+
+
+def solve_whole(model: Hierarchy, fit: HierarchyFit) -> tuple[gtsam.Values, np.ndarray]:
+    """By GTSAM from a displaced start: values, and the joint marginal of the cameras."""
+    rng, graph, start = np.random.default_rng(2), hierarchy_graph(model), gtsam.Values()
+    for key, pose in all_poses(model, fit.poses).items():
+        start.insert(key, pose.retract(1e-4 * rng.standard_normal(6)))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setMaxIterations(100)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    cameras = [gtsam.symbol("x", camera) for camera in range(len(model.cameras))]
+    marginals = gtsam.Marginals(graph, values)
+    return values, marginals.jointMarginalCovariance(cameras).fullMatrix()
+
+
+def all_poses(model: Hierarchy, poses: Poses) -> dict[int, gtsam.Pose3]:
+    """By key."""
+    cameras, keys = len(model.cameras), {}
+    for kind, letter in enumerate("xmn"):
+        for camera in range(cameras):
+            pose = poses.shared[kind * cameras + camera]
+            keys[gtsam.symbol(letter, camera)] = gtsam.Pose3(pose)
+    keys[gtsam.symbol("o", 0)] = gtsam.Pose3(poses.shared[3 * cameras])
+    for place, placed in enumerate(poses.placed):
+        keys[gtsam.symbol("p", place)] = gtsam.Pose3(placed[0])
+        for camera in range(cameras):
+            key = gtsam.symbol("a", place * cameras + camera)
+            keys[key] = gtsam.Pose3(placed[1 + camera])
+    return keys
+
+
+@pytest.mark.parametrize("kind", ["surface", "point"])
+def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(
+    pair: Rig, kind: str
+) -> None:
+    """Its error is that of the pair seen from the cloud, its Jacobian that by differences."""
+    from calibgraph.solver.camera_pairs import pair_terms  # noqa: PLC0415
+
+    term = pair_terms(pair, simulated_pairs(pair), Config(), kind=kind)[0]  # type: ignore[arg-type]
+    cloud = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]))
+    poses = [to_T_lidar_camera(pair.T_camera_lidar[name]) for name in (term.a, term.b)]
+    values = gtsam.Values()
+    for key, pose in enumerate([cloud, *poses]):
+        values.insert(key, pose)
+    factor = placed_pair_factor(0, 1, 2, term.block)
+    expected = pair_sums(term.block, *(cloud.between(pose) for pose in poses))
+    assert 2 * factor.error(values) == pytest.approx(expected.cost, rel=1e-9)
+    jacobian, right = factor.linearize(values).jacobian()
+    gradient = -jacobian.T @ right
+    for column in range(18):
+        key, axis = divmod(column, 6)
+        step = 1e-6 * np.eye(6)[axis]
+        costs = []
+        for sign in (1.0, -1.0):
+            moved = gtsam.Values(values)
+            moved.update(key, values.atPose3(key).retract(sign * step))
+            costs.append(factor.error(moved))
+        assert gradient[column] == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-4, abs=1e-2)
+
+
+def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
+    """Nothing contradicts them: the solve has no model, and the model the same minimum."""
+    table = table_of(pair, 8, False, [])
+    config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
+    solution = solve_joint(pair, table, config)
+    assert solution.errors is None
+    errors = fit_errors(solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+    assert errors is not None
+    for name, T in errors.T_camera_lidar.items():
+        np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
+
+
+def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
+    """Of what is stated, of the scatter of frames, and of independent matches."""
+    table = table_of(pair, 8, False, [])
+    metadata = {**table.metadata, "place_variance": 0.0}
+    errors = solve_model(pair, replace(table, metadata=metadata), pairs=False)
+    parts, Ad = errors.model.components, gtsam.Pose3(errors.T_camera_lidar["left"]).AdjointMap()
+    cloud = parts.cloud + parts.cloud_at_place
+    block = errors.model.blocks["left"]
+    assert isinstance(block.block, ProjectionBlock)
+    hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
+    expected = parts.camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
+    sigmas = np.sqrt(np.diag(expected))
+    difference = (errors.fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
+    # The paper's priors of a metre take (3 cm / 1 m)^2 off.
+    assert np.abs(difference).max() < 2e-3
