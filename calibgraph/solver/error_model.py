@@ -41,7 +41,7 @@ from factors import pose_sigmas
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-_LEAST_SIGMA = 1e-6  # rad and m: as exact is what is stated to be so
+_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 _WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
