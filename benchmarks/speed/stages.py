@@ -113,7 +113,8 @@ class StageSampler:
         self._stop.set()
         self._thread.join()
         if self._error is not None and kind is None:
-            raise RuntimeError("the sampler failed; the times are not whole") from self._error
+            problem = f"the sampler failed ({self._error!r}); the times are not whole"
+            raise RuntimeError(problem) from self._error
 
     def _run(self) -> None:
         try:
