@@ -18,6 +18,7 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.named import find_matcher
@@ -126,6 +127,7 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
         data = choice.dataset
         if choice.text:
             _log.info(choice.text)
+    data = keep_frames(data)
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     return data, guess
 

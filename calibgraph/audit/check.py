@@ -11,11 +11,11 @@ from calibgraph.audit.judgement import (
     judge_camera,
     judge_lidar,
 )
-from calibgraph.audit.kept_frames import keep_frames
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +22,18 @@ from calibgraph.model.rig import Camera
 
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
+
+
+class Sized(Protocol):
+    """A value that knows its size in memory."""
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        ...
+
+
+Derived = TypeVar("Derived", bound=Sized)
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,10 @@ class Frame:
         """(height, width) the same image, gray."""
         gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
         return np.asarray(gray, dtype=np.uint8)
+
+    def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:  # noqa: ARG002
+        """A value that follows from its files and the key; see ``KeptFrame``."""
+        return make()
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the cloud and the images, by path."""

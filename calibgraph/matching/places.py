@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
-from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
+from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.model.rig import Camera
@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 PLACE_M = 20.0
 """Frames within so many metres of a place's first frame are of that place: a camera that looks
 ahead matches objects at 10 to 50 m."""
-MAX_SIDE_PX = 700
-"""Larger images are reduced: a motion is wanted to some decimetres."""
 
 Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the camera; None where the two frames have too little in common."""
@@ -72,7 +70,7 @@ def motions(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> li
 def _detect(frame: Frame, camera: str, lens: Camera) -> Features | None:
     if camera not in frame.image_paths:
         return None
-    return detect_features(frame.load_gray(camera, lens), lens, max_side_px=MAX_SIDE_PX)
+    return features_of(frame, camera, lens)
 
 
 def _motion(

@@ -165,6 +165,8 @@ def _bars(axes: Axes, sigma: Array, other: Array | None) -> None:
 
 def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
     """Change of the extrinsic in each round of matching, and its number of matches."""
+    from matplotlib.ticker import NullLocator
+
     figure = new_figure(3.1)
     moved = figure.add_axes((0.15, 0.46, 0.82, 0.45))
     matches = figure.add_axes((0.15, 0.14, 0.82, 0.24), sharex=moved)
@@ -176,6 +178,8 @@ def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
         values = np.maximum([r[key] for r in rounds], _MIN_MOVE)
         moved.plot(numbers, values, style, color=colour, markersize=4, label=label)
     moved.set_yscale("log")
+    moved.yaxis.set_minor_locator(NullLocator())
+    moved.yaxis.set_major_formatter("{x:g}")  # in place of powers, which take long to draw
     moved.tick_params(labelbottom=False)
     # Above the axes: inside, it would cover points.
     add_legend(moved, markerscale=1, loc="lower center", bbox_to_anchor=(0.5, 0.99), ncols=2)

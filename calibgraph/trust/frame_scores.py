@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
-from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
     concatenate_scores,
     score_frame,
 )
-from calibgraph.matching.structure.window_table import WindowTables
 from calibgraph.model.rig import Camera
-from calibgraph.parallel import Once
 
 Images = Sequence[NDArray[np.uint8]]
 """Gray images of one camera, (height, width) each, one per frame."""
@@ -42,12 +40,12 @@ class FrameScorer:
         self.frames = frames
         self._dataset = dataset
         self._pool = pool
-        self._clouds: Once[int, PreparedCloud] = Once()
-        self._tables = WindowTables()
+        self._cache = cache_of(frames, FrameCache())
 
     def load_images(self, name: str, camera: Camera) -> list[NDArray[np.uint8]]:
         """Gray images of a camera, one per frame."""
-        return list(self._pool.map(lambda frame: frame.load_gray(name, camera), self.frames))
+        load = partial(self._cache.image, name=name, camera=camera)
+        return list(self._pool.map(load, self.frames))
 
     def score(
         self, images: Images, camera: Camera, level: Level, *, offset: int = 0
@@ -67,8 +65,6 @@ class FrameScorer:
         other = self._dataset.neighbour(frame, offset) if offset else frame
         if other is None:
             return None
-        cloud = self._clouds.get(
-            other.index, lambda: PreparedCloud.from_points(other.load_cloud(), self._tables)
-        )
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
+        cloud = self._cache.cloud(other)
         return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)

@@ -11,9 +11,9 @@ import pytest
 
 import calibgraph
 from calibgraph import Correspondences, Dataset, Rig, simulate_correspondences
-from calibgraph.audit.kept_frames import KeptFrame, keep_frames
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.io.frame import Frame
+from calibgraph.io.kept_frames import KeptFrame, keep_frames
 from calibgraph.matching.protocol import to_full_matcher
 from calibgraph.model.config import Config
 from calibgraph.model.findings import MatcherFindings

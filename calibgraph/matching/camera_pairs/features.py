@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera
 from factors import unproject
 
@@ -16,7 +17,8 @@ Gray = NDArray[np.uint8]
 
 MAX_SIDE_PX = 800
 """Larger images are reduced. On KITTI, relative poses are as good as with all pixels, in a third of
-the time; on images of 1600 to 1936 px there are as many matches or more."""
+the time; on images of 1600 to 1936 px there are as many matches or more. A search, and the motion
+of the vehicle, would do with less, but find the features of some frames there."""
 MAX_FEATURES = 4000  # per image
 LOWE_RATIO = 0.8  # of the distances of the best and the second best match, at most
 
@@ -35,20 +37,37 @@ class Features:
     rays: Array
     descriptors: NDArray[np.float32]
 
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+        return self.pixels_px.nbytes + self.rays.nbytes + self.descriptors.nbytes
+
     def select(self, rows: NDArray[np.intp]) -> Features:
         """Some of the features, by their rows."""
         return Features(self.pixels_px[rows], self.rays[rows], self.descriptors[rows])
 
 
-def detect_features(gray: Gray, camera: Camera, *, max_side_px: int = MAX_SIDE_PX) -> Features:
+def features_of(frame: Frame, name: str, camera: Camera) -> Features:
+    """The features of a camera's image of a frame, see :func:`detect_features`.
+
+    Raises:
+        FileError: if the image cannot be read.
+    """
+    lens = camera.lens
+    return frame.derive(
+        ("features", name, lens.kind, lens.packed.tobytes()),
+        lambda: detect_features(frame.load_gray(name, camera), camera),
+    )
+
+
+def detect_features(gray: Gray, camera: Camera) -> Features:
     """SIFT features of an image that lie on rays of the lens, one per place.
 
     Args:
         gray: (height, width).
         camera: its lens.
-        max_side_px: larger images are reduced to it.
     """
-    factor = min(1.0, max_side_px / max(gray.shape))
+    factor = min(1.0, MAX_SIDE_PX / max(gray.shape))
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     # Without the precise upscaling, keypoints are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import combinations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
-from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
+from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
 from calibgraph.model.geometry import planes_in_lidar
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 from factors import unproject
@@ -27,8 +27,6 @@ PAIR_FRAMES = 3
 """So many frames of a recording are enough: on KITTI, 2 to 10 give relative poses within 0.01 deg
 and 0.3 cm of each other, and 3 take a tenth of the time of a run."""
 
-GrayLoader = Callable[[Frame, str, Camera], NDArray[np.uint8]]
-
 
 def match_cameras(
     dataset: Dataset,
@@ -37,7 +35,6 @@ def match_cameras(
     frames: Sequence[Frame] | None = None,
     pairs: Iterable[Pair] | None = None,
     seed: int = 0,
-    load_gray: GrayLoader = Frame.load_gray,
     progress: Progress = no_progress,
 ) -> CameraMatches:
     """Find features that two cameras of a rig see at one instant, without their extrinsics.
@@ -51,7 +48,6 @@ def match_cameras(
         frames: of the dataset; all of them if None.
         pairs: of cameras, A before B in the rig's order; all of them if None.
         seed: of the choice of samples.
-        load_gray: (height, width) gray image of a frame, a camera's name and its lens.
         progress: called as frames are done.
 
     Returns:
@@ -63,7 +59,7 @@ def match_cameras(
     wanted = list(combinations(rig.cameras, 2)) if pairs is None else list(pairs)
     chosen = dataset.frames if frames is None else frames
     found: dict[Pair, list[tuple[int, Features, Features]]] = {pair: [] for pair in wanted}
-    match = partial(_match_frame, rig=rig, pairs=wanted, load_gray=load_gray)
+    match = partial(_match_frame, rig=rig, pairs=wanted)
     with core_pool() as cores:
         for done, (frame, matches) in enumerate(zip(chosen, cores.map(match, chosen), strict=True)):
             progress("matching cameras", done, len(chosen))
@@ -88,12 +84,12 @@ def match_some_frames(
 
 
 def _match_frame(
-    frame: Frame, *, rig: Rig, pairs: Sequence[Pair], load_gray: GrayLoader
+    frame: Frame, *, rig: Rig, pairs: Sequence[Pair]
 ) -> dict[Pair, tuple[Features, Features]]:
     """Per pair of cameras with images in a frame, the matched features of both."""
     seen = [pair for pair in pairs if frame.image_paths.keys() >= set(pair)]
     features = {
-        name: detect_features(load_gray(frame, name, camera), camera)
+        name: features_of(frame, name, camera)
         for name, camera in rig.cameras.items()
         if any(name in pair for pair in seen)
     }

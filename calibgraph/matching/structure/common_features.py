@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.camera_pairs.features import Features, detect_features, match_features
+from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
@@ -19,9 +19,6 @@ from calibgraph.model.rig import Rig
 Array = NDArray[np.float64]
 
 FRAMES = 4
-MAX_SIDE_PX = 700
-"""Half the resolution is enough: a search needs a relative pose to a few tenths of a degree, and
-features take more time than all else if a guess is near."""
 
 
 class CommonFeatures:
@@ -96,5 +93,5 @@ def _match(
 
 
 def _detect(rig: Rig, frames: CameraFrames, name: str, numbers: Sequence[int]) -> list[Features]:
-    detect = partial(detect_features, camera=rig.cameras[name], max_side_px=MAX_SIDE_PX)
-    return list(frames.cores.map(detect, [frames.grays[number] for number in numbers]))
+    detect = partial(features_of, name=name, camera=rig.cameras[name])
+    return list(frames.cores.map(detect, [frames.frames[number] for number in numbers]))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.frame import Frame
+from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
@@ -37,6 +38,11 @@ class FrameCache:
         self._images: Once[tuple[FileVersion, int, int], NDArray[np.uint8]] = Once()
         self._tables = WindowTables()
 
+    @property
+    def nbytes(self) -> int:
+        """Nothing to those who bound their own memory: it has bounds of its own."""
+        return 0
+
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
@@ -56,9 +62,21 @@ class FrameCache:
     def image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the camera's image, gray; its size is checked against the camera's."""
         key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
-        image = self._images.get(key, lambda: keep(frame.load_gray(name, camera)))
+
+        def load() -> NDArray[np.uint8]:
+            gray = frame.load_gray(name, camera)
+            return gray if isinstance(frame, KeptFrame) else keep(gray)
+
+        image = self._images.get(key, load)
         self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)
         return image
+
+
+def cache_of(frames: Sequence[Frame], otherwise: FrameCache) -> FrameCache:
+    """The cache that goes with kept frames, for all that score them; else, the given one."""
+    if frames and isinstance(frames[0], KeptFrame):
+        return frames[0].derive_for_all("frame cache", FrameCache)
+    return otherwise
 
 
 def load_camera_frames(
@@ -68,7 +86,10 @@ def load_camera_frames(
     clouds = list(cores.map(cache.cloud, frames))
     return {
         name: CameraFrames(
-            list(cores.map(partial(cache.image, name=name, camera=camera), frames)), clouds, cores
+            frames,
+            list(cores.map(partial(cache.image, name=name, camera=camera), frames)),
+            clouds,
+            cores,
         )
         for name, camera in rig.cameras.items()
     }

@@ -16,7 +16,7 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.protocol import Stage1Source, Start
 from calibgraph.matching.structure.consensus import find_consensus
-from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
+from calibgraph.matching.structure.frame_cache import FrameCache, cache_of, load_camera_frames
 from calibgraph.matching.structure.global_search import Located, locate_cameras
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.pose_refinement import CONFIDENT
@@ -106,15 +106,15 @@ class StructureMatcher:
         progress: Progress,
     ) -> Start:
         """Start where a search locates the cameras; at the guess those that it does not locate."""
-        self._cache.keep_only(dataset.frames)
+        cache = self._cache_of(dataset)
         frames = spread_out(dataset.frames, SEARCH_FRAMES)
-        self._require_structure(frames, rig)
+        self._require_structure(cache, frames, rig)
         if self.search_range is None:
             return Start(rig)
         with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
             candidates = locate_cameras(
                 rig,
-                load_camera_frames(self._cache, frames, rig, cores),
+                load_camera_frames(cache, frames, rig, cores),
                 self.search_range,
                 seed=self.seed,
                 out_of_time=out_of_time,
@@ -132,12 +132,12 @@ class StructureMatcher:
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
         """Match every camera in every frame, about the rig's extrinsics."""
-        self._cache.keep_only(dataset.frames)
+        cache = self._cache_of(dataset)
         work = len(rig.cameras) * len(dataset.frames)
         tables, z_scores = [], {}
         with core_pool() as cores, core_pool() as pool:  # a few cameras' scores are copied at once
             level = self.levels[round_index]
-            waiting = self._submit_scores(dataset.frames, rig, level, cores)
+            waiting = self._submit_scores(cache, dataset.frames, rig, level, cores)
             matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
             for index, name in enumerate(rig.cameras):
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
@@ -147,17 +147,17 @@ class StructureMatcher:
                 tables.append(table)
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
 
-    def _require_structure(self, frames: Sequence[Frame], rig: Rig) -> None:
+    def _require_structure(self, cache: FrameCache, frames: Sequence[Frame], rig: Rig) -> None:
         """Refuse clouds none of which has enough windows."""
         camera, finest = next(iter(rig.cameras.values())), self.levels[-1]
         spacings = finest.spacing_rad, finest.stride_spacings
         most, best = -1, frames[0]
         for frame in frames:
-            count = self._cache.cloud(frame).count_windows(camera, *spacings, most=TRIED_WINDOWS)
+            count = cache.cloud(frame).count_windows(camera, *spacings, most=TRIED_WINDOWS)
             if count >= LEAST_WINDOWS:
                 return
             most, best = max((most, best), (count, frame), key=lambda pair: pair[0])
-        points = len(self._cache.cloud(best).points_lidar_m)
+        points = len(cache.cloud(best).points_lidar_m)
         raise DatasetError(
             f"{best.cloud_path}: its {points} points have {most} neighbourhoods with structure, "
             f"the other clouds no more; at least {LEAST_WINDOWS} are needed. Give whole scans that "
@@ -168,12 +168,18 @@ class StructureMatcher:
         """Drop the frames that are kept from round to round."""
         self._cache = FrameCache()
 
+    def _cache_of(self, dataset: Dataset) -> FrameCache:
+        """Of a dataset's frames, and no others."""
+        cache = cache_of(dataset.frames, self._cache)
+        cache.keep_only(dataset.frames)
+        return cache
+
     def _first_round(self, candidates: Mapping[str, Located]) -> int:
         confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
     def _submit_scores(
-        self, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
+        self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
     ) -> dict[str, deque[Future[ShiftScores]]]:
         """Score every camera in every frame; frame by frame, so that cameras share its windows.
 
@@ -183,7 +189,7 @@ class StructureMatcher:
         max_windows = min(per_frame, FRAME_WINDOWS)
 
         def score(frame: Frame, name: str, camera: Camera) -> ShiftScores:
-            gray, cloud = self._cache.image(frame, name, camera), self._cache.cloud(frame)
+            gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
             return score_frame(
                 gray, cloud, camera, level, frame=frame.index, max_windows=max_windows
             )

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.bodies import Body, adjoint, lead, place
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
@@ -54,11 +55,13 @@ class CameraFrames:
     """The data of one camera in a few frames.
 
     Attributes:
+        frames: that they are of.
         grays: (height, width) images.
         clouds: one per image.
         cores: a thread per core, which works on several frames in parallel.
     """
 
+    frames: Sequence[Frame]
     grays: Sequence[NDArray[np.uint8]]
     clouds: Sequence[PreparedCloud]
     cores: Executor

@@ -8,15 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
+from factors import unproject
 from factors.block_arrays import contiguous
 from factors.compiled import compiled
-from factors.lens_kernels import EQUIRECTANGULAR, is_projectable, project_one, subtract_columns
+from factors.lens_kernels import (
+    EQUIRECTANGULAR,
+    PINHOLE,
+    RADTAN,
+    is_projectable,
+    project_one,
+    subtract_columns,
+)
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the nearest is hidden
+_BORDER_PIXELS, _COSINE_MARGIN = 17, 0.99  # of each side of an image; what lies between them
 
 
 def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Array]:
@@ -35,8 +44,9 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
     rows = np.empty(len(points), np.intp)
     views = np.empty((len(points), 3))
     count = _find_in_view(
-        lens.kind, lens.packed, T, points, camera.width_px, camera.height_px, rows, views
-    )
+        lens.kind, lens.packed, T, points, camera.width_px, camera.height_px, _least_cosine(camera),
+        rows, views,
+    )  # fmt: skip
     return rows[:count], views[:count, :2], views[:count, 2]
 
 
@@ -50,11 +60,12 @@ def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
     """
     if not len(angles):
         return np.empty(0, np.bool_)
-    cells = np.floor((angles - angles.min(axis=0)) / cell_rad).astype(np.int64)
-    name = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    nearest_m = np.full(int(name.max()) + 1, np.inf)
-    np.minimum.at(nearest_m, name, distance_m)
-    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[name] + HIDDEN_M)
+    least, most = _range(angles)
+    rows, columns = np.floor((most - least) / cell_rad).astype(np.int64) + 1
+    nearest_m, cell = np.full(rows * columns, np.inf), np.empty(len(angles), np.int64)
+    visible = np.empty(len(angles), np.bool_)
+    _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible)
+    return visible
 
 
 def find_places(
@@ -86,14 +97,50 @@ def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: igno
             places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
 
+def _least_cosine(camera: Camera) -> float:
+    """Of the angle to the camera's axis, within its image: -1 where that may be any angle."""
+    u = np.linspace(-0.5, camera.width_px - 0.5, _BORDER_PIXELS)
+    v = np.linspace(-0.5, camera.height_px - 0.5, _BORDER_PIXELS)
+    sides = [np.column_stack([u, np.full_like(u, end)]) for end in (v[0], v[-1])]
+    sides += [np.column_stack([np.full_like(v, end), v]) for end in (u[0], u[-1])]
+    rays, valid = unproject(camera.lens, np.concatenate(sides))
+    if not valid.all() or camera.lens.kind not in (PINHOLE, RADTAN):
+        return -1.0
+    return float(rays[:, 2].min()) * _COSINE_MARGIN
+
+
 @compiled()
-def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: ignore[no-untyped-def]
+def _range(angles):  # type: ignore[no-untyped-def]
+    """The least and the greatest of each column; NumPy is slow with columns."""
+    least, most = angles[0].copy(), angles[0].copy()
+    for i in range(len(angles)):
+        for k in range(2):
+            least[k], most[k] = min(least[k], angles[i, k]), max(most[k], angles[i, k])
+    return least, most
+
+
+@compiled()
+def _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible):  # type: ignore[no-untyped-def]
+    for i in range(len(angles)):
+        row = np.int64((angles[i, 0] - least[0]) / cell_rad)
+        column = np.int64((angles[i, 1] - least[1]) / cell_rad)
+        cell[i] = row * columns + column
+        nearest_m[cell[i]] = min(nearest_m[cell[i]], distance_m[i])
+    for i in range(len(angles)):
+        visible[i] = distance_m[i] < HIDDEN_RATIO * nearest_m[cell[i]] + HIDDEN_M
+
+
+@compiled()
+def _find_in_view(kind, lens, T, points, width, height, least_cosine, rows, views):  # type: ignore[no-untyped-def]
     count = 0
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        squared = x * x + y * y + z * z
+        if least_cosine > 0 and (z <= 0 or z * z < least_cosine * least_cosine * squared):
+            continue
         if not is_projectable(kind, lens, x, y, z):
             continue
         projection = project_one(kind, lens, x, y, z)
@@ -103,6 +150,6 @@ def _find_in_view(kind, lens, T, points, width, height, rows, views):  # type: i
         rows[count] = i
         views[count, 0] = math.atan2(x, z)
         views[count, 1] = math.atan2(y, math.sqrt(x * x + z * z))
-        views[count, 2] = math.sqrt(x * x + y * y + z * z)
+        views[count, 2] = math.sqrt(squared)
         count += 1
     return count

@@ -13,7 +13,6 @@ from calibgraph.matching.structure.windows import (
     Neighbours,
     Windows,
     cut_windows,
-    to_directions,
 )
 from calibgraph.memory import keep, reserve
 from calibgraph.parallel import Once
@@ -53,9 +52,9 @@ class WindowTable:
         stride_spacings: float,
         keep_linear: bool,
     ) -> None:
-        directions = to_directions(rays_m[rows])
-        kept = thin(directions, spacing_rad)
-        centres = thin(directions[kept], stride_spacings * spacing_rad)
+        usable = rays_m[rows]
+        kept = thin(usable, spacing_rad)
+        centres = thin(usable[kept], stride_spacings * spacing_rad)
         self._cloud = rays_m, intensity_rank
         self._rows = keep(rows[kept].astype(np.int32))
         self._centres = keep(np.random.default_rng(0).permutation(centres).astype(np.int32))

@@ -1,15 +1,16 @@
-"""Frames whose files are decoded once, though several parts of an audit read them."""
+"""Frames whose files are decoded once, though several parts of a calibration read them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame
+from calibgraph.io.frame import Derived, Frame
 from calibgraph.io.motion import ScanMotion
 from calibgraph.memory import keep
 from calibgraph.model.rig import Camera
@@ -19,28 +20,24 @@ Gray = NDArray[np.uint8]
 Cloud = NDArray[np.float32]
 
 MAX_BYTES = 300_000_000
-"""Of the images and of the clouds that are kept, each: 300 gray images of a megapixel."""
+"""Of all that is kept of a dataset: 300 gray images of a megapixel."""
 
-
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """Decoded images and clouds of a dataset, those used last."""
-
-    images: Once[tuple[int, str], Gray] = field(default_factory=Once)
-    clouds: Once[int, Cloud] = field(default_factory=Once)
+_ALL = -1  # in place of a frame's number
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFrame(Frame):
-    """A frame whose gray images and cloud are kept. None of them may be written to.
+    """A frame whose gray images, cloud and what derives of them are kept, unless others came since.
+
+    None of them may be written to.
 
     Attributes:
         frame: that reads them.
-        kept: of all frames of its dataset.
+        kept: by number of the frame and what it is; of all frames of the dataset.
     """
 
     frame: Frame
-    kept: Kept
+    kept: Once[tuple[int, Hashable], Any]
 
     @property
     def motion(self) -> ScanMotion | None:
@@ -49,9 +46,7 @@ class KeptFrame(Frame):
 
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""
-        cloud = self.kept.clouds.get(self.index, lambda: keep(self.frame.load_cloud()))
-        self.kept.clouds.keep_last(MAX_BYTES, lambda each: each.nbytes)
-        return cloud
+        return self.derive("cloud", lambda: keep(self.frame.load_cloud()))
 
     def load_image(self, name: str, camera: Camera) -> Gray:
         """(height, width, 3) image, BGR; not kept."""
@@ -59,10 +54,18 @@ class KeptFrame(Frame):
 
     def load_gray(self, name: str, camera: Camera) -> Gray:
         """(height, width) the same image, gray."""
-        key = self.index, name
-        image = self.kept.images.get(key, lambda: keep(self.frame.load_gray(name, camera)))
-        self.kept.images.keep_last(MAX_BYTES, lambda each: each.nbytes)
-        return image
+        return self.derive(("gray", name), lambda: keep(self.frame.load_gray(name, camera)))
+
+    def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
+        """What follows from its files and the key, made once."""
+        value: Derived = self.kept.get((self.index, key), make)
+        self.kept.keep_last(MAX_BYTES, lambda each: each.nbytes)
+        return value
+
+    def derive_for_all(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
+        """What all frames of the dataset have in common, made once."""
+        value: Derived = self.kept.get((_ALL, key), make)
+        return value
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the cloud and the images, by path."""
@@ -76,9 +79,11 @@ class KeptFrame(Frame):
 def keep_frames(data: Dataset) -> Dataset:
     """The dataset with frames whose files are decoded once.
 
-    Only the frames themselves: the others that were recorded are not read.
+    Only the frames themselves, not the others that were recorded.
     """
-    kept = Kept()
+    if any(isinstance(frame, KeptFrame) for frame in data.frames):
+        return data
+    kept: Once[tuple[int, Hashable], Any] = Once()
     frames = (
         KeptFrame(each.index, each.name, each.cloud_path, each.image_paths, frame=each, kept=kept)
         for each in data.frames
