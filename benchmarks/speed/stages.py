@@ -32,6 +32,7 @@ import numpy as np
 from benchmarks.tables import ROOT, Table
 
 INTERVAL_S = 0.005
+_ALONE_S = 10.0  # far longer than a sample takes
 
 OTHER = "other"
 _INNER = (
@@ -126,9 +127,7 @@ class StageSampler:
 
     def _sample(self) -> None:
         """Add the time since the last sample to the stages that used it."""
-        gc.disable()  # in it, a collection can stop all threads (CPython's issue 106883)
-        stacks = sys._current_frames()
-        gc.enable()
+        stages = _stages_of_threads()
         clocks = dict(_thread_clocks())
         used = {key: max(0.0, clocks[key] - self._clocks.get(key, 0.0)) for key in clocks}
         del used[threading.get_ident()]
@@ -138,9 +137,25 @@ class StageSampler:
         total = sum(used.values())
         shares = {ident: part / total for ident, part in used.items()} if total > 0 else {}
         for ident, share in (shares or {self._main: 1.0}).items():
-            stage = stage_of(stacks.get(ident))
+            stage = stages.get(ident, OTHER)
             self.wall_s[stage] += share * float(wall_s)
             self.cpu_s[stage] += share * float(cpu_s)
+
+
+def _stages_of_threads() -> dict[int, str]:
+    """The stage of every Python thread, by its identifier.
+
+    No other thread runs meanwhile, and nothing is collected: a collection can stop all threads for
+    good (CPython's issue 106883), and stacks that change while they are walked end the process.
+    """
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(_ALONE_S)
+    gc.disable()
+    try:
+        return {ident: stage_of(frame) for ident, frame in sys._current_frames().items()}
+    finally:
+        gc.enable()
+        sys.setswitchinterval(interval_s)
 
 
 def _thread_clocks() -> Iterator[tuple[int, float]]:
@@ -184,7 +199,8 @@ def run_in_process(dataset: Path) -> Run:
     command = [sys.executable, "-m", "benchmarks.speed.stages", str(dataset), "--json"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        return Run(np.nan, np.nan, np.nan, verdict=(done.stderr.splitlines() or ["failed"])[-1])
+        unsaid = [f"ended with {done.returncode}"]
+        return Run(np.nan, np.nan, np.nan, verdict=(done.stderr.splitlines() or unsaid)[-1])
     return Run(**json.loads(done.stdout))
 
 
