@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,10 @@ from calibgraph.parallel import Once
 
 Gray = NDArray[np.uint8]
 Cloud = NDArray[np.float32]
+Common = TypeVar("Common")
 
 MAX_BYTES = 300_000_000
 """Of all that is kept of a dataset: 300 gray images of a megapixel."""
-
-_ALL = -1  # in place of a frame's number
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +33,12 @@ class KeptFrame(Frame):
     Attributes:
         frame: that reads them.
         kept: by number of the frame and what it is; of all frames of the dataset.
+        common: what all frames have in common; it is not dropped.
     """
 
     frame: Frame
     kept: Once[tuple[int, Hashable], Any]
+    common: Once[Hashable, Any]
 
     @property
     def motion(self) -> ScanMotion | None:
@@ -62,9 +63,9 @@ class KeptFrame(Frame):
         self.kept.keep_last(MAX_BYTES, lambda each: each.nbytes)
         return value
 
-    def derive_for_all(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
-        """What all frames of the dataset have in common, made once."""
-        value: Derived = self.kept.get((_ALL, key), make)
+    def derive_for_all(self, key: Hashable, make: Callable[[], Common]) -> Common:
+        """What all frames of the dataset have in common, made once. It bounds its own memory."""
+        value: Common = self.common.get(key, make)
         return value
 
     def hashes(self) -> dict[str, str]:
@@ -84,8 +85,12 @@ def keep_frames(data: Dataset) -> Dataset:
     if any(isinstance(frame, KeptFrame) for frame in data.frames):
         return data
     kept: Once[tuple[int, Hashable], Any] = Once()
+    common: Once[Hashable, Any] = Once()
     frames = (
-        KeptFrame(each.index, each.name, each.cloud_path, each.image_paths, frame=each, kept=kept)
+        KeptFrame(
+            each.index, each.name, each.cloud_path, each.image_paths,
+            frame=each, kept=kept, common=common,
+        )
         for each in data.frames
-    )
+    )  # fmt: skip
     return replace(data, frames=tuple(frames))

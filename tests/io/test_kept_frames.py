@@ -33,6 +33,16 @@ def test_kept_frames_share_one_cache_of_windows() -> None:
     assert cache_of(keep_frames(data).frames, own) is not cache_of(kept.frames, own)
 
 
+def test_no_size_drops_the_cache_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_frames, "MAX_BYTES", 1)
+    data = keep_frames(calibgraph.load_dataset(SAMPLE))
+    cache, camera = cache_of(data.frames, FrameCache()), data.rig.cameras["left"]
+    images = [cache.image(frame, "left", camera) for frame in data.frames]
+    assert cache_of(data.frames, FrameCache()) is cache
+    for frame, image in zip(data.frames, images, strict=True):
+        assert cache.image(frame, "left", camera) is image
+
+
 def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, made = keep_frames(calibgraph.load_dataset(SAMPLE)).frames[0], list[str]()
     assert isinstance(frame, KeptFrame)

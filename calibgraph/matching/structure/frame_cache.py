@@ -38,11 +38,6 @@ class FrameCache:
         self._images: Once[tuple[FileVersion, int, int], NDArray[np.uint8]] = Once()
         self._tables = WindowTables()
 
-    @property
-    def nbytes(self) -> int:
-        """Nothing to those who bound their own memory: it has bounds of its own."""
-        return 0
-
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
