@@ -23,6 +23,8 @@ _NUMBERS = {
     "systematic_rotation_rad": math.pi,
     "systematic_translation_m": 100.0,
     "camera_share": 1.0,
+    "elevation_rad": math.pi,
+    "scan_motion_m": 100.0,
     "place_rotation_rad": math.pi,
     "place_translation_m": 100.0,
     "place_variance": 1e6,
@@ -45,6 +47,8 @@ class MatcherFindings:
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             error that all its frames share.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        elevation_rad: standard deviation of an offset of all beams' elevations.
+        scan_motion_m: of the motion during a turn for which clouds are not corrected.
         place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of the error that frames of one place share, over that of one frame's
             matches if they were independent.
@@ -61,6 +65,8 @@ class MatcherFindings:
     systematic_rotation_rad: float = 0.0
     systematic_translation_m: float = 0.0
     camera_share: float = 0.5
+    elevation_rad: float = 0.0
+    scan_motion_m: float = 0.0
     place_rotation_rad: float = 0.0
     place_translation_m: float = 0.0
     place_variance: float = 0.0
@@ -95,6 +101,11 @@ class MatcherFindings:
     def systematic_sigmas(self) -> tuple[float, float]:
         """Rotation [rad] and translation [m] that all frames share, per axis."""
         return self.systematic_rotation_rad, self.systematic_translation_m
+
+    @property
+    def bend_sigmas(self) -> tuple[float, float]:
+        """Offset of all elevations [rad], motion during a turn [m]: how the sensor bends clouds."""
+        return self.elevation_rad, self.scan_motion_m
 
 
 def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:

@@ -25,6 +25,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
+from calibgraph.solver.cloud_bends import bend_shifts
 from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.covariance import with_pseudo_frames
@@ -76,7 +77,12 @@ class ErrorFit:
         parts = self.model.components
         model = replace(
             self.model,
-            components=replace(parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera),
+            components=replace(
+                parts,
+                cloud=ratio * parts.cloud,
+                camera=ratio * parts.camera,
+                bends=ratio**0.5 * parts.bends,
+            ),
         )
         fit = linearize(model, self.fit)
         return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
@@ -218,16 +224,21 @@ def error_model(
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    blocks = {}
+    blocks, bends = {}, np.zeros((len(cameras), 6, len(findings.bend_sigmas)))
     for name, block in inliers.blocks.items():
         placed = PlacedBlock.of(block, scales[name], places)
         within = _within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
         blocks[name] = placed.with_variance(within.least)
+        if any(findings.bend_sigmas):
+            pose = to_T_lidar_camera(T_camera_lidar[name])
+            shifts = bend_shifts(block, scales[name], pose, _WEAK)
+            bends[cameras.index(name)] = shifts * findings.bend_sigmas
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
         camera=_covariance(*(share * whole)),
+        bends=bends,
         pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,

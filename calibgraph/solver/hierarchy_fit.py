@@ -141,13 +141,11 @@ class Equations:
         return shared, -(solved[..., :-1] @ shared + solved[..., -1])
 
     def _add_shared(self, model: Hierarchy, poses: Poses) -> None:
-        edges = shared_edges(model, poses)
-        self.cost += float(edges.squared.sum())
-        for one, jacobian in ((edges.first, edges.to_first), (edges.second, edges.to_second)):
-            weighted = jacobian.transpose(0, 2, 1) @ edges.information
-            np.add.at(self.shared_gradient, one, (weighted @ edges.error[..., None])[..., 0])
-            np.add.at(self.shared, (one, edges.first), weighted @ edges.to_first)
-            np.add.at(self.shared, (one, edges.second), weighted @ edges.to_second)
+        edges, S = shared_edges(model, poses), len(poses.shared)
+        self.cost += edges.squared
+        hessian = edges.jacobian.T @ edges.information @ edges.jacobian
+        self.shared += hessian.reshape(S, 6, S, 6).swapaxes(1, 2)
+        self.shared_gradient += (edges.jacobian.T @ edges.weighted).reshape(S, 6)
 
     def _add_places(self, model: Hierarchy, poses: Poses) -> None:
         edges, (P, L) = placed_edges(model, poses), self.distances.shape
