@@ -24,6 +24,7 @@ _NUMBERS = {
     "systematic_translation_m": 100.0,
     "camera_share": 1.0,
     "elevation_rad": math.pi,
+    "elevation_stretch": 1.0,
     "scan_motion_m": 100.0,
     "place_rotation_rad": math.pi,
     "place_translation_m": 100.0,
@@ -47,7 +48,9 @@ class MatcherFindings:
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             error that all its frames share.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
-        elevation_rad: standard deviation of an offset of all beams' elevations.
+        elevation_rad: standard deviation of an offset of all beams' elevations; this and the next
+            two, which bend the cloud, are part of the error that all frames share.
+        elevation_stretch: of the share by which elevations are too far from the horizon.
         scan_motion_m: of the motion during a turn for which clouds are not corrected.
         place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of the error that frames of one place share, over that of one frame's
@@ -66,6 +69,7 @@ class MatcherFindings:
     systematic_translation_m: float = 0.0
     camera_share: float = 0.5
     elevation_rad: float = 0.0
+    elevation_stretch: float = 0.0
     scan_motion_m: float = 0.0
     place_rotation_rad: float = 0.0
     place_translation_m: float = 0.0
@@ -103,9 +107,22 @@ class MatcherFindings:
         return self.systematic_rotation_rad, self.systematic_translation_m
 
     @property
-    def bend_sigmas(self) -> tuple[float, float]:
-        """Offset of all elevations [rad], motion during a turn [m]: how the sensor bends clouds."""
-        return self.elevation_rad, self.scan_motion_m
+    def rigid_sigmas(self) -> tuple[float, float]:
+        """Of these what is left besides the bends, which displace a camera by about as much."""
+        parts = (
+            (self.systematic_rotation_rad, self.elevation_rad),
+            (
+                self.systematic_translation_m,
+                self.scan_motion_m / (4 * math.pi),
+            ),
+        )
+        rotation, translation = (math.sqrt(max(a**2 - b**2, 0.0)) for a, b in parts)
+        return rotation, translation
+
+    @property
+    def bend_sigmas(self) -> tuple[float, float, float]:
+        """Of what bends the cloud: offset of elevations [rad], their stretch, motion [m]."""
+        return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
 
 
 def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:

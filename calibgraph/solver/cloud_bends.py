@@ -1,9 +1,10 @@
 """How the sensor bends the cloud, and what that does to the matches of each camera.
 
-A rigid motion of the cloud moves all cameras alike. Two errors of recorded sensors do not: beams
-that all point higher or lower than is stated, which pitch the cloud along every line of sight, and
-motion during a turn, which displaces each heading by another amount. Each is one unknown number of
-the whole rig; a camera's matches follow it by a displacement that their own points show.
+A rigid motion of the cloud moves all cameras alike. Three errors of recorded sensors do not: beams
+that all point higher or lower than is stated, which pitch the cloud along every line of sight;
+beams that are spread too far or too little; and motion during a turn, which displaces each heading
+by another amount. Each is one unknown number of the whole rig; a camera's matches follow it by a
+displacement that their own points show.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 
 _SAMPLE = 1000  # correspondences: the displacement is a ratio of two sums over them
-_STEP = 1e-4  # rad and m, of the difference quotient: far below a pixel, far above rounding
+_STEP = 1e-4  # of the difference quotient: far below a pixel, far above rounding
 _NO_LOSS = 1e6  # sigmas at which it bends: inliers are far below, and weigh nearly the same
 
 
 def bends_at(points_lidar_m: Array) -> Array:
-    """(2, n, 3) displacements in the LiDAR frame, by one radian of elevation, one metre of motion.
+    """(3, n, 3) displacements in the LiDAR frame, by a unit of each bend.
 
-    The motion is ahead, over one turn that begins and ends behind: a point straight ahead is where
+    Elevations that are all a radian higher; elevations twice as far from the horizon; a metre of
+    motion. This is ahead, over a turn that begins and ends behind: a point straight ahead is where
     it is reported, one behind is half of it off.
 
     Args:
@@ -37,13 +39,14 @@ def bends_at(points_lidar_m: Array) -> Array:
     elevation = np.column_stack([-z * np.cos(heading), -z * np.sin(heading), level])
     motion = np.zeros_like(points_lidar_m)
     motion[:, 0] = heading / (2 * np.pi)
-    return np.stack([elevation, motion])
+    stretch = elevation * np.arctan2(z, level)[:, None]
+    return np.stack([elevation, stretch, motion])
 
 
 def bend_shifts(
     block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, weak: Array
 ) -> Array:
-    """(6, 2) by how much the pose of a camera's matches follows each bend, per radian and metre.
+    """(6, 3) by how much the pose of a camera's matches follows a unit of each bend.
 
     With b the gradient of the squared residuals and H their Hessian, -H^-1 (db / dbend), in the
     tangent of ``T_lidar_camera``.

@@ -32,7 +32,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
 from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
-from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize
+from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy, linearize
 from calibgraph.solver.hierarchy_poses import start_poses
 from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.pair_refinement import pair_sigmas
@@ -86,6 +86,16 @@ class ErrorFit:
         )
         fit = linearize(model, self.fit)
         return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
+
+    def bends(self, usual: Sequence[float]) -> tuple[Array, Array]:
+        """(3,) offset of elevations [rad], their stretch, motion [m]; (3,) standard deviations.
+
+        Args:
+            usual: the standard deviations that the matcher states.
+        """
+        values, covariance = bends_of(self.model, self.fit)
+        unit = self.sizes.shared**0.5 * np.asarray(usual)
+        return unit * values, unit * np.sqrt(np.diag(covariance))
 
     def without_pose_graph(self) -> HierarchyFit | None:
         """The fit without priors and measured relative poses, of the same sizes."""
@@ -217,8 +227,8 @@ def error_model(
     """The model with usual sizes; arguments as of :func:`fit_errors`."""
     findings, usual = MatcherFindings.from_metadata(metadata), error_components()
     cameras = tuple(T_camera_lidar)
-    whole, share = np.square(findings.systematic_sigmas), findings.camera_share
-    if not whole.any() and inliers.pairs:  # nothing is stated, and there is what may contradict
+    whole, share = np.square(findings.rigid_sigmas), findings.camera_share
+    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
         unknown = usual.matchers["unknown"]
         whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
         share = unknown.camera_share

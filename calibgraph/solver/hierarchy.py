@@ -183,6 +183,11 @@ class Hierarchy:
     components: Components
 
     @property
+    def bends(self) -> Array:
+        """(6 N, B) by how much the matches of all cameras follow the bends, under each other."""
+        return np.concatenate(self.components.bends)
+
+    @property
     def places(self) -> int:
         """How many there are."""
         return len(self.components.at_place)

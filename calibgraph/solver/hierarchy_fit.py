@@ -246,6 +246,23 @@ def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
     return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
 
 
+def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
+    """(B,) bends of the cloud in standard deviations, and their (B, B) marginal covariance.
+
+    The eliminated form has them in the covariance of all m_c about x_c; here they come back.
+
+    Args:
+        model: of the error.
+        fit: its minimum.
+    """
+    edges, free, shifts = shared_edges(model, fit.poses), len(fit.shared_covariance), model.bends
+    matches = slice(6, 6 + len(shifts))
+    gain = shifts.T @ edges.information[matches, matches]
+    slope = gain @ edges.jacobian[matches, :free]
+    covariance = np.eye(shifts.shape[1]) - gain @ shifts + slope @ fit.shared_covariance @ slope.T
+    return gain @ edges.error[matches], covariance
+
+
 def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:
     hessian, _, solved = equations.reduced
     return HierarchyFit(
