@@ -6,8 +6,9 @@ Errors are drawn from the error model itself, as the matcher ``structure`` state
 cloud, what displaces it everywhere and at a place, the matches of a camera everywhere and at a
 place (in the shape of its information), three frames each, matches of which share a fifth of their
 variance. So the table checks the algebra, and what is made of the sizes, not whether recordings are
-like that; that is ``error_bars``. NEES is the squared error in the metric of its covariance; its mean over 6 should
-be 1. Errors of single cameras and of pairs are medians; before: all matches independent.
+like that; that is ``error_bars``. NEES is the squared error in the metric of its covariance; its
+mean over 6 should be 1. Errors of single cameras and of pairs are medians; before: all matches
+independent.
 """
 
 from __future__ import annotations
