@@ -76,3 +76,32 @@ def relative_pose_factor(
     return gtsam.BetweenFactorPose3(
         key_a, key_b, measured, gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     )
+
+
+def bent_between_factor(
+    key_1: int, key_bend: int, key_2: int, shifts: ArrayLike, noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """Two poses that differ by some numbers' effect: error ``log(X_1^-1 X_2) - shifts b``.
+
+    Args:
+        key_1: variable X_1.
+        key_bend: variable b, a vector of B numbers.
+        key_2: variable X_2.
+        shifts: (6, B) twist of X_2 in X_1's frame by each of the numbers.
+        noise: of the six rows.
+    """
+    shifts = np.asarray(shifts, dtype=np.float64)
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        step = values.atPose3(key_1).between(values.atPose3(key_2))
+        twist = gtsam.Pose3.Logmap(step)
+        if jacobians is not None:
+            by_step = gtsam.Pose3.LogmapDerivative(twist)
+            jacobians[0] = np.asfortranarray(-by_step @ step.inverse().AdjointMap())
+            jacobians[1] = np.asfortranarray(-shifts)
+            jacobians[2] = np.asfortranarray(by_step)
+        return np.asarray(twist - shifts @ values.atVector(key_bend))
+
+    return gtsam.CustomFactor(noise, [key_1, key_bend, key_2], error)

@@ -2,12 +2,13 @@
 
     python -m benchmarks.accuracy.place_draws [--draws 200] [--cases "5 places" ...]
 
-Errors are drawn from the error model itself, as the matcher ``structure`` states it: what displaces
-the cloud everywhere and at a place, the matches of a camera everywhere and at a place (in the shape
-of its information), three frames each, matches of which share a fifth of their variance. So the
-table checks the algebra, and what is made of the sizes, not whether recordings are like that; that
-is ``error_bars``. NEES is the squared error in the metric of its covariance; its mean over 6 should
-be 1. Errors of single cameras and of pairs are medians; before: all matches independent.
+Errors are drawn from the error model itself, as the matcher ``structure`` states it: what bends the
+cloud, what displaces it everywhere and at a place, the matches of a camera everywhere and at a
+place (in the shape of its information), three frames each, matches of which share a fifth of their
+variance. So the table checks the algebra, and what is made of the sizes, not whether recordings are
+like that; that is ``error_bars``. NEES is the squared error in the metric of its covariance; its
+mean over 6 should be 1. Errors of single cameras and of pairs are medians; before: all matches
+independent.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ from benchmarks.accuracy.uncertainty import (
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Config, Rig, concatenate, simulate_correspondences
 from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.solver.cloud_bends import bends_at
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
@@ -106,7 +109,9 @@ def errors_of(solved: Solution, truth: Rig) -> Iterator[tuple[str, Array]]:
 def draw_places(places: int, matches: int, rng: Rng) -> Drawn:
     """A table of so many places, that states the errors which were drawn."""
     truth, tables = stereo(), []
-    whole = np.repeat([SIZES.systematic_rotation_rad, SIZES.systematic_translation_m], 3)
+    findings = MatcherFindings.from_metadata(vars(SIZES))
+    whole = np.repeat(findings.rigid_sigmas, 3)
+    bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
     at_place = np.repeat([SIZES.place_rotation_rad, SIZES.place_translation_m], 3)
     cloud = np.sqrt(1 - SIZES.camera_share) * whole * rng.standard_normal(6)
     cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
@@ -117,7 +122,9 @@ def draw_places(places: int, matches: int, rng: Rng) -> Drawn:
         table = simulate_correspondences(
             there, frames=FRAMES, matches=matches, errors=FIFTH, seed=int(rng.integers(2**31))
         )
-        tables.append(replace(table, frame=table.frame + FRAMES * place))
+        points = table.points_lidar_m
+        bent = points + np.tensordot(bends, bends_at(points), axes=1)
+        tables.append(replace(table, points_lidar_m=bent, frame=table.frame + FRAMES * place))
     names = [list(range(FRAMES * place, FRAMES * (place + 1))) for place in range(places)]
     stated = {name: value for name, value in vars(SIZES).items()}
     joined = concatenate(tables)

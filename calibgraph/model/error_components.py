@@ -23,6 +23,9 @@ class MatcherComponents:
     Attributes:
         systematic_rotation_rad, systematic_translation_m: of what all its frames share.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        elevation_rad: of an offset of all beams' elevations.
+        elevation_stretch: of the share by which elevations are too far from the horizon.
+        scan_motion_m: of the motion during a turn for which clouds are not corrected.
         place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of what a camera's frames of a place share besides, over the variance of one
             frame's matches if they were independent.
@@ -31,6 +34,9 @@ class MatcherComponents:
     systematic_rotation_rad: float
     systematic_translation_m: float
     camera_share: float
+    elevation_rad: float
+    elevation_stretch: float
+    scan_motion_m: float
     place_rotation_rad: float
     place_translation_m: float
     place_variance: float
@@ -88,6 +94,9 @@ def error_components() -> ErrorComponents:
                 systematic_rotation_rad=float(np.radians(one["systematic_rotation_deg"])),
                 systematic_translation_m=one["systematic_translation_m"],
                 camera_share=one["camera_share"],
+                elevation_rad=float(np.radians(one["elevation_deg"])),
+                elevation_stretch=one["elevation_stretch"],
+                scan_motion_m=one["scan_motion_m"],
                 place_rotation_rad=float(np.radians(one["place_rotation_deg"])),
                 place_translation_m=one["place_translation_m"],
                 place_variance=one["place_variance"],

@@ -23,6 +23,9 @@ _NUMBERS = {
     "systematic_rotation_rad": math.pi,
     "systematic_translation_m": 100.0,
     "camera_share": 1.0,
+    "elevation_rad": math.pi,
+    "elevation_stretch": 1.0,
+    "scan_motion_m": 100.0,
     "place_rotation_rad": math.pi,
     "place_translation_m": 100.0,
     "place_variance": 1e6,
@@ -45,6 +48,10 @@ class MatcherFindings:
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             error that all its frames share.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        elevation_rad: standard deviation of an offset of all beams' elevations; this and the next
+            two, which bend the cloud, are part of the error that all frames share.
+        elevation_stretch: of the share by which elevations are too far from the horizon.
+        scan_motion_m: of the motion during a turn for which clouds are not corrected.
         place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
         place_variance: of the error that frames of one place share, over that of one frame's
             matches if they were independent.
@@ -61,6 +68,9 @@ class MatcherFindings:
     systematic_rotation_rad: float = 0.0
     systematic_translation_m: float = 0.0
     camera_share: float = 0.5
+    elevation_rad: float = 0.0
+    elevation_stretch: float = 0.0
+    scan_motion_m: float = 0.0
     place_rotation_rad: float = 0.0
     place_translation_m: float = 0.0
     place_variance: float = 0.0
@@ -95,6 +105,24 @@ class MatcherFindings:
     def systematic_sigmas(self) -> tuple[float, float]:
         """Rotation [rad] and translation [m] that all frames share, per axis."""
         return self.systematic_rotation_rad, self.systematic_translation_m
+
+    @property
+    def rigid_sigmas(self) -> tuple[float, float]:
+        """Of these what is left besides the bends, which displace a camera by about as much."""
+        parts = (
+            (self.systematic_rotation_rad, self.elevation_rad),
+            (
+                self.systematic_translation_m,
+                self.scan_motion_m / (4 * math.pi),
+            ),
+        )
+        rotation, translation = (math.sqrt(max(a**2 - b**2, 0.0)) for a, b in parts)
+        return rotation, translation
+
+    @property
+    def bend_sigmas(self) -> tuple[float, float, float]:
+        """Of what bends the cloud: offset of elevations [rad], their stretch, motion [m]."""
+        return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
 
 
 def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:

@@ -29,7 +29,7 @@ class Sizes:
     """Variances over the usual ones.
 
     Attributes:
-        shared: of what all places share: the cloud, the cameras' matches, their pairs.
+        shared: of what all places share: the cloud, its bends, the cameras' matches, their pairs.
         cloud: of the cloud at one place.
         cameras: of a camera's matches at one place.
     """
@@ -44,6 +44,7 @@ class Sizes:
             usual,
             cloud=self.shared * usual.cloud,
             camera=self.shared * usual.camera,
+            bends=self.shared**0.5 * usual.bends,
             pairs=self.shared * usual.pairs,
             cloud_at_place=self.cloud * usual.cloud_at_place,
             at_place=self.cameras * usual.at_place,
@@ -81,16 +82,10 @@ def _size(squared: float, free: float, present: float, prior_dof: float) -> floa
 
 def _shared_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[float, float]:
     """Sum of squares of what is shared everywhere, and its expectation."""
-    edges = shared_edges(model, fit.poses)
-    free = len(fit.shared_covariance)
-    covariance = np.zeros((free + 6, free + 6))  # the identity is known
-    covariance[:free, :free] = fit.shared_covariance
-    blocks = covariance.reshape(free // 6 + 1, 6, free // 6 + 1, 6).swapaxes(1, 2)
-    both = np.concatenate([edges.to_first, edges.to_second], axis=2)
-    ends = np.stack([edges.first, edges.second], axis=1)
-    known = blocks[ends[:, :, None], ends[:, None, :]].swapaxes(2, 3).reshape(-1, 12, 12)
-    trace = np.einsum("nij,njk,nkl,nil->", edges.information, both, known, both, optimize=True)
-    return float(edges.squared.sum()), 6.0 * len(edges.error) - float(trace)
+    edges, free = shared_edges(model, fit.poses), len(fit.shared_covariance)
+    jacobian = edges.jacobian[:, :free]  # the identity is known
+    trace = np.sum((edges.information @ jacobian) * (jacobian @ fit.shared_covariance))
+    return edges.squared, float(len(edges.error) - trace)
 
 
 def _placed_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:

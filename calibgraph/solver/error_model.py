@@ -25,13 +25,14 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
+from calibgraph.solver.cloud_bends import bend_shifts
 from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
 from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
-from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy, linearize
+from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy, linearize
 from calibgraph.solver.hierarchy_poses import start_poses
 from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.pair_refinement import pair_sigmas
@@ -76,10 +77,25 @@ class ErrorFit:
         parts = self.model.components
         model = replace(
             self.model,
-            components=replace(parts, cloud=ratio * parts.cloud, camera=ratio * parts.camera),
+            components=replace(
+                parts,
+                cloud=ratio * parts.cloud,
+                camera=ratio * parts.camera,
+                bends=ratio**0.5 * parts.bends,
+            ),
         )
         fit = linearize(model, self.fit)
         return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
+
+    def bends(self, usual: Sequence[float]) -> tuple[Array, Array]:
+        """(3,) offset of elevations [rad], their stretch, motion [m]; (3,) standard deviations.
+
+        Args:
+            usual: the standard deviations that the matcher states.
+        """
+        values, covariance = bends_of(self.model, self.fit)
+        unit = self.sizes.shared**0.5 * np.asarray(usual)
+        return unit * values, unit * np.sqrt(np.diag(covariance))
 
     def without_pose_graph(self) -> HierarchyFit | None:
         """The fit without priors and measured relative poses, of the same sizes."""
@@ -211,23 +227,28 @@ def error_model(
     """The model with usual sizes; arguments as of :func:`fit_errors`."""
     findings, usual = MatcherFindings.from_metadata(metadata), error_components()
     cameras = tuple(T_camera_lidar)
-    whole, share = np.square(findings.systematic_sigmas), findings.camera_share
-    if not whole.any() and inliers.pairs:  # nothing is stated, and there is what may contradict
+    whole, share = np.square(findings.rigid_sigmas), findings.camera_share
+    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
         unknown = usual.matchers["unknown"]
         whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    blocks = {}
+    blocks, bends = {}, np.zeros((len(cameras), 6, len(findings.bend_sigmas)))
     for name, block in inliers.blocks.items():
         placed = PlacedBlock.of(block, scales[name], places)
         within = _within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
         blocks[name] = placed.with_variance(within.least)
+        if any(findings.bend_sigmas):
+            pose = to_T_lidar_camera(T_camera_lidar[name])
+            shifts = bend_shifts(block, scales[name], pose, _WEAK)
+            bends[cameras.index(name)] = shifts * findings.bend_sigmas
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
         camera=_covariance(*(share * whole)),
+        bends=bends,
         pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,

@@ -1,9 +1,10 @@
 """The error model as a factor graph: what matches of a place, and all places, have in common.
 
-Variables, each a ``Pose3``; without errors of the sensor and the matcher all of a camera are equal:
+Variables, each a ``Pose3`` but b; without errors of sensor and matcher all of a camera are equal:
 
     x_c   camera c as it is: ``T_lidar_camera``, what is wanted
-    m_c   camera c as its matches show it everywhere: tied to x_c by ``components.camera``
+    b     how the sensor bends the cloud, numbers in standard deviations: a prior at zero
+    m_c   camera c as its matches show it everywhere: tied to x_c and b by ``components.camera``
     n_c   camera c as its pairs show it everywhere: tied to x_c by ``components.pairs``
     o     the cloud as displaced everywhere: a prior at the identity, ``components.cloud``
     o_p   the cloud as displaced at place p: tied to o by ``components.cloud_at_place``
@@ -28,7 +29,14 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.factor_graph import join
 from calibgraph.solver.residual_scale import ResidualScale
-from factors import BlockSums, ProjectionBlock, pair_block_factor, placed_pair_factor, robust_noise
+from factors import (
+    BlockSums,
+    ProjectionBlock,
+    bent_between_factor,
+    pair_block_factor,
+    placed_pair_factor,
+    robust_noise,
+)
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -42,6 +50,7 @@ class Components:
         cloud: (6, 6) of the cloud everywhere, in the LiDAR frame.
         cloud_at_place: (6, 6) of the cloud at one place besides.
         camera: (6, 6) of all matches of a camera, in its axes.
+        bends: (N, 6, B) by how much they follow one standard deviation of each bend of the cloud.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
         robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
@@ -51,14 +60,26 @@ class Components:
     cloud: Array
     cloud_at_place: Array
     camera: Array
+    bends: Array
     pairs: Array
     at_place: Array
     robust_scale: float = np.inf
 
+    @property
+    def cameras(self) -> Array:
+        """(6 N, 6 N) of the matches of all cameras, which share the bends."""
+        shifts = np.concatenate(self.bends)
+        return np.kron(np.eye(len(self.bends)), self.camera) + shifts @ shifts.T
+
     @cached_property
     def shared_information(self) -> Array:
-        """(3, 6, 6) of the cloud, of a camera's matches, and of its pairs."""
-        return np.linalg.inv(np.stack([self.cloud, self.camera, self.pairs]))
+        """(6 (2 N + 1),) squared: of the cloud, of all cameras' matches, and of their pairs."""
+        N = len(self.bends)
+        whole, matches = np.zeros((6 * (2 * N + 1),) * 2), slice(6, 6 + 6 * N)
+        whole[:6, :6] = np.linalg.inv(self.cloud)
+        whole[matches, matches] = np.linalg.inv(self.cameras)
+        whole[6 + 6 * N :, 6 + 6 * N :] = np.kron(np.eye(N), np.linalg.inv(self.pairs))
+        return whole
 
     @cached_property
     def place_information(self) -> Array:
@@ -162,6 +183,11 @@ class Hierarchy:
     components: Components
 
     @property
+    def bends(self) -> Array:
+        """(6 N, B) by how much the matches of all cameras follow the bends, under each other."""
+        return np.concatenate(self.components.bends)
+
+    @property
     def places(self) -> int:
         """How many there are."""
         return len(self.components.at_place)
@@ -170,15 +196,18 @@ class Hierarchy:
 def hierarchy_graph(model: Hierarchy) -> gtsam.NonlinearFactorGraph:
     """The whole graph: stock factors between poses, block factors of the data."""
     parts, graph = model.components, gtsam.NonlinearFactorGraph()
-    cloud, no_motion = gtsam.symbol("o", 0), gtsam.Pose3()
+    cloud, bend, no_motion = gtsam.symbol("o", 0), gtsam.symbol("b", 0), gtsam.Pose3()
     graph.add(gtsam.PriorFactorPose3(cloud, no_motion, _noise(parts.cloud)))
+    zero = np.zeros(parts.bends.shape[2])
+    graph.add(gtsam.PriorFactorVector(bend, zero, gtsam.noiseModel.Unit.Create(len(zero))))
     for place in range(model.places):
         noise = _robust(parts.cloud_at_place, parts.robust_scale)
         graph.add(gtsam.BetweenFactorPose3(cloud, cloud_key(place), no_motion, noise))
     for camera, name in enumerate(model.cameras):
-        pose, matched = gtsam.symbol("x", camera), gtsam.symbol("m", camera)
-        for key, covariance in ((matched, parts.camera), (gtsam.symbol("n", camera), parts.pairs)):
-            graph.add(gtsam.BetweenFactorPose3(pose, key, no_motion, _noise(covariance)))
+        pose, matched, paired = (gtsam.symbol(letter, camera) for letter in "xmn")
+        noise = _noise(parts.camera)
+        graph.add(bent_between_factor(pose, bend, matched, parts.bends[camera], noise))
+        graph.add(gtsam.BetweenFactorPose3(pose, paired, no_motion, _noise(parts.pairs)))
         for place in range(model.places):
             noise = _robust(parts.at_place[place, camera], parts.robust_scale)
             key = placed_key(model, camera, place)

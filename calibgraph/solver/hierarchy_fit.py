@@ -141,13 +141,11 @@ class Equations:
         return shared, -(solved[..., :-1] @ shared + solved[..., -1])
 
     def _add_shared(self, model: Hierarchy, poses: Poses) -> None:
-        edges = shared_edges(model, poses)
-        self.cost += float(edges.squared.sum())
-        for one, jacobian in ((edges.first, edges.to_first), (edges.second, edges.to_second)):
-            weighted = jacobian.transpose(0, 2, 1) @ edges.information
-            np.add.at(self.shared_gradient, one, (weighted @ edges.error[..., None])[..., 0])
-            np.add.at(self.shared, (one, edges.first), weighted @ edges.to_first)
-            np.add.at(self.shared, (one, edges.second), weighted @ edges.to_second)
+        edges, S = shared_edges(model, poses), len(poses.shared)
+        self.cost += edges.squared
+        hessian = edges.jacobian.T @ edges.information @ edges.jacobian
+        self.shared += hessian.reshape(S, 6, S, 6).swapaxes(1, 2)
+        self.shared_gradient += (edges.jacobian.T @ edges.weighted).reshape(S, 6)
 
     def _add_places(self, model: Hierarchy, poses: Poses) -> None:
         edges, (P, L) = placed_edges(model, poses), self.distances.shape
@@ -246,6 +244,23 @@ def fit_hierarchy(
 def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
     """A fit with the marginals of another model at the same poses."""
     return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
+
+
+def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
+    """(B,) bends of the cloud in standard deviations, and their (B, B) marginal covariance.
+
+    The eliminated form has them in the covariance of all m_c about x_c; here they come back.
+
+    Args:
+        model: of the error.
+        fit: its minimum.
+    """
+    edges, free, shifts = shared_edges(model, fit.poses), len(fit.shared_covariance), model.bends
+    matches = slice(6, 6 + len(shifts))
+    gain = shifts.T @ edges.information[matches, matches]
+    slope = gain @ edges.jacobian[matches, :free]
+    covariance = np.eye(shifts.shape[1]) - gain @ shifts + slope @ fit.shared_covariance @ slope.T
+    return gain @ edges.error[matches], covariance
 
 
 def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:

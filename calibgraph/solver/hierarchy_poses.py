@@ -52,7 +52,7 @@ class Edges:
         error: (n, 6) log(first^-1 second).
         to_first, to_second: (n, 6, 6) its derivatives.
         information: (n, 6, 6) without the loss.
-        robust_scale: of the loss of Geman and McClure.
+        robust_scale: of the loss of Geman and McClure; infinite: none.
     """
 
     first: Index
@@ -61,7 +61,7 @@ class Edges:
     to_first: Array
     to_second: Array
     information: Array
-    robust_scale: float = np.inf
+    robust_scale: float
 
     @cached_property
     def squared(self) -> Array:
@@ -79,14 +79,41 @@ class Edges:
         return np.asarray((1.0 + self.squared / self.robust_scale**2) ** -2)
 
 
-def shared_edges(model: Hierarchy, poses: Poses) -> Edges:
+@dataclass(frozen=True, eq=False)
+class SharedEdges:
+    """The prior of o, and all x_c to m_c and to n_c: one factor, since bends tie the cameras.
+
+    Attributes:
+        error: (6 E,) log(first^-1 second) of each.
+        jacobian: (6 E, 6 S) by the tangents of all shared poses.
+        information: (6 E, 6 E).
+    """
+
+    error: Array
+    jacobian: Array
+    information: Array
+
+    @cached_property
+    def weighted(self) -> Array:
+        """(6 E,) the information times the error."""
+        return np.asarray(self.information @ self.error)
+
+    @property
+    def squared(self) -> float:
+        """Squared distance in sigmas."""
+        return float(self.error @ self.weighted)
+
+
+def shared_edges(model: Hierarchy, poses: Poses) -> SharedEdges:
     """The prior of o; x_c to m_c and to n_c."""
-    N, parts = len(model.cameras), model.components
+    N, S = len(model.cameras), len(poses.shared)
     first = np.r_[3 * N + 1, np.arange(N), np.arange(N)]
     second = np.r_[3 * N, N : 2 * N, 2 * N : 3 * N]
-    information = parts.shared_information[np.repeat([0, 1, 2], [1, N, N])]
-    between = _between(poses.shared[first], poses.shared[second])
-    return Edges(first, second, *between, information)
+    error, to_first, to_second = _between(poses.shared[first], poses.shared[second])
+    jacobian, edges = np.zeros((len(first), 6, S, 6)), np.arange(len(first))
+    jacobian[edges, :, first], jacobian[edges, :, second] = to_first, to_second
+    information = model.components.shared_information
+    return SharedEdges(error.ravel(), jacobian.reshape(6 * len(first), 6 * S), information)
 
 
 def placed_edges(model: Hierarchy, poses: Poses) -> Edges:

@@ -20,7 +20,7 @@ from calibgraph import (
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.hierarchy import Components, Hierarchy, hierarchy_graph
-from calibgraph.solver.hierarchy_fit import HierarchyFit, fit_hierarchy
+from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy
 from calibgraph.solver.hierarchy_poses import Poses, start_poses
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
@@ -30,6 +30,9 @@ ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 STATED = {
     "systematic_rotation_rad": 1.5e-3,
     "systematic_translation_m": 0.02,
+    "elevation_rad": 1e-3,
+    "elevation_stretch": 0.005,
+    "scan_motion_m": 0.1,
     "place_rotation_rad": 7e-4,
     "place_translation_m": 0.006,
     "place_variance": 8.0,
@@ -62,7 +65,14 @@ def test_the_eliminated_form_is_the_whole_graph(
     T = errors.T_camera_lidar
     eliminated = fit_hierarchy(model, start_poses(model, T), relative_tolerance=0.0)
     assert eliminated is not None
-    values, covariance = solve_whole(model, eliminated)
+    values, bend = solve_whole(model, eliminated), gtsam.symbol("b", 0)
+    bends, covariance_of_bends = bends_of(model, eliminated)
+    # A bend of one sigma displaces a camera by 1e-3.
+    np.testing.assert_allclose(bends, values.atVector(bend), rtol=0, atol=1e-6)
+    marginals = gtsam.Marginals(hierarchy_graph(model), to_values(model, eliminated.poses, bends))
+    found = marginals.marginalCovariance(bend)
+    np.testing.assert_allclose(covariance_of_bends, found, rtol=0, atol=1e-9)
+    covariance = joint_of_cameras(model, marginals)
     for camera in range(len(model.cameras)):
         found = values.atPose3(gtsam.symbol("x", camera)).matrix()
         np.testing.assert_allclose(eliminated.poses.shared[camera], found, rtol=0, atol=1e-9)
@@ -114,30 +124,46 @@ def with_correlations(model: Hierarchy) -> Hierarchy:
         return (scale[:, None] * mix) @ (scale[:, None] * mix).T
 
     parts = model.components
+    bends = parts.bends + 1e-3 * rng.standard_normal(parts.bends.shape)
     at_place = np.array([[mixed(one) for one in place] for place in parts.at_place])
     return replace(
         model,
         components=Components(
-            *(mixed(c) for c in (parts.cloud, parts.cloud_at_place, parts.camera, parts.pairs)),
+            *(mixed(c) for c in (parts.cloud, parts.cloud_at_place, parts.camera)),
+            bends,
+            mixed(parts.pairs),
             at_place,
             parts.robust_scale,
         ),
     )
 
 
-def solve_whole(model: Hierarchy, fit: HierarchyFit) -> tuple[gtsam.Values, np.ndarray]:
-    """By GTSAM from a displaced start: values, and the joint marginal of the cameras."""
-    rng, graph, start = np.random.default_rng(2), hierarchy_graph(model), gtsam.Values()
+def solve_whole(model: Hierarchy, fit: HierarchyFit) -> gtsam.Values:
+    """By GTSAM from a displaced start."""
+    rng, graph = np.random.default_rng(2), hierarchy_graph(model)
+    start = to_values(model, fit.poses, rng.standard_normal(3))
     for key, pose in all_poses(model, fit.poses).items():
-        start.insert(key, pose.retract(1e-4 * rng.standard_normal(6)))
+        start.update(key, pose.retract(1e-4 * rng.standard_normal(6)))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0.0)
     parameters.setAbsoluteErrorTol(0.0)
     parameters.setMaxIterations(100)
-    values = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+
+
+def to_values(model: Hierarchy, poses: Poses, bends: np.ndarray) -> gtsam.Values:
+    """All variables of the graph."""
+    values = gtsam.Values()
+    values.insert(gtsam.symbol("b", 0), bends)
+    for key, pose in all_poses(model, poses).items():
+        values.insert(key, pose)
+    return values
+
+
+def joint_of_cameras(model: Hierarchy, marginals: gtsam.Marginals) -> np.ndarray:
+    """(6 N, 6 N) marginal of all x_c."""
     cameras = [gtsam.symbol("x", camera) for camera in range(len(model.cameras))]
-    marginals = gtsam.Marginals(graph, values)
-    return values, marginals.jointMarginalCovariance(cameras).fullMatrix()
+    return np.asarray(marginals.jointMarginalCovariance(cameras).fullMatrix())
 
 
 def all_poses(model: Hierarchy, poses: Poses) -> dict[int, gtsam.Pose3]:
@@ -207,7 +233,8 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
     block = errors.model.blocks["left"]
     assert isinstance(block.block, ProjectionBlock)
     hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
-    expected = parts.camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
+    camera = parts.cameras[:6, :6]  # with the bends of the cloud
+    expected = camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
     sigmas = np.sqrt(np.diag(expected))
     difference = (errors.fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
     # The paper's priors of a metre take (3 cm / 1 m)^2 off.
