@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -23,6 +23,7 @@ class LiveFrame:
         inliers: per camera, (m,) which of them are within the gate.
         hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
         gradient: (n, 6) at the cameras' references.
+        place: name of the place that it is of; empty: not known.
     """
 
     number: int
@@ -30,6 +31,7 @@ class LiveFrame:
     inliers: dict[int, NDArray[np.bool_]]
     hessian: Array
     gradient: Array
+    place: str = ""
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
@@ -37,7 +39,7 @@ class LiveFrame:
         hessian[camera], gradient[camera] = 0.0, 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
         inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
-        return LiveFrame(self.number, raw, inliers, hessian, gradient)
+        return replace(self, raw=raw, inliers=inliers, hessian=hessian, gradient=gradient)
 
     def add(
         self,
@@ -49,18 +51,19 @@ class LiveFrame:
         """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         hessian[camera], gradient[camera] = sums
-        return LiveFrame(
-            self.number,
-            {**self.raw, camera: raw},
-            {**self.inliers, camera: inliers},
-            hessian,
-            gradient,
+        return replace(
+            self,
+            raw={**self.raw, camera: raw},
+            inliers={**self.inliers, camera: inliers},
+            hessian=hessian,
+            gradient=gradient,
         )
 
     @staticmethod
-    def empty(number: int, cameras: int) -> LiveFrame:
+    def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
         """A frame without matches."""
-        return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
+        sums = np.zeros((cameras, 6, 6)), np.zeros((cameras, 6))
+        return LiveFrame(number, {}, {}, *sums, place)
 
 
 @dataclass(frozen=True, eq=False)

@@ -154,7 +154,7 @@ def posterior(state: State, before: int | None = None) -> Posterior:
 
 def closed_posterior(state: State, before: int | None = None) -> Posterior:
     """The same without the frames of the open epoch."""
-    sums, steps = Posterior.from_summaries(state), _steps(state)
+    sums, steps = Posterior.from_summaries(state), steps_of(state)
     for epoch in state.epochs[:-1]:
         sums = sums.add(_until(epoch, before), steps).propagate(state, len(epoch.frames))
     return sums
@@ -165,7 +165,7 @@ def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
 
     As ``posterior(state, number of its first frame)``, each frame added once.
     """
-    sums, steps = Posterior.from_summaries(state), _steps(state)
+    sums, steps = Posterior.from_summaries(state), steps_of(state)
     for place, epoch in enumerate(state.epochs[:-1]):
         sums = sums.add(epoch.frames, steps).propagate(state, len(epoch.frames))
         before = sums
@@ -176,11 +176,11 @@ def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
 
 def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:
     """The sums over closed epochs with the frames of the open one added."""
-    return sums.add(_until(state.epochs[-1], before), _steps(state))
+    return sums.add(_until(state.epochs[-1], before), steps_of(state))
 
 
-def _steps(state: State) -> Array:
-    """(n, 6) from the references to the estimates."""
+def steps_of(state: State) -> Array:
+    """(n, 6) from the references to the tracker's own estimates."""
     return np.array([*map(step_between, state.references, state.T_lidar_camera)])
 
 

@@ -168,6 +168,7 @@ def _restart_camera(
         state,
         epochs=epochs,
         cross=cross,
+        places=state.places.without(camera),
         references=replace_item(state.references, camera, T_lidar_camera),
         drift=_with_anchor_at(
             drift, camera, step_between(state.references[camera], T_lidar_camera)

@@ -1,0 +1,235 @@
+"""The estimate of all cameras and its covariance, by the error model, in constant time.
+
+The tracker's own estimate takes all matches for independent: by it frames are gated and moves are
+found. What is reported is the minimum under the error model, as of a batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
+from calibgraph.solver.covariance import ENOUGH_FRAMES, with_pseudo_frames
+from calibgraph.solver.curvature import pose_equations
+from calibgraph.solver.factor_graph import relative_pose_graph
+from calibgraph.tracking.place_errors import (
+    Information,
+    SharedErrors,
+    information_of_places,
+    spread_of,
+)
+from calibgraph.tracking.place_sums import PlaceSums, parts_of
+from calibgraph.tracking.posterior import Posterior, is_determined, steps_of
+from calibgraph.tracking.state import State
+from calibgraph.tracking.window import pose_priors
+
+Array = NDArray[np.float64]
+
+_PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
+_POSE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Quadratics of the terms without correspondences, at the references.
+
+    Attributes:
+        always: (6 n, 6 n) Hessian of the priors, which are about the references.
+        measured: per relative pose, by its place in the rig: (6 n, 6 n) Hessian, (6 n,) gradient.
+    """
+
+    always: Array
+    measured: dict[int, tuple[Array, Array]]
+
+    @staticmethod
+    def of(state: State) -> Priors:
+        """Of the priors, and of the relative poses that no move has invalidated."""
+        T = _by_name(state, state.references)
+        measured = {
+            place: pose_equations(relative_pose_graph(state.names, (pair,)), state.names, T)
+            for place, pair in enumerate(state.rig.relative_poses)
+            if place not in state.dropped_pairs
+        }
+        whole = pose_equations(pose_priors(state), state.names, T)[0]
+        return Priors(whole - sum(hessian for hessian, _ in measured.values()), measured)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedPlaces:
+    """The sums over the frames of closed epochs, and what follows from these.
+
+    Attributes:
+        sums: per place; of a camera that drifts, none.
+        findings: with which the rest was made.
+        errors: what frames share.
+        information: of each place.
+    """
+
+    sums: PlaceSums
+    findings: MatcherFindings
+    errors: SharedErrors
+    information: Information
+
+    @staticmethod
+    def of(state: State) -> ClosedPlaces:
+        """Of a state's closed epochs."""
+        frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
+        sums = state.places.add(parts_of(frames, steps_of(state)))
+        for camera, one in enumerate(state.cameras):
+            if one.summary.walk:
+                sums = sums.without(camera)
+        errors = SharedErrors.of(state.findings, state.references)
+        every = np.ones(len(sums.names), dtype=np.bool_)
+        spread = _spreads(state, sums, errors)
+        information = information_of_places(sums, every, spread, errors)
+        return ClosedPlaces(sums, state.findings, errors, information)
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate:
+    """All cameras' estimates.
+
+    Attributes:
+        T_lidar_camera: per camera.
+        covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras with too
+            few frames.
+        conflicts: of the relative poses with the correspondences of both their cameras.
+    """
+
+    T_lidar_camera: tuple[gtsam.Pose3, ...]
+    covariance: Array
+    conflicts: tuple[Conflict, ...]
+
+
+def joint_estimate(
+    state: State, sums: Posterior, closed: ClosedPlaces, priors: Priors
+) -> JointEstimate:
+    """The present estimates.
+
+    A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
+    batch.
+
+    Args:
+        state: the tracker's.
+        sums: over its summaries and live frames.
+        closed: of its closed epochs.
+        priors: at its references.
+    """
+    if closed.findings != state.findings:
+        closed = ClosedPlaces.of(state)
+    places = _with_open_epoch(state, sums, closed)
+    own = _information(state, places, closed).of_cameras(closed.errors)
+    conflicts = _conflicts(state, sums, own)
+    limit = error_components().contradiction_sigmas
+    hessian, vector = own.matrix + priors.always, own.vector
+    for place, (measured, gradient) in priors.measured.items():
+        if place not in conflicts or conflicts[place].largest <= limit:
+            hessian, vector = hessian + measured, vector - gradient
+    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    estimates = state.T_lidar_camera
+    if state.config.preset == "auto" and (priors.measured or not places.is_of_one_place):
+        steps = (covariance @ vector).reshape(-1, _POSE)
+        moved = zip(state.references, steps, strict=True)
+        estimates = tuple(reference.retract(step) for reference, step in moved)
+    few = np.repeat(sums.frames < ENOUGH_FRAMES, _POSE)
+    covariance[few], covariance[:, few] = np.nan, np.nan
+    return JointEstimate(estimates, covariance, tuple(conflicts.values()))
+
+
+def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> PlaceSums:
+    """The sums over all frames; those of a camera that drifts at the present place."""
+    frames = state.epochs[-1].frames
+    places = closed.sums.add(parts_of(frames, steps_of(state)))
+    live = state.live_frames
+    for camera, one in enumerate(state.cameras):
+        if one.summary.walk and live:
+            rows = pose_rows(camera)
+            own = (
+                sums.hessian[camera],
+                sums.gradient[camera],
+                sums.scatter[rows, rows],
+                float(sums.frames[camera]),
+            )
+            used = state.matches_of_frame(camera)
+            places = places.with_camera_at(live[-1].place, camera, own, used)
+    return places if state.config.preset == "auto" else places.bounded(most=0)
+
+
+def _information(state: State, places: PlaceSums, closed: ClosedPlaces) -> Information:
+    """Of all places: those that the open epoch adds to are computed anew."""
+    spread = _spreads(state, places, closed.errors)
+    if len(places.names) == 1:  # the weights of a preset of the paper
+        every = np.ones(1, dtype=np.bool_)
+        return information_of_places(places, every, spread, closed.errors).sum(every)
+    live = state.live_frames[-1:]
+    touched = {frame.place for frame in (*state.epochs[-1].frames, *live)}
+    fresh = np.array([name in touched for name in places.names])
+    kept = np.array([name not in touched for name in closed.sums.names])
+    present = information_of_places(places, fresh, spread, closed.errors)
+    return closed.information.sum(kept) + present.sum(np.ones(len(present.vector), np.bool_))
+
+
+def _spreads(state: State, places: PlaceSums, errors: SharedErrors) -> Array:
+    """(n, 6, 6) scatter of each camera's frames about the means of their places, over H.
+
+    With an allowance for few frames, as in a batch. While a camera that has moved has few frames,
+    the scatter is shrunk towards that of all its frames so far. Where the matcher states nothing of
+    places it is wider if epochs scatter more than their frames suggest.
+    """
+    scatter, frames, left = places.of_all
+    hessian, matches = places.hessian.sum(axis=0), places.matches.sum(axis=0)
+    found = np.tile(np.eye(_POSE), (len(frames), 1, 1))
+    correlation = error_components().frame_correlation
+    for camera, one in enumerate(state.cameras):
+        count = frames[camera]
+        if not count:
+            continue
+        own = scatter[camera]
+        if one.moved_at >= 0 and not one.summary.walk:
+            share = _PRIOR_FRAMES / (count + _PRIOR_FRAMES)
+            rows = pose_rows(camera)
+            usual = state.total[rows, rows] * (count / max(state.total_frames[camera], 1.0))
+            own = (1.0 - share) * own + share * usual
+        if not errors.are_at_places:
+            own = state.widen(camera, own)
+        seen = left[camera] + 1.0
+        usual_size = 1.0 + correlation * (matches[camera] / count - 1.0)
+        usual = usual_size * hessian[camera] * seen / count
+        whole = with_pseudo_frames(own, hessian[camera], np.full(_POSE, seen), usual)
+        found[camera] = spread_of(whole * count / seen, hessian[camera])
+    return found
+
+
+def _conflicts(state: State, sums: Posterior, own: Information) -> dict[int, Conflict]:
+    """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
+    if not state.rig.relative_poses:
+        return {}
+    known = [
+        camera
+        for camera, one in enumerate(state.cameras)
+        if one.started and sums.frames[camera] >= ENOUGH_FRAMES
+        and is_determined(sums.hessian[camera])
+    ]  # fmt: skip
+    rows = (_POSE * np.array(known, dtype=np.intp)[:, None] + np.arange(_POSE)).ravel()
+    covariance = np.asarray(np.linalg.inv(own.matrix[np.ix_(rows, rows)]), dtype=np.float64)
+    steps = (covariance @ own.vector[rows]).reshape(-1, _POSE)
+    T = {
+        state.names[c]: to_T_camera_lidar(state.references[c].retract(step))
+        for c, step in zip(known, steps, strict=True)
+    }
+    return {
+        place: relative_pose_conflict(pair, tuple(T), T, covariance)
+        for place, pair in enumerate(state.rig.relative_poses)
+        if place not in state.dropped_pairs and {pair.a, pair.b} <= set(T)
+    }
+
+
+def _by_name(state: State, poses: tuple[gtsam.Pose3, ...]) -> dict[str, Array]:
+    return {n: to_T_camera_lidar(pose) for n, pose in zip(state.names, poses, strict=True)}
