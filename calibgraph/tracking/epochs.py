@@ -9,12 +9,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, merge
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch
+from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import PlacePart
 from calibgraph.tracking.posterior import true_hessian
 from calibgraph.tracking.state import CameraState, State, block_diagonal
@@ -106,12 +107,14 @@ class _PlaceInEpoch:
     Attributes:
         hessian: (6, 6).
         gradient: (6,) at the reference.
+        reweighted: (6, 6) Hessian by the matches' weights in the loss.
         scores: (f, 6) gradients at the estimate, of all the epoch's frames; zero of others.
         frames, matches: how many.
     """
 
     hessian: Array
     gradient: Array
+    reweighted: Array
     scores: Array
     frames: int
     matches: int
@@ -119,12 +122,14 @@ class _PlaceInEpoch:
     @staticmethod
     def empty(frames: int) -> _PlaceInEpoch:
         """Of none of so many frames."""
-        return _PlaceInEpoch(np.zeros((6, 6)), np.zeros(6), np.zeros((frames, 6)), 0, 0)
+        zero = np.zeros((6, 6))
+        return _PlaceInEpoch(zero, np.zeros(6), zero, np.zeros((frames, 6)), 0, 0)
 
     def __add__(self, other: _PlaceInEpoch) -> _PlaceInEpoch:
         return _PlaceInEpoch(
             self.hessian + other.hessian,
             self.gradient + other.gradient,
+            self.reweighted + other.reweighted,
             self.scores + other.scores,
             self.frames + other.frames,
             self.matches + other.matches,
@@ -145,13 +150,14 @@ def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _Plac
         return nothing
     block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
-    gradients = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame))).gradient
+    by_frame = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame)))
     scores = np.zeros((len(numbers), 6))
-    scores[np.searchsorted(numbers, own)] = gradients
+    scores[np.searchsorted(numbers, own)] = by_frame.gradient
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     to_reference = step_between(T_lidar_camera, state.references[camera])
-    gradient = gradients.sum(axis=0) + hessian @ to_reference
-    return _PlaceInEpoch(hessian, gradient, scores, len(own), len(inliers.frame))
+    gradient = by_frame.gradient.sum(axis=0) + hessian @ to_reference
+    reweighted = by_frame.hessian.sum(axis=0)
+    return _PlaceInEpoch(hessian, gradient, reweighted, scores, len(own), len(inliers.frame))
 
 
 def _summarize_oldest(state: State) -> State:
@@ -164,7 +170,10 @@ def _summarize_oldest(state: State) -> State:
     ]
     sums = [sum(at, _PlaceInEpoch.empty(len(epoch.frames))) for at in at_places]
     drifted = [one.summary.walk > 0 for one in state.cameras]
-    update_evidence = [_update_evidence(state, camera, s) for camera, s in enumerate(sums)]
+    by_places = shift_between(state, (), epoch.frames)
+    update_evidence = [
+        _update_evidence(state, camera, s, by_places) for camera, s in enumerate(sums)
+    ]
     state = replace(state, cameras=tuple(update_evidence))
     state = _select_walks(state)
     gains, summarized = [], []
@@ -192,6 +201,7 @@ def _to_part(name: str, cameras: Sequence[_PlaceInEpoch]) -> PlacePart:
         name,
         hessian=np.array([one.hessian for one in cameras]),
         gradient=np.array([one.gradient for one in cameras]),
+        reweighted=np.array([one.reweighted for one in cameras]),
         score=np.array([one.scores.sum(axis=0) for one in cameras]),
         scatter=np.array([one.scores.T @ one.scores for one in cameras]),
         frames=np.array([one.frames for one in cameras], dtype=np.float64),
@@ -229,7 +239,9 @@ def _between_cameras(scores: Array) -> Array:
     return scatter
 
 
-def _update_evidence(state: State, camera: int, sums: _PlaceInEpoch) -> CameraState:
+def _update_evidence(
+    state: State, camera: int, sums: _PlaceInEpoch, by_places: Array
+) -> CameraState:
     """The camera with the evidence of its walks updated by how well they predict an epoch.
 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
@@ -240,7 +252,9 @@ def _update_evidence(state: State, camera: int, sums: _PlaceInEpoch) -> CameraSt
         return camera_state
     score = sums.scores.sum(axis=0)
     groups = tuple(one.add(score, sums.frames, alone) for one in camera_state.groups)
-    summary = camera_state.summary.update_evidence(sums.hessian, sums.gradient, noise * sums.frames)
+    rows = pose_rows(camera)
+    noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
+    summary = camera_state.summary.update_evidence(sums.hessian, sums.gradient, noise)
     return replace(camera_state, summary=summary, groups=groups)
 
 

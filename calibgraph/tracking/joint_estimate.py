@@ -17,13 +17,15 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, with_pseudo_frames
-from calibgraph.solver.curvature import pose_equations
+from calibgraph.solver.curvature import convex_hessian, pose_equations
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.tracking.place_errors import (
+    FrameSpread,
     Information,
     SharedErrors,
     information_of_places,
-    spread_of,
+    root_of,
+    spread_over,
 )
 from calibgraph.tracking.place_sums import PlaceSums, parts_of
 from calibgraph.tracking.posterior import Posterior, is_determined, steps_of
@@ -176,35 +178,40 @@ def _information(state: State, places: PlaceSums, closed: ClosedPlaces) -> Infor
     return closed.information.sum(kept) + present.sum(np.ones(len(present.vector), np.bool_))
 
 
-def _spreads(state: State, places: PlaceSums, errors: SharedErrors) -> Array:
-    """(n, 6, 6) scatter of each camera's frames about the means of their places, over H.
+def _spreads(state: State, places: PlaceSums, errors: SharedErrors) -> FrameSpread:
+    """Of each camera's frames about the means of their places.
 
     With an allowance for few frames, as in a batch. While a camera that has moved has few frames,
     the scatter is shrunk towards that of all its frames so far. Where the matcher states nothing of
     places it is wider if epochs scatter more than their frames suggest.
     """
     scatter, frames, left = places.of_all
-    hessian, matches = places.hessian.sum(axis=0), places.matches.sum(axis=0)
-    found = np.tile(np.eye(_POSE), (len(frames), 1, 1))
+    matches = places.matches.sum(axis=0)
+    hessian, reweighted = places.hessian.sum(axis=0), places.reweighted.sum(axis=0)
+    roots, spreads = np.tile(np.eye(_POSE), (2, len(frames), 1, 1))
     correlation = error_components().frame_correlation
-    for camera, one in enumerate(state.cameras):
-        count = frames[camera]
-        if not count:
-            continue
-        own = scatter[camera]
-        if one.moved_at >= 0 and not one.summary.walk:
-            share = _PRIOR_FRAMES / (count + _PRIOR_FRAMES)
-            rows = pose_rows(camera)
-            usual = state.total[rows, rows] * (count / max(state.total_frames[camera], 1.0))
-            own = (1.0 - share) * own + share * usual
+    for camera in np.flatnonzero(frames):
+        count, seen = frames[camera], left[camera] + 1.0
+        own = _usual_while_few(state, int(camera), scatter[camera], count)
         if not errors.are_at_places:
-            own = state.widen(camera, own)
-        seen = left[camera] + 1.0
+            own = state.widen(int(camera), own)
+        true = convex_hessian(hessian[camera], reweighted[camera])
+        root = root_of(reweighted[camera], true)
         usual_size = 1.0 + correlation * (matches[camera] / count - 1.0)
-        usual = usual_size * hessian[camera] * seen / count
-        whole = with_pseudo_frames(own, hessian[camera], np.full(_POSE, seen), usual)
-        found[camera] = spread_of(whole * count / seen, hessian[camera])
-    return found
+        usual = usual_size * true * seen / count
+        whole = with_pseudo_frames(own, true, np.full(_POSE, seen), usual) * count / seen
+        roots[camera], spreads[camera] = root, spread_over(whole, reweighted[camera], root)
+    return FrameSpread(roots, spreads)
+
+
+def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -> Array:
+    """(6, 6) scatter of a camera's frames, that of all before counted in after a move."""
+    one = state.cameras[camera]
+    if one.moved_at < 0 or one.summary.walk:
+        return scatter
+    share, rows = _PRIOR_FRAMES / (frames + _PRIOR_FRAMES), pose_rows(camera)
+    usual = state.total[rows, rows] * (frames / max(state.total_frames[camera], 1.0))
+    return np.asarray((1.0 - share) * scatter + share * usual)
 
 
 def _conflicts(state: State, sums: Posterior, own: Information) -> dict[int, Conflict]:

@@ -104,22 +104,22 @@ class Information:
 
 
 def information_of_places(
-    sums: PlaceSums, rows: NDArray[np.bool_], spread: Array, errors: SharedErrors
+    sums: PlaceSums, rows: NDArray[np.bool_], seen: FrameSpread, errors: SharedErrors
 ) -> Information:
     """The information of each of some places.
 
     Args:
         sums: of all frames.
         rows: (P,) which places.
-        spread: (n, 6, 6) W of each camera.
+        seen: by the frames of each camera.
         errors: what frames share.
     """
-    hessian, gradient = sums.hessian[rows], sums.gradient[rows]
+    gradient = sums.gradient[rows]
     frames, places = sums.frames[rows], sums.places[rows]
     P, n = frames.shape
-    root = np.linalg.cholesky(hessian + _WEAK)
+    root = np.linalg.cholesky(sums.reweighted[rows] + _WEAK) @ seen.root
     shared = errors.place_variance * frames / places
-    inner = np.linalg.inv(spread + shared[..., None, None] * np.eye(6))
+    inner = np.linalg.inv(seen.spread + shared[..., None, None] * np.eye(6))
     half = root @ inner
     own = half @ root.swapaxes(2, 3) * (frames > 0)[..., None, None]
     whitened = np.linalg.solve(root, -gradient[..., None])
@@ -139,12 +139,36 @@ def information_of_places(
     return Information(matrix, vector.reshape(P, 6 * n) - less)
 
 
-def spread_of(scatter: Array, hessian: Array) -> Array:
-    """(6, 6) W: a scatter of frames' gradients in units of independent matches."""
-    root = np.linalg.cholesky(hessian + _WEAK)
-    left = np.linalg.solve(root, scatter)
-    found = np.linalg.solve(root, left.T)
+@dataclass(frozen=True, eq=False)
+class FrameSpread:
+    """What the frames of each camera show of their errors, in units of the reweighted Hessian.
+
+    Attributes:
+        root: (n, 6, 6) Cholesky root of the true Hessian, as seen from that of the reweighted one:
+            the sums over a place are too few for a true Hessian of its own.
+        spread: (n, 6, 6) W, in units of the true Hessian.
+    """
+
+    root: Array
+    spread: Array
+
+
+def root_of(reweighted: Array, true: Array) -> Array:
+    """(6, 6) of :class:`FrameSpread`, from both Hessians, the true one positive definite."""
+    outer = np.asarray(np.linalg.cholesky(reweighted + _WEAK), dtype=np.float64)
+    return np.asarray(np.linalg.cholesky(whiten(outer, true + _WEAK)))
+
+
+def whiten(root: Array, matrix: Array) -> Array:
+    """(6, 6) R^-1 M R^-T of a symmetric M."""
+    found = np.linalg.solve(root, np.linalg.solve(root, matrix).T)
     return np.asarray((found + found.T) / 2)
+
+
+def spread_over(scatter: Array, reweighted: Array, root: Array) -> Array:
+    """(6, 6) W: a scatter of frames' gradients in units of independent matches."""
+    outer = np.asarray(np.linalg.cholesky(reweighted + _WEAK), dtype=np.float64)
+    return whiten(outer @ root, scatter)
 
 
 def shift_covariance(

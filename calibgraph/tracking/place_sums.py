@@ -20,8 +20,8 @@ MOST_PLACES = 24
 """Places that are kept apart."""
 
 _OLDER = "\0"  # name of the first row, which no place has
-_ROWS = ("hessian", "gradient", "score", "frames", "matches")
-_SHAPES = ((6, 6), (6,), (6,), (6, 6), (), ())  # of a part, per camera
+_ROWS = ("hessian", "gradient", "reweighted", "score", "frames", "matches")
+_SHAPES = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())  # of a part, per camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class PlacePart:
         name: of the place.
         hessian: (n, 6, 6) true Hessian, per camera.
         gradient: (n, 6) at the references.
+        reweighted: (n, 6, 6) Hessian by the matches' weights in the loss, positive semidefinite.
         score: (n, 6) sum of the frames' gradients, each at the estimate of its time.
         scatter: (n, 6, 6) sum of the outer products of the same.
         frames, matches: (n,).
@@ -40,6 +41,7 @@ class PlacePart:
     name: str
     hessian: Array
     gradient: Array
+    reweighted: Array
     score: Array
     scatter: Array
     frames: Array
@@ -69,6 +71,7 @@ def _part(frames: Sequence[LiveFrame], steps: Array, name: str) -> PlacePart:
         name,
         hessian.sum(axis=0),
         gradient.sum(axis=0),
+        sum((frame.reweighted for frame in frames), np.zeros_like(hessian[0])),
         scores.sum(axis=0),
         np.einsum("fni,fnj->nij", scores, scores),
         np.count_nonzero(counts, axis=0).astype(np.float64),
@@ -84,6 +87,7 @@ class PlaceSums:
         names: (P,) of the places, the last visited last.
         hessian: (P, n, 6, 6) true Hessian of each camera's robust cost.
         gradient: (P, n, 6) at the references, which ``State`` holds.
+        reweighted: (P, n, 6, 6) Hessian by the matches' weights in the loss.
         score: (P, n, 6) sum of the frames' gradients, each at the estimate of its time; 0 for older
             places.
         frames, matches: (P, n) how many.
@@ -96,6 +100,7 @@ class PlaceSums:
     names: tuple[str, ...]
     hessian: Array
     gradient: Array
+    reweighted: Array
     score: Array
     frames: Array
     matches: Array
@@ -111,6 +116,7 @@ class PlaceSums:
             names=(_OLDER,),
             hessian=np.zeros((1, n, 6, 6)),
             gradient=np.zeros((1, n, 6)),
+            reweighted=np.zeros((1, n, 6, 6)),
             score=np.zeros((1, n, 6)),
             frames=np.zeros((1, n)),
             matches=np.zeros((1, n)),
@@ -225,5 +231,12 @@ class PlaceSums:
         n = len(self.scatter)
         part = PlacePart(name, *(np.zeros((n, *shape)) for shape in _SHAPES))
         part.hessian[camera], part.gradient[camera], part.scatter[camera] = sums[:3]
+        part.reweighted[camera] = _without_negative(sums[0])
         part.frames[camera], part.matches[camera] = sums[3], sums[3] * matches
         return self.without(camera).add([part])
+
+
+def _without_negative(hessian: Array) -> Array:
+    """The nearest positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(hessian)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -21,13 +22,28 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 
 
+class Quadratic(NamedTuple):
+    """Half the cost of some matches of one camera, near its reference.
+
+    Attributes:
+        hessian: (6, 6) true one.
+        gradient: (6,) at the reference.
+        reweighted: (6, 6) Hessian of the matches by their weights in the loss: it is positive
+            semidefinite, of however few.
+    """
+
+    hessian: Array
+    gradient: Array
+    reweighted: Array
+
+
 def quadratic(
     residuals: BlockResiduals,
     inliers: NDArray[np.bool_],
     scale: ResidualScale,
     T_lidar_camera: gtsam.Pose3,
     reference: gtsam.Pose3,
-) -> tuple[Array, Array]:
+) -> Quadratic:
     """The quadratic approximation of one frame's cost for a camera.
 
     Args:
@@ -36,16 +52,12 @@ def quadratic(
         scale: of the residuals.
         T_lidar_camera: near the minimum.
         reference: T_lidar_camera at which the gradient is taken.
-
-    Returns:
-        (6, 6) true Hessian of half the cost there; (6,) gradient at the reference.
     """
     block = residuals.block.select(inliers).with_scale(scale)
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
-    gradient = block.sums(T_lidar_camera).gradient + hessian @ step_between(
-        T_lidar_camera, reference
-    )
-    return hessian, gradient
+    sums = block.sums(T_lidar_camera)
+    gradient = sums.gradient + hessian @ step_between(T_lidar_camera, reference)
+    return Quadratic(hessian, gradient, sums.hessian)
 
 
 def true_hessian(

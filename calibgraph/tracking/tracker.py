@@ -267,7 +267,7 @@ class IncrementalCalibrator:
             residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
             reference = self._state.references[camera]
             sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, agreeing[camera], rows, sums)
+            open_frame = open_frame.add(camera, agreeing[camera], rows, sums._asdict())
             self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
         self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
         return used
