@@ -35,6 +35,7 @@ from calibgraph.tracking.window import pose_priors
 Array = NDArray[np.float64]
 
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
+_SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _POSE = 6
 
 
@@ -71,13 +72,21 @@ class ClosedPlaces:
         sums: per place; of a camera that drifts, none.
         findings: with which the rest was made.
         errors: what frames share.
+        seen: by the frames of each camera.
         information: of each place.
     """
 
     sums: PlaceSums
     findings: MatcherFindings
     errors: SharedErrors
+    seen: FrameSpread
     information: Information
+
+    def is_settled(self, state: State) -> bool:
+        """Whether an epoch's frames more would hardly change the scatter of frames."""
+        frames = self.sums.frames.sum(axis=0)
+        cameras = zip(state.cameras, frames, strict=True)
+        return all(count >= _SETTLED for one, count in cameras if one.started)
 
     @staticmethod
     def of(state: State) -> ClosedPlaces:
@@ -89,9 +98,9 @@ class ClosedPlaces:
                 sums = sums.without(camera)
         errors = SharedErrors.of(state.findings, state.references)
         every = np.ones(len(sums.names), dtype=np.bool_)
-        spread = _spreads(state, sums, errors)
-        information = information_of_places(sums, every, spread, errors)
-        return ClosedPlaces(sums, state.findings, errors, information)
+        seen = _spreads(state, sums, errors)
+        information = information_of_places(sums, every, seen, errors)
+        return ClosedPlaces(sums, state.findings, errors, seen, information)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,15 +175,15 @@ def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> Pla
 
 def _information(state: State, places: PlaceSums, closed: ClosedPlaces) -> Information:
     """Of all places: those that the open epoch adds to are computed anew."""
-    spread = _spreads(state, places, closed.errors)
+    seen = closed.seen if closed.is_settled(state) else _spreads(state, places, closed.errors)
     if len(places.names) == 1:  # the weights of a preset of the paper
         every = np.ones(1, dtype=np.bool_)
-        return information_of_places(places, every, spread, closed.errors).sum(every)
+        return information_of_places(places, every, seen, closed.errors).sum(every)
     live = state.live_frames[-1:]
     touched = {frame.place for frame in (*state.epochs[-1].frames, *live)}
     fresh = np.array([name in touched for name in places.names])
     kept = np.array([name not in touched for name in closed.sums.names])
-    present = information_of_places(places, fresh, spread, closed.errors)
+    present = information_of_places(places, fresh, seen, closed.errors)
     return closed.information.sum(kept) + present.sum(np.ones(len(present.vector), np.bool_))
 
 
