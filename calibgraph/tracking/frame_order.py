@@ -13,7 +13,7 @@ from calibgraph.solver.repeats import PLACES, lists_of_frames
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
-_LONGEST_NAME = 200
+LONGEST_PLACE = 200
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
     "place_rotation_rad", "place_translation_m", "place_variance",
@@ -77,14 +77,19 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
 
 
 def with_place(table: Correspondences, place: str | int | None) -> Correspondences:
-    """The table with the name of its place in the metadata.
+    """The table with the name of its place in the metadata, and without the lists of places.
+
+    Args:
+        table: the correspondences of one frame.
+        place: None: as by the metadata.
 
     Raises:
-        CorrespondenceError: if it is no name.
+        CorrespondenceError: if it is no name, or the lists are wrong.
     """
-    if place is None:
-        return table
-    return replace(table, metadata={**table.metadata, PLACE: _place_name(place)})
+    name = _place_of(table) if place is None else _place_name(place)
+    kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
+    kept |= {PLACE: name} if name else {}
+    return table if kept == table.metadata else replace(table, metadata=kept)
 
 
 def with_metadata_per_frame(table: Correspondences) -> Correspondences:
@@ -92,13 +97,15 @@ def with_metadata_per_frame(table: Correspondences) -> Correspondences:
 
     These are the findings of its matcher about shared errors, and the name of its place.
 
+    Args:
+        table: after :func:`with_place`.
+
     Raises:
-        CorrespondenceError: if one of them is wrong.
+        CorrespondenceError: if a finding is wrong.
     """
     findings = table.findings.to_metadata()
     kept = {key: findings[key] for key in _FINDINGS_PER_FRAME if key in findings}
-    place = _place_of(table)
-    kept |= {PLACE: place} if place else {}
+    kept |= {key: table.metadata[key] for key in (PLACE,) if key in table.metadata}
     return table if kept == table.metadata else replace(table, metadata=kept)
 
 
@@ -119,9 +126,9 @@ def _place_name(place: object) -> str:
         found = f"found {reprlib.repr(place)}"
         raise CorrespondenceError(f"the place of a frame must be a name or a number, {found}")
     name = str(place)
-    if len(name) > _LONGEST_NAME or "\0" in name:
+    if len(name) > LONGEST_PLACE or "\0" in name:
         raise CorrespondenceError(
-            f"the place of a frame must have at most {_LONGEST_NAME} characters, found "
+            f"the place of a frame must have at most {LONGEST_PLACE} characters, found "
             f"{reprlib.repr(name)}"
         )
     return name

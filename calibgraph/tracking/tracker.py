@@ -99,6 +99,11 @@ class IncrementalCalibrator:
         """Number of the last frame, None before the first."""
         return self._state.frame
 
+    @property
+    def place(self) -> str:
+        """Name of the place of the last frame; empty if it is not known."""
+        return self._state.live_frames[-1].place if self._state.live_frames else ""
+
     def calibration(self) -> Calibration:
         """The present estimate as a result of the same type as a batch solve's."""
         return to_calibration(self._state)
