@@ -6,7 +6,9 @@ found. What is reported is the minimum under the error model, as of a batch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -22,11 +24,12 @@ from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.tracking.place_errors import (
     FrameSpread,
     Information,
+    PlaceTerms,
     SharedErrors,
-    information_of_places,
     root_of,
     spread_over,
 )
+from calibgraph.tracking.place_sizes import sizes_shown
 from calibgraph.tracking.place_sums import PlaceSums, parts_of
 from calibgraph.tracking.posterior import Posterior, is_determined, steps_of
 from calibgraph.tracking.state import State
@@ -36,6 +39,7 @@ Array = NDArray[np.float64]
 
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
+_ROUNDS = 3  # of sizing, as in a batch
 _POSE = 6
 
 
@@ -63,6 +67,15 @@ class Priors:
         whole = pose_equations(pose_priors(state), state.names, T)[0]
         return Priors(whole - sum(hessian for hessian, _ in measured.values()), measured)
 
+    def without(self, conflicts: Mapping[int, Conflict]) -> Information:
+        """All but the relative poses that contradict the correspondences."""
+        limit = error_components().contradiction_sigmas
+        matrix, vector = self.always, np.zeros(len(self.always))
+        for place, (hessian, gradient) in self.measured.items():
+            if place not in conflicts or conflicts[place].largest <= limit:
+                matrix, vector = matrix + hessian, vector - gradient
+        return Information(matrix, vector)
+
 
 @dataclass(frozen=True, eq=False)
 class ClosedPlaces:
@@ -73,14 +86,19 @@ class ClosedPlaces:
         findings: with which the rest was made.
         errors: what frames share.
         seen: by the frames of each camera.
-        information: of each place.
+        terms: of each place.
     """
 
     sums: PlaceSums
     findings: MatcherFindings
     errors: SharedErrors
     seen: FrameSpread
-    information: Information
+    terms: PlaceTerms
+
+    @cached_property
+    def information(self) -> Information:
+        """Of each place."""
+        return self.terms.information
 
     def is_settled(self, state: State) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
@@ -96,11 +114,11 @@ class ClosedPlaces:
         for camera, one in enumerate(state.cameras):
             if one.summary.walk:
                 sums = sums.without(camera)
-        errors = SharedErrors.of(state.findings, state.references)
+        errors = SharedErrors.of(state.findings, state.references, state.sizes)
         every = np.ones(len(sums.names), dtype=np.bool_)
         seen = _spreads(state, sums, errors)
-        information = information_of_places(sums, every, seen, errors)
-        return ClosedPlaces(sums, state.findings, errors, seen, information)
+        terms = PlaceTerms.of(sums, every, seen, errors)
+        return ClosedPlaces(sums, state.findings, errors, seen, terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,21 +155,34 @@ def joint_estimate(
         closed = ClosedPlaces.of(state)
     places = _with_open_epoch(state, sums, closed)
     own = _information(state, places, closed).of_cameras(closed.errors)
-    conflicts = _conflicts(state, sums, own)
-    limit = error_components().contradiction_sigmas
-    hessian, vector = own.matrix + priors.always, own.vector
-    for place, (measured, gradient) in priors.measured.items():
-        if place not in conflicts or conflicts[place].largest <= limit:
-            hessian, vector = hessian + measured, vector - gradient
-    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    conflicts = _conflicts(state, places, own)
+    agreeing = own + priors.without(conflicts)
+    covariance = np.asarray(np.linalg.inv(agreeing.matrix), dtype=np.float64)
     estimates = state.T_lidar_camera
     if state.config.preset == "auto" and (priors.measured or not places.is_of_one_place):
-        steps = (covariance @ vector).reshape(-1, _POSE)
+        steps = (covariance @ agreeing.vector).reshape(-1, _POSE)
         moved = zip(state.references, steps, strict=True)
         estimates = tuple(reference.retract(step) for reference, step in moved)
     few = np.repeat(sums.frames < ENOUGH_FRAMES, _POSE)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return JointEstimate(estimates, covariance, tuple(conflicts.values()))
+
+
+def with_sizes(state: State) -> State:
+    """The state with the sizes of the errors that its closed epochs show."""
+    sizes, priors = state.sizes, Priors.of(state)
+    for _ in range(_ROUNDS):
+        closed = ClosedPlaces.of(replace(state, sizes=sizes))
+        if closed.sums.is_of_one_place and not priors.measured:
+            return state
+        every = np.ones(len(closed.sums.names), dtype=np.bool_)
+        own = closed.information.sum(every).of_cameras(closed.errors)
+        of_poses = priors.without(_conflicts(state, closed.sums, own))
+        found = sizes_shown(closed.sums, closed.terms, closed.errors, of_poses, sizes)
+        if found.is_near(sizes):
+            break
+        sizes = found
+    return replace(state, sizes=sizes)
 
 
 def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> PlaceSums:
@@ -178,12 +209,12 @@ def _information(state: State, places: PlaceSums, closed: ClosedPlaces) -> Infor
     seen = closed.seen if closed.is_settled(state) else _spreads(state, places, closed.errors)
     if len(places.names) == 1:  # the weights of a preset of the paper
         every = np.ones(1, dtype=np.bool_)
-        return information_of_places(places, every, seen, closed.errors).sum(every)
+        return PlaceTerms.of(places, every, seen, closed.errors).information.sum(every)
     live = state.live_frames[-1:]
     touched = {frame.place for frame in (*state.epochs[-1].frames, *live)}
     fresh = np.array([name in touched for name in places.names])
     kept = np.array([name not in touched for name in closed.sums.names])
-    present = information_of_places(places, fresh, seen, closed.errors)
+    present = PlaceTerms.of(places, fresh, seen, closed.errors).information
     return closed.information.sum(kept) + present.sum(np.ones(len(present.vector), np.bool_))
 
 
@@ -223,16 +254,16 @@ def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -
     return np.asarray((1.0 - share) * scatter + share * usual)
 
 
-def _conflicts(state: State, sums: Posterior, own: Information) -> dict[int, Conflict]:
+def _conflicts(state: State, places: PlaceSums, own: Information) -> dict[int, Conflict]:
     """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
     if not state.rig.relative_poses:
         return {}
+    frames, hessian = places.frames.sum(axis=0), places.hessian.sum(axis=0)
     known = [
         camera
         for camera, one in enumerate(state.cameras)
-        if one.started and sums.frames[camera] >= ENOUGH_FRAMES
-        and is_determined(sums.hessian[camera])
-    ]  # fmt: skip
+        if one.started and frames[camera] >= ENOUGH_FRAMES and is_determined(hessian[camera])
+    ]
     rows = (_POSE * np.array(known, dtype=np.intp)[:, None] + np.arange(_POSE)).ravel()
     covariance = np.asarray(np.linalg.inv(own.matrix[np.ix_(rows, rows)]), dtype=np.float64)
     steps = (covariance @ own.vector[rows]).reshape(-1, _POSE)

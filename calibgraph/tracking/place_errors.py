@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -22,13 +23,16 @@ from numpy.typing import NDArray
 
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import adjoint_camera_lidar
+from calibgraph.solver.component_sizes import Sizes
 from calibgraph.tracking.place_sums import PlaceSums
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
 _LEAST_SIGMA = 1e-5  # rad and m, as of the batch
-_WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
+_EXACT = 100.0 * _LEAST_SIGMA**2  # what is stated to be so, of any size
+_LEAST_VARIANCE = 0.1  # of independent matches
+WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
 
@@ -37,37 +41,47 @@ class SharedErrors:
     """Covariances of what frames have in common, at given poses.
 
     Attributes:
-        everywhere: (6 n, 6 n) of what all frames share, in the cameras' axes: C and K.
+        cloud: (6, 6) K, in the LiDAR frame.
+        camera: (6, 6) C, in the camera's axes.
         cloud_at_place: (6, 6) D, in the LiDAR frame.
         place_variance: q.
+        cameras_size: by which what a camera's frames share at a place is larger than usual.
         to_cameras: (n, 6, 6) A, from a motion of the cloud to that of each camera.
     """
 
-    everywhere: Array
+    cloud: Array
+    camera: Array
     cloud_at_place: Array
     place_variance: float
+    cameras_size: float
     to_cameras: Array
 
     @staticmethod
-    def of(findings: MatcherFindings, T_lidar_camera: Sequence[gtsam.Pose3]) -> SharedErrors:
-        """The sizes that a matcher states, about these poses."""
-        to_cameras = np.array([*map(adjoint_camera_lidar, T_lidar_camera)])
-        n, whole = len(to_cameras), np.square(findings.systematic_sigmas)
+    def of(
+        findings: MatcherFindings, T_lidar_camera: Sequence[gtsam.Pose3], sizes: Sizes
+    ) -> SharedErrors:
+        """What a matcher states, times the sizes that the data show, about these poses."""
+        whole = np.square(findings.systematic_sigmas)
         at_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
-        flat = to_cameras.reshape(6 * n, 6)
-        cloud = _covariance((1.0 - findings.camera_share) * whole)
-        cameras = np.kron(np.eye(n), _covariance(findings.camera_share * whole))
         return SharedErrors(
-            cameras + flat @ cloud @ flat.T,
-            _covariance(at_place),
-            findings.place_variance,
-            to_cameras,
+            cloud=sizes.shared * _covariance((1.0 - findings.camera_share) * whole),
+            camera=sizes.shared * _covariance(findings.camera_share * whole),
+            cloud_at_place=sizes.cloud * _covariance(at_place),
+            place_variance=findings.place_variance,
+            cameras_size=sizes.cameras,
+            to_cameras=np.array([*map(adjoint_camera_lidar, T_lidar_camera)]),
         )
+
+    @cached_property
+    def everywhere(self) -> Array:
+        """(6 n, 6 n) of what all frames share, in the cameras' axes: C and K."""
+        flat, n = self.to_cameras.reshape(-1, 6), len(self.to_cameras)
+        return np.asarray(np.kron(np.eye(n), self.camera) + flat @ self.cloud @ flat.T)
 
     @property
     def are_at_places(self) -> bool:
         """Whether frames of one place share more than all frames do."""
-        return self.place_variance > 0 or self.cloud_at_place[0, 0] > _LEAST_SIGMA**2
+        return bool(self.place_variance > 0 or (np.diag(self.cloud_at_place) > _EXACT).any())
 
 
 def _covariance(variances: Array) -> Array:
@@ -103,42 +117,6 @@ class Information:
         return Information((matrix + matrix.T) / 2, found[:, -1])
 
 
-def information_of_places(
-    sums: PlaceSums, rows: NDArray[np.bool_], seen: FrameSpread, errors: SharedErrors
-) -> Information:
-    """The information of each of some places.
-
-    Args:
-        sums: of all frames.
-        rows: (P,) which places.
-        seen: by the frames of each camera.
-        errors: what frames share.
-    """
-    gradient = sums.gradient[rows]
-    frames, places = sums.frames[rows], sums.places[rows]
-    P, n = frames.shape
-    root = np.linalg.cholesky(sums.reweighted[rows] + _WEAK) @ seen.root
-    shared = errors.place_variance * frames / places
-    inner = np.linalg.inv(seen.spread + shared[..., None, None] * np.eye(6))
-    half = root @ inner
-    own = half @ root.swapaxes(2, 3) * (frames > 0)[..., None, None]
-    whitened = np.linalg.solve(root, -gradient[..., None])
-    vector = (half @ whitened)[..., 0] * (frames > 0)[..., None]
-    by_cloud = own @ errors.to_cameras  # (P, n, 6, 6)
-    turned = errors.to_cameras.swapaxes(1, 2)
-    of_cloud = (turned @ by_cloud).sum(axis=1)
-    pull = np.einsum("nij,pnj->pi", turned, vector)
-    alike = np.where(frames > 0, places, np.inf).min(axis=1)
-    cloud = errors.cloud_at_place / np.where(np.isfinite(alike), alike, 1.0)[:, None, None]
-    left = np.linalg.solve(np.eye(6) + cloud @ of_cloud, cloud)
-    flat = by_cloud.reshape(P, 6 * n, 6)
-    matrix = -flat @ left @ flat.swapaxes(1, 2)
-    blocks = matrix.reshape(P, n, 6, n, 6)
-    blocks[:, np.arange(n), :, np.arange(n)] += own.swapaxes(0, 1)
-    less = (flat @ (left @ pull[..., None]))[..., 0]
-    return Information(matrix, vector.reshape(P, 6 * n) - less)
-
-
 @dataclass(frozen=True, eq=False)
 class FrameSpread:
     """What the frames of each camera show of their errors, in units of the reweighted Hessian.
@@ -152,11 +130,81 @@ class FrameSpread:
     root: Array
     spread: Array
 
+    @property
+    def least(self) -> Array:
+        """(n,) the variance that matches keep for themselves, as in a batch."""
+        return np.clip(np.linalg.eigvalsh(self.spread)[:, 0], _LEAST_VARIANCE, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceTerms:
+    """What the matches of each camera at some places show.
+
+    Attributes:
+        root: (P, n, 6, 6) L.
+        excess: (P, n, 6, 6) what L^T V L has beyond the noise of independent matches.
+        own: (P, n, 6, 6) inverse of V; 0 where a camera has no frames.
+        vector: (P, n, 6) the same times -H^-1 b.
+        cloud: (P, 6, 6) D.
+        left: (P, 6, 6) covariance of the cloud's displacement at a place, the cameras' poses given.
+        to_cameras: (n, 6, 6) A.
+    """
+
+    root: Array
+    excess: Array
+    own: Array
+    vector: Array
+    cloud: Array
+    left: Array
+    to_cameras: Array
+
+    @staticmethod
+    def of(
+        sums: PlaceSums, rows: NDArray[np.bool_], seen: FrameSpread, errors: SharedErrors
+    ) -> PlaceTerms:
+        """At some places.
+
+        Args:
+            sums: of all frames.
+            rows: (P,) which places.
+            seen: by the frames of each camera.
+            errors: what frames share.
+        """
+        frames, places = sums.frames[rows], sums.places[rows]
+        root = np.linalg.cholesky(sums.reweighted[rows] + WEAK) @ seen.root
+        shared = errors.place_variance * frames / places
+        noise = seen.least[:, None, None] * np.eye(6)
+        excess = seen.spread - noise + shared[..., None, None] * np.eye(6)
+        excess = errors.cameras_size * excess
+        half = root @ np.linalg.inv(noise + excess)
+        own = half @ root.swapaxes(2, 3) * (frames > 0)[..., None, None]
+        whitened = np.linalg.solve(root, -sums.gradient[rows][..., None])
+        vector = (half @ whitened)[..., 0] * (frames > 0)[..., None]
+        A = errors.to_cameras
+        of_cloud = (A.swapaxes(1, 2) @ own @ A).sum(axis=1)
+        alike = np.where(frames > 0, places, np.inf).min(axis=1)
+        alike = np.where(np.isfinite(alike), alike, 1.0)
+        cloud = errors.cloud_at_place / alike[:, None, None]
+        left = np.linalg.solve(np.eye(6) + cloud @ of_cloud, cloud)
+        return PlaceTerms(root, excess, own, vector, cloud, left, A)
+
+    @property
+    def information(self) -> Information:
+        """Of each place about all cameras, (P, 6 n, 6 n): the cloud's displacement eliminated."""
+        P, n = self.own.shape[:2]
+        flat = (self.own @ self.to_cameras).reshape(P, 6 * n, 6)
+        pull = np.einsum("nji,pnj->pi", self.to_cameras, self.vector)
+        matrix = -flat @ self.left @ flat.swapaxes(1, 2)
+        blocks = matrix.reshape(P, n, 6, n, 6)
+        blocks[:, np.arange(n), :, np.arange(n)] += self.own.swapaxes(0, 1)
+        less = (flat @ (self.left @ pull[..., None]))[..., 0]
+        return Information(matrix, self.vector.reshape(P, 6 * n) - less)
+
 
 def root_of(reweighted: Array, true: Array) -> Array:
     """(6, 6) of :class:`FrameSpread`, from both Hessians, the true one positive definite."""
-    outer = np.asarray(np.linalg.cholesky(reweighted + _WEAK), dtype=np.float64)
-    return np.asarray(np.linalg.cholesky(whiten(outer, true + _WEAK)))
+    outer = np.asarray(np.linalg.cholesky(reweighted + WEAK), dtype=np.float64)
+    return np.asarray(np.linalg.cholesky(whiten(outer, true + WEAK)))
 
 
 def whiten(root: Array, matrix: Array) -> Array:
@@ -167,7 +215,7 @@ def whiten(root: Array, matrix: Array) -> Array:
 
 def spread_over(scatter: Array, reweighted: Array, root: Array) -> Array:
     """(6, 6) W: a scatter of frames' gradients in units of independent matches."""
-    outer = np.asarray(np.linalg.cholesky(reweighted + _WEAK), dtype=np.float64)
+    outer = np.asarray(np.linalg.cholesky(reweighted + WEAK), dtype=np.float64)
     return whiten(outer @ root, scatter)
 
 
@@ -190,7 +238,7 @@ def shift_covariance(
     n = len(both)
     flat = errors.to_cameras.reshape(6 * n, 6)
     found = np.kron(both, np.ones((6, 6))) * (flat @ errors.cloud_at_place @ flat.T)
-    of_frame = errors.place_variance * np.linalg.inv(frame_hessian + _WEAK)
+    of_frame = errors.place_variance * np.linalg.inv(frame_hessian + WEAK)
     for camera in range(n):
         rows = slice(6 * camera, 6 * camera + 6)
         found[rows, rows] += both[camera, camera] * of_frame[camera]

@@ -14,6 +14,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
+from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -118,7 +119,8 @@ class State:
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
         places: sums of the older frames, place by place, of cameras that do not drift.
-        findings: sizes of the errors that frames share, by their matcher.
+        findings: of the errors that frames share, by their matcher.
+        sizes: of these, as the data show them, over what the matcher states.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -137,6 +139,7 @@ class State:
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
+    sizes: Sizes = Sizes()
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0

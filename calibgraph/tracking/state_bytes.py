@@ -30,6 +30,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -49,8 +50,8 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, MatcherFindings, ResidualHistogram, ResidualScale,
-                 Correspondences, CameraBlock, ProjectionBlock)
+                 EpochSummary, PlaceSums, MatcherFindings, Sizes, ResidualHistogram,
+                 ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DECODING_ERRORS = (
     ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError, EOFError,

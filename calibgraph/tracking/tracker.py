@@ -34,7 +34,7 @@ from calibgraph.tracking.frame_order import (
     with_place,
 )
 from calibgraph.tracking.halves import Halves
-from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors
+from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
@@ -323,5 +323,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(self._state)
+        self._resume(with_sizes(self._state))
         return events
