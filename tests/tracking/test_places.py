@@ -25,6 +25,8 @@ from calibgraph.tracking.place_errors import (
     shift_covariance,
 )
 from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.stream_lines import frames_of_lines
+from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import drive, pair_of
@@ -227,6 +229,21 @@ def test_the_callers_place_counts_before_that_of_the_table() -> None:
     assert place_after(named) == "yard"
     assert place_after(named, 12) == "12"
     assert place_after(table, "gate") == "gate"
+
+
+@pytest.mark.parametrize(("place", "name"), [('"gate 4"', "gate 4"), ("-7", "-7"), ("null", "")])
+def test_a_line_names_its_place(place: str, name: str) -> None:
+    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
+    (item,) = frames_of_lines([line.encode()], "lines")
+    assert isinstance(item, StreamFrame)
+    assert item.table.metadata.get(PLACE, "") == name
+
+
+@pytest.mark.parametrize("place", ["1.5", "true", "[]", '"' + "x" * 201 + '"'])
+def test_a_line_with_another_place_is_left_out(place: str) -> None:
+    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
+    (item,) = frames_of_lines([line.encode()], "lines")
+    assert isinstance(item, Refused) and "place" in item.message
 
 
 @pytest.mark.parametrize("place", [True, 1.5, "x" * 201, "a\0b"])
