@@ -106,9 +106,19 @@ def errors_of(solved: Solution, truth: Rig) -> Iterator[tuple[str, Array]]:
         yield of, np.array([*after, *sizes[1][of]])
 
 
-def draw_places(places: int, matches: int, rng: Rng) -> Drawn:
-    """A table of so many places, that states the errors which were drawn."""
-    truth, tables = stereo(), []
+def draw_places(
+    places: int, matches: int, rng: Rng, *, frames: int = FRAMES, rounds: int = 1
+) -> Drawn:
+    """A table of so many places, that states the errors which were drawn.
+
+    Args:
+        places: how many.
+        matches: of a camera in a frame.
+        rng: draws the errors.
+        frames: of a place in each round.
+        rounds: how often all places are visited, one after the other.
+    """
+    truth, there = stereo(), []
     findings = MatcherFindings.from_metadata(vars(SIZES))
     whole = np.repeat(findings.rigid_sigmas, 3)
     bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
@@ -116,16 +126,23 @@ def draw_places(places: int, matches: int, rng: Rng) -> Drawn:
     cloud = np.sqrt(1 - SIZES.camera_share) * whole * rng.standard_normal(6)
     cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
     everywhere = displaced(truth, cloud, cameras)
-    for place in range(places):
-        there = displaced(everywhere, at_place * rng.standard_normal(6), np.zeros((2, 6)))
-        there = displaced(there, np.zeros(6), draw_cameras(truth, matches, rng))
+    tables, names = [], [list[int]() for _ in range(places)]
+    for visit in range(places * rounds):
+        place = visit % places
+        if visit < places:
+            moved = displaced(everywhere, at_place * rng.standard_normal(6), np.zeros((2, 6)))
+            there.append(displaced(moved, np.zeros(6), draw_cameras(truth, matches, rng)))
         table = simulate_correspondences(
-            there, frames=FRAMES, matches=matches, errors=FIFTH, seed=int(rng.integers(2**31))
+            there[place],
+            frames=frames,
+            matches=matches,
+            errors=FIFTH,
+            seed=int(rng.integers(2**31)),
         )
         points = table.points_lidar_m
         bent = points + np.tensordot(bends, bends_at(points), axes=1)
-        tables.append(replace(table, points_lidar_m=bent, frame=table.frame + FRAMES * place))
-    names = [list(range(FRAMES * place, FRAMES * (place + 1))) for place in range(places)]
+        tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
+        names[place] += range(frames * visit, frames * (visit + 1))
     stated = {name: value for name, value in vars(SIZES).items()}
     joined = concatenate(tables)
     metadata = {**joined.metadata, **stated, "places": names}

@@ -60,6 +60,10 @@ def track(
     moved, since when, how far). It is printed once the update is on disk: after a crash or kill -9
     the same command resumes there, and may print the last line again. SIGTERM and Ctrl-C finish
     the current update first.
+
+    Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the
+    frames of each in the table ("places"). Otherwise all are of one place, and the error bar stays
+    as wide. With --matcher structure places are found from the images.
     """
     from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig

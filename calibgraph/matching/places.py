@@ -6,18 +6,21 @@ with depths from the cloud: robust PnP, in metres, without odometry.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
-from calibgraph.model.rig import Camera
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 
 Array = NDArray[np.float64]
@@ -46,17 +49,84 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
     Raises:
         FileError: if an image or a cloud cannot be read.
     """
-    places: list[list[int]] = []
-    T_now_first, folder = np.eye(4), None
-    steps = [None, *motions(dataset, camera, lens, seed=seed)]
+    places: dict[int, list[int]] = {}
+    walk, steps = PlaceWalk(), [None, *motions(dataset, camera, lens, seed=seed)]
     for frame, step in zip(dataset.frames, steps, strict=True):
-        T_now_first = T_now_first if step is None else step @ T_now_first
+        places.setdefault(walk.first_of_place(frame, step), []).append(frame.index)
+    return list(places.values())
+
+
+class PlaceWalk:
+    """The place of one frame after the other."""
+
+    def __init__(self) -> None:
+        self._T_now_first, self._folder, self._first = np.eye(4), Path(), -1
+
+    def first_of_place(self, frame: Frame, step: Motion) -> int:
+        """The number of the first frame of this frame's place.
+
+        Args:
+            frame: the next one.
+            step: from the frame before.
+        """
+        if step is not None:
+            self._T_now_first = step @ self._T_now_first
         here = frame.cloud_path.parent
-        if here != folder or np.linalg.norm(T_now_first[:3, 3]) > PLACE_M:
-            places.append([])
-            T_now_first, folder = np.eye(4), here
-        places[-1].append(frame.index)
-    return places
+        far = np.linalg.norm(self._T_now_first[:3, 3]) > PLACE_M
+        if self._first < 0 or here != self._folder or far:
+            self._T_now_first, self._folder, self._first = np.eye(4), here, frame.index
+        return self._first
+
+
+class PlaceFinder:
+    """The place of one frame after the other, from their images.
+
+    While the motion is not found by the first camera of the rig, the next ones are tried.
+
+    Args:
+        rig: cameras at their extrinsics.
+        seed: of the robust fits.
+    """
+
+    def __init__(self, rig: Rig, *, seed: int = 0) -> None:
+        self._rig, self._seed, self._walk = rig, seed, PlaceWalk()
+        self._before: _SeenFrame | None = None
+
+    def first_of_place(self, frame: Frame) -> int:
+        """The number of the first frame of this frame's place; see `find_places`.
+
+        A frame whose image or cloud cannot be read is of the place of the one before.
+        """
+        seen, before = _SeenFrame(frame, {}), self._before
+        self._before = seen
+        step = None if before is None else self._step(before, seen)
+        return self._walk.first_of_place(frame, step)
+
+    def _step(self, before: _SeenFrame, now: _SeenFrame) -> Motion:
+        for name, lens in self._rig.cameras.items():
+            try:
+                earlier = before.frame, before.features(name, lens)
+                both = earlier, (now.frame, now.features(name, lens))
+                step = _motion(both, lens=lens, seed=self._seed)
+            except (CalibrationError, OSError):  # the matcher reports it
+                continue
+            if step is not None:
+                return step
+        return None
+
+
+@dataclass(frozen=True)
+class _SeenFrame:
+    """A frame, and the features of its images as far as they were wanted."""
+
+    frame: Frame
+    found: dict[str, Features | None]
+
+    def features(self, name: str, lens: Camera) -> Features | None:
+        """The features of a camera's image."""
+        if name not in self.found:
+            self.found[name] = _detect(self.frame, name, lens)
+        return self.found[name]
 
 
 def motions(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[Motion]:

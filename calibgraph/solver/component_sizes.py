@@ -10,6 +10,7 @@ poses) e is 0, the trace is 6 n, and the size is the usual one.
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,26 +67,52 @@ def sizes_of(model: Hierarchy, fit: HierarchyFit, present: Sizes) -> Sizes:
         fit: its minimum.
         present: of the model.
     """
-    prior = error_components()
-    shared = _size(*_shared_evidence(model, fit), present.shared, prior.shared_dof)
     squared, free = _placed_evidence(model, fit)
-    cloud = _size(squared[0], free[0], present.cloud, prior.place_dof)
-    cameras = _size(squared[1:].sum(), free[1:].sum(), present.cameras, prior.place_dof)
-    least = 1.0 if model.places < prior.least_places else 0.0
-    return Sizes(max(shared, 1.0), max(cloud, least), max(cameras, least))
+    return sizes_by_evidence(
+        _shared_evidence(model, fit),
+        Evidence(float(squared[0]), float(free[0])),
+        Evidence(float(squared[1:].sum()), float(free[1:].sum())),
+        places=model.places,
+        present=present,
+    )
 
 
-def _size(squared: float, free: float, present: float, prior_dof: float) -> float:
+class Evidence(NamedTuple):
+    """Of one component.
+
+    Attributes:
+        squared: sum of squares of its displacements, in units of its present covariance.
+        free: what is expected of that, at the present size.
+    """
+
+    squared: float
+    free: float
+
+
+def sizes_by_evidence(
+    shared: Evidence, cloud: Evidence, cameras: Evidence, *, places: int, present: Sizes
+) -> Sizes:
+    """The sizes by each component's evidence, as `sizes_of`; ``places``: how many there are."""
+    prior = error_components()
+    least = 1.0 if places < prior.least_places else 0.0
+    return Sizes(
+        max(_size(shared, present.shared, prior.shared_dof), 1.0),
+        max(_size(cloud, present.cloud, prior.place_dof), least),
+        max(_size(cameras, present.cameras, prior.place_dof), least),
+    )
+
+
+def _size(evidence: Evidence, present: float, prior_dof: float) -> float:
     """The size by squares in units of the present one, with the usual one as prior."""
-    return (prior_dof + present * squared) / (prior_dof + max(free, 0.0))
+    return (prior_dof + present * evidence.squared) / (prior_dof + max(evidence.free, 0.0))
 
 
-def _shared_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[float, float]:
-    """Sum of squares of what is shared everywhere, and its expectation."""
+def _shared_evidence(model: Hierarchy, fit: HierarchyFit) -> Evidence:
+    """Of what is shared everywhere."""
     edges, free = shared_edges(model, fit.poses), len(fit.shared_covariance)
     jacobian = edges.jacobian[:, :free]  # the identity is known
     trace = np.sum((edges.information @ jacobian) * (jacobian @ fit.shared_covariance))
-    return edges.squared, float(len(edges.error) - trace)
+    return Evidence(edges.squared, float(len(edges.error) - trace))
 
 
 def _placed_evidence(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:

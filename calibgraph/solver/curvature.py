@@ -143,17 +143,25 @@ def pose_hessian(
     graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
 ) -> Array:
     """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
-    hessian = np.zeros((6 * len(cameras), 6 * len(cameras)))
+    return pose_equations(graph, cameras, T_camera_lidar)[0]
+
+
+def pose_equations(
+    graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """(6 N, 6 N) Gauss-Newton Hessian and (6 N,) gradient of the factors between poses."""
+    hessian, gradient = np.zeros((6 * len(cameras), 6 * len(cameras))), np.zeros(6 * len(cameras))
     if not graph.size():
-        return hessian
+        return hessian, gradient
     values = to_values(cameras, T_camera_lidar)
     keys = list(values.keys())
     for index in range(graph.size()):
         factor = graph.at(index).linearize(values)
-        A = factor.jacobian()[0]
+        A, right = factor.jacobian()
         rows = np.concatenate([6 * keys.index(key) + np.arange(6) for key in list(factor.keys())])
         hessian[np.ix_(rows, rows)] += A.T @ A
-    return hessian
+        gradient[rows] -= A.T @ right
+    return hessian, gradient
 
 
 def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array:

@@ -39,7 +39,7 @@ def number_by_place(metadata: Mapping[str, Any], frame: Numbers) -> Numbers:
         CorrespondenceError: if the metadata's ``same_place`` is not a list of lists of numbers.
     """
     numbers = frame
-    for place in _lists_of_frames(metadata, SAME_PLACE):
+    for place in lists_of_frames(metadata, SAME_PLACE):
         numbers = np.where(np.isin(frame, place), np.int64(place[0]), numbers)
     return numbers
 
@@ -60,7 +60,7 @@ def frames_of_one_place(metadata: Mapping[str, Any], frame: Numbers) -> float:
 
 def split_places(metadata: Mapping[str, Any], frame: Numbers) -> list[Numbers]:
     """The numbers of a camera's frames, place by place; arguments as of `frames_of_one_place`."""
-    lists = _lists_of_frames(metadata, PLACES)
+    lists = lists_of_frames(metadata, PLACES)
     place_of = {number: place for place, numbers in enumerate(lists) for number in numbers}
     place = np.array([place_of.get(number, len(lists)) for number in frame.tolist()], np.int64)
     order = np.argsort(place, kind="stable")
@@ -68,7 +68,12 @@ def split_places(metadata: Mapping[str, Any], frame: Numbers) -> list[Numbers]:
     return [part for part in np.split(frame[order], edges) if len(part)]
 
 
-def _lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:
+def lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:
+    """The lists under a key of a table's metadata; none if it is not there.
+
+    Raises:
+        CorrespondenceError: if they are not lists of frame numbers.
+    """
     places = metadata.get(key, [])
     good = isinstance(places, list) and all(
         isinstance(place, list) and place and all(type(number) is int for number in place)

@@ -13,12 +13,18 @@ from types import FrameType
 
 from calibgraph.errors import FileError
 from calibgraph.io.dataset import load_dataset
+from calibgraph.matching.places import PlaceFinder
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.report.as_json import print_line, require_stdout
-from calibgraph.tracking.dataset_frames import first_frames, frames_of_batch, matched_frames
+from calibgraph.tracking.dataset_frames import (
+    first_frames,
+    frames_of_batch,
+    matched_frames,
+    with_places,
+)
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.preload import warm_up_tracker
@@ -142,7 +148,8 @@ def _opened(
     later = matched_frames(
         replace(data, frames=tuple(rest)), matcher, config, lambda: calibrator.tracker.rig
     )
-    return chain(head, later), calibrator
+    finder = PlaceFinder(calibrator.tracker.initial_rig, seed=config.seed)
+    return with_places(chain(head, later), data, finder, calibrator.tracker.place), calibrator
 
 
 def _report_recovery(calibrator: DurableCalibrator, notify: Notify) -> DurableCalibrator:

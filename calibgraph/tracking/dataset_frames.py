@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset
+from calibgraph.matching.places import PlaceFinder
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
@@ -17,6 +18,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
+from calibgraph.tracking.frame_order import with_place
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 
 
@@ -58,6 +60,34 @@ def matched_frames(
             yield Refused(f"frame {frame.name} ({frame.index}): {error}")
         else:
             yield _stream_frame(frame.index, table)
+
+
+def with_places(
+    items: Iterable[Item], dataset: Dataset, finder: PlaceFinder, last_place: str
+) -> Iterator[Item]:
+    """The items with the place of each frame named, as by how far the vehicle drove.
+
+    Where the matcher's error has a part that frames of one place share.
+
+    Args:
+        items: frames, those of the dataset, in order.
+        dataset: all its frames.
+        finder: at the first estimate, which a restart also has.
+        last_place: of the last frame that was taken in; empty before the first. The frames from its
+            first one on are looked at again, so that a restart finds the same places.
+    """
+    frames = {frame.index: frame for frame in dataset.frames}
+    taken = int(last_place) if last_place.isdigit() else None
+    for item in items:
+        if isinstance(item, Refused) or not item.table.findings.place_variance:
+            yield item
+            continue
+        if taken is not None:
+            for number in (n for n in frames if taken <= n < item.frame):
+                finder.first_of_place(frames[number])
+            taken = None
+        first = finder.first_of_place(frames[item.frame])
+        yield replace(item, table=with_place(item.table, first))
 
 
 def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> Correspondences:

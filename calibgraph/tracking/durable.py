@@ -12,6 +12,7 @@ from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
+from calibgraph.tracking.frame_order import with_place
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator
@@ -73,7 +74,9 @@ class DurableCalibrator:
             raise
         self.resumed = self.tracker.frame is not None
 
-    def update(self, table: Correspondences, *, frame: int | None = None) -> Update:
+    def update(
+        self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
+    ) -> Update:
         """Take in one frame, see :meth:`IncrementalCalibrator.update`; it is on disk then.
 
         Raises:
@@ -81,6 +84,7 @@ class DurableCalibrator:
                 changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
+        table = with_place(table, place)
         record = _encode_input(table, frame, self.tracker.initial_rig)
         self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)

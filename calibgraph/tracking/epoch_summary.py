@@ -177,6 +177,12 @@ class EpochSummary:
         return summary
 
     @property
+    def selected(self) -> tuple[Array, Array, Array, float]:
+        """The sums of the selected walk: Hessian, gradient, scatter, frames."""
+        w = self.walk
+        return self.hessian[w], self.gradient[w], self.scatter[w], float(self.frames[w])
+
+    @property
     def best_walk(self) -> int:
         """The walk with the most evidence, the static one left out."""
         return 1 + int(np.argmax(self.evidence[1:]))

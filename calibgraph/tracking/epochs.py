@@ -9,12 +9,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, merge
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch
+from calibgraph.tracking.place_shift import shift_between
+from calibgraph.tracking.place_sums import PlacePart
 from calibgraph.tracking.posterior import true_hessian
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 
@@ -77,6 +79,7 @@ def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State
         drift = replace(
             drift, anchors=tuple(anchor.shift_reference(step) for anchor, step in anchors)
         )
+    places = state.places.shift_reference(steps)
     epochs = tuple(
         replace(
             epoch,
@@ -87,31 +90,56 @@ def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State
         )
         for epoch in state.epochs
     )
-    return replace(state, cameras=cameras, epochs=epochs, references=references, drift=drift)
+    return replace(
+        state,
+        cameras=cameras,
+        epochs=epochs,
+        references=references,
+        places=places,
+        drift=drift,
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _EpochSums:
-    """Sums of an epoch's matches, gated anew, about a camera's reference.
+class _PlaceInEpoch:
+    """Sums of a camera's matches in an epoch at one place, gated anew, about its reference.
 
     Attributes:
         hessian: (6, 6).
         gradient: (6,) at the reference.
-        scores: (f, 6) gradients at the estimate of all its frames; zero where there is none.
-        frames: how many have matches.
+        reweighted: (6, 6) Hessian by the matches' weights in the loss.
+        scores: (f, 6) gradients at the estimate, of all the epoch's frames; zero of others.
+        frames, matches: how many.
     """
 
     hessian: Array
     gradient: Array
+    reweighted: Array
     scores: Array
     frames: int
+    matches: int
+
+    @staticmethod
+    def empty(frames: int) -> _PlaceInEpoch:
+        """Of none of so many frames."""
+        zero = np.zeros((6, 6))
+        return _PlaceInEpoch(zero, np.zeros(6), zero, np.zeros((frames, 6)), 0, 0)
+
+    def __add__(self, other: _PlaceInEpoch) -> _PlaceInEpoch:
+        return _PlaceInEpoch(
+            self.hessian + other.hessian,
+            self.gradient + other.gradient,
+            self.reweighted + other.reweighted,
+            self.scores + other.scores,
+            self.frames + other.frames,
+            self.matches + other.matches,
+        )
 
 
-def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
+def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _PlaceInEpoch:
     numbers = np.array([frame.number for frame in epoch.frames])
-    scores = np.zeros((len(numbers), 6))
-    raw = [frame.raw[camera] for frame in epoch.frames if camera in frame.raw]
-    nothing = _EpochSums(np.zeros((6, 6)), np.zeros(6), scores, 0)
+    nothing = _PlaceInEpoch.empty(len(numbers))
+    raw = [f.raw[camera] for f in epoch.frames if camera in f.raw and f.place == place]
     if not raw:
         return nothing
     T_lidar_camera, scale = epoch.T_lidar_camera[camera], state.cameras[camera].scale
@@ -122,22 +150,33 @@ def _epoch_sums(state: State, epoch: Epoch, camera: int) -> _EpochSums:
         return nothing
     block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
-    gradients = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame))).gradient
-    scores[np.searchsorted(numbers, own)] = gradients
+    by_frame = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame)))
+    scores = np.zeros((len(numbers), 6))
+    scores[np.searchsorted(numbers, own)] = by_frame.gradient
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     to_reference = step_between(T_lidar_camera, state.references[camera])
-    gradient = gradients.sum(axis=0) + hessian @ to_reference
-    return _EpochSums(hessian, gradient, scores, len(own))
+    gradient = by_frame.gradient.sum(axis=0) + hessian @ to_reference
+    reweighted = by_frame.hessian.sum(axis=0)
+    return _PlaceInEpoch(hessian, gradient, reweighted, scores, len(own), len(inliers.frame))
 
 
 def _summarize_oldest(state: State) -> State:
     """The state with its oldest epoch added to the summaries."""
     epoch, *younger = state.epochs
-    sums = [_epoch_sums(state, epoch, camera) for camera in range(len(state.cameras))]
-    update_evidence = [_update_evidence(state, camera, s) for camera, s in enumerate(sums)]
+    names = tuple(dict.fromkeys(frame.place for frame in epoch.frames))
+    cameras = range(len(state.cameras))
+    at_places = [
+        [_sums_at_place(state, epoch, camera, name) for name in names] for camera in cameras
+    ]
+    sums = [sum(at, _PlaceInEpoch.empty(len(epoch.frames))) for at in at_places]
+    drifted = [one.summary.walk > 0 for one in state.cameras]
+    by_places = shift_between(state, (), epoch.frames)
+    update_evidence = [
+        _update_evidence(state, camera, s, by_places) for camera, s in enumerate(sums)
+    ]
     state = replace(state, cameras=tuple(update_evidence))
     state = _select_walks(state)
-    gains, cameras = [], []
+    gains, summarized = [], []
     for camera, (camera_state, s) in enumerate(zip(state.cameras, sums, strict=True)):
         summary = camera_state.summary
         if s.frames:
@@ -145,13 +184,51 @@ def _summarize_oldest(state: State) -> State:
         summary, gain = summary.propagate(
             state.walk_variance(len(epoch.frames)), state.overconfidence(camera)
         )
-        cameras.append(replace(camera_state, summary=summary))
+        summarized.append(replace(camera_state, summary=summary))
         gains.append(gain)
     scores = np.hstack([s.scores for s in sums])
     cross, gain = state.cross + _between_cameras(scores), block_diagonal(np.array(gains))
-    return replace(
-        state, cameras=tuple(cameras), cross=gain @ cross @ gain.T, epochs=tuple(younger)
+    state = replace(
+        state, cameras=tuple(summarized), cross=gain @ cross @ gain.T, epochs=tuple(younger)
     )
+    parts = [_to_part(name, [at[row] for at in at_places]) for row, name in enumerate(names)]
+    return _with_places(state, parts, drifted)
+
+
+def _to_part(name: str, cameras: Sequence[_PlaceInEpoch]) -> PlacePart:
+    """The sums of all cameras at one place."""
+    return PlacePart(
+        name,
+        hessian=np.array([one.hessian for one in cameras]),
+        gradient=np.array([one.gradient for one in cameras]),
+        reweighted=np.array([one.reweighted for one in cameras]),
+        score=np.array([one.scores.sum(axis=0) for one in cameras]),
+        scatter=np.array([one.scores.T @ one.scores for one in cameras]),
+        frames=np.array([one.frames for one in cameras], dtype=np.float64),
+        matches=np.array([one.matches for one in cameras], dtype=np.float64),
+    )
+
+
+def _with_places(state: State, parts: Sequence[PlacePart], drifted: Sequence[bool]) -> State:
+    """The state with an epoch's sums added to those of its places.
+
+    Of a camera that drifts there are only the sums that are discounted by its walk. When the drift
+    has ended, what these hold counts as of one place.
+
+    Args:
+        state: with the epoch summarized.
+        parts: sums of the epoch, per place.
+        drifted: per camera, whether it drifted before the epoch was summarized.
+    """
+    places = state.places.add(parts).bounded()
+    for camera, (one, before) in enumerate(zip(state.cameras, drifted, strict=True)):
+        if one.summary.walk:
+            places = places.without(camera)
+        elif before and parts:
+            places = places.with_camera_at(
+                parts[-1].name, camera, one.summary.selected, state.matches_of_frame(camera)
+            )
+    return replace(state, places=places)
 
 
 def _between_cameras(scores: Array) -> Array:
@@ -162,7 +239,9 @@ def _between_cameras(scores: Array) -> Array:
     return scatter
 
 
-def _update_evidence(state: State, camera: int, sums: _EpochSums) -> CameraState:
+def _update_evidence(
+    state: State, camera: int, sums: _PlaceInEpoch, by_places: Array
+) -> CameraState:
     """The camera with the evidence of its walks updated by how well they predict an epoch.
 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
@@ -173,7 +252,9 @@ def _update_evidence(state: State, camera: int, sums: _EpochSums) -> CameraState
         return camera_state
     score = sums.scores.sum(axis=0)
     groups = tuple(one.add(score, sums.frames, alone) for one in camera_state.groups)
-    summary = camera_state.summary.update_evidence(sums.hessian, sums.gradient, noise * sums.frames)
+    rows = pose_rows(camera)
+    noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
+    summary = camera_state.summary.update_evidence(sums.hessian, sums.gradient, noise)
     return replace(camera_state, summary=summary, groups=groups)
 
 

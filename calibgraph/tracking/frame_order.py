@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.solver.repeats import PLACES, lists_of_frames
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
-_FINDINGS_PER_FRAME = ("systematic_rotation_rad", "systematic_translation_m")
+LONGEST_PLACE = 200
+_FINDINGS_PER_FRAME = (
+    "systematic_rotation_rad", "systematic_translation_m", "camera_share",
+    "place_rotation_rad", "place_translation_m", "place_variance",
+)  # fmt: skip
+
+PLACE = "place"
+"""Key of a frame's metadata: the name of the place that it is of."""
 
 
 def number_and_stamp(
@@ -67,7 +76,59 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
         )
 
 
-def with_findings_per_frame(table: Correspondences) -> Correspondences:
-    """The table with only those findings of its matcher that hold for a single frame."""
-    kept = {k: float(table.metadata[k]) for k in _FINDINGS_PER_FRAME if k in table.metadata}
+def with_place(table: Correspondences, place: str | int | None) -> Correspondences:
+    """The table with the name of its place in the metadata, and without the lists of places.
+
+    Args:
+        table: the correspondences of one frame.
+        place: None: as by the metadata.
+
+    Raises:
+        CorrespondenceError: if it is no name, or the lists are wrong.
+    """
+    name = _place_of(table) if place is None else _place_name(place)
+    kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
+    kept |= {PLACE: name} if name else {}
     return table if kept == table.metadata else replace(table, metadata=kept)
+
+
+def with_metadata_per_frame(table: Correspondences) -> Correspondences:
+    """The table with only that metadata which holds for a single frame.
+
+    These are the findings of its matcher about shared errors, and the name of its place.
+
+    Args:
+        table: after :func:`with_place`.
+
+    Raises:
+        CorrespondenceError: if a finding is wrong.
+    """
+    findings = table.findings.to_metadata()
+    kept = {key: findings[key] for key in _FINDINGS_PER_FRAME if key in findings}
+    kept |= {key: table.metadata[key] for key in (PLACE,) if key in table.metadata}
+    return table if kept == table.metadata else replace(table, metadata=kept)
+
+
+def _place_of(table: Correspondences) -> str:
+    """The name of a frame's place: its own, or the first number of its list; empty if unknown."""
+    if PLACE in table.metadata:
+        return _place_name(table.metadata[PLACE])
+    if not len(table):
+        return ""
+    number = int(table.frame[0])
+    lists = lists_of_frames(table.metadata, PLACES)
+    return next((str(place[0]) for place in lists if number in place), "")
+
+
+def _place_name(place: object) -> str:
+    """A name as text."""
+    if isinstance(place, bool) or not isinstance(place, (str, int, np.integer)):
+        found = f"found {reprlib.repr(place)}"
+        raise CorrespondenceError(f"the place of a frame must be a name or a number, {found}")
+    name = str(place)
+    if len(name) > LONGEST_PLACE or "\0" in name:
+        raise CorrespondenceError(
+            f"the place of a frame must have at most {LONGEST_PLACE} characters, found "
+            f"{reprlib.repr(name)}"
+        )
+    return name

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from calibgraph.solver.camera_block import CameraBlock
 
 Array = NDArray[np.float64]
+
+_SUMS = ("hessian", "gradient", "reweighted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +26,8 @@ class LiveFrame:
         inliers: per camera, (m,) which of them are within the gate.
         hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
         gradient: (n, 6) at the cameras' references.
+        reweighted: (n, 6, 6) Hessian by the matches' weights in the loss, positive semidefinite.
+        place: name of the place that it is of; empty: not known.
     """
 
     number: int
@@ -30,37 +35,41 @@ class LiveFrame:
     inliers: dict[int, NDArray[np.bool_]]
     hessian: Array
     gradient: Array
+    reweighted: Array
+    place: str = ""
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
-        hessian, gradient = self.hessian.copy(), self.gradient.copy()
-        hessian[camera], gradient[camera] = 0.0, 0.0
+        sums = {name: getattr(self, name).copy() for name in _SUMS}
+        for values in sums.values():
+            values[camera] = 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
         inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
-        return LiveFrame(self.number, raw, inliers, hessian, gradient)
+        return replace(self, raw=raw, inliers=inliers, **sums)
 
     def add(
         self,
         camera: int,
         raw: CameraBlock,
         inliers: NDArray[np.bool_],
-        sums: tuple[Array, Array],
+        sums: Mapping[str, Array],
     ) -> LiveFrame:
-        """The frame with a camera's matches, and their (6, 6) Hessian and (6,) gradient."""
-        hessian, gradient = self.hessian.copy(), self.gradient.copy()
-        hessian[camera], gradient[camera] = sums
-        return LiveFrame(
-            self.number,
-            {**self.raw, camera: raw},
-            {**self.inliers, camera: inliers},
-            hessian,
-            gradient,
+        """The frame with a camera's matches, and their sums by the names of the attributes."""
+        own = {name: getattr(self, name).copy() for name in _SUMS}
+        for name, values in own.items():
+            values[camera] = sums[name]
+        return replace(
+            self,
+            raw={**self.raw, camera: raw},
+            inliers={**self.inliers, camera: inliers},
+            **own,
         )
 
     @staticmethod
-    def empty(number: int, cameras: int) -> LiveFrame:
+    def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
         """A frame without matches."""
-        return LiveFrame(number, {}, {}, np.zeros((cameras, 6, 6)), np.zeros((cameras, 6)))
+        zero, none = np.zeros((cameras, 6, 6)), np.zeros((cameras, 6))
+        return LiveFrame(number, {}, {}, zero, none, zero, place)
 
 
 @dataclass(frozen=True, eq=False)

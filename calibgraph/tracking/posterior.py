@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -21,13 +22,28 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 
 
+class Quadratic(NamedTuple):
+    """Half the cost of some matches of one camera, near its reference.
+
+    Attributes:
+        hessian: (6, 6) true one.
+        gradient: (6,) at the reference.
+        reweighted: (6, 6) Hessian of the matches by their weights in the loss: it is positive
+            semidefinite, of however few.
+    """
+
+    hessian: Array
+    gradient: Array
+    reweighted: Array
+
+
 def quadratic(
     residuals: BlockResiduals,
     inliers: NDArray[np.bool_],
     scale: ResidualScale,
     T_lidar_camera: gtsam.Pose3,
     reference: gtsam.Pose3,
-) -> tuple[Array, Array]:
+) -> Quadratic:
     """The quadratic approximation of one frame's cost for a camera.
 
     Args:
@@ -36,16 +52,12 @@ def quadratic(
         scale: of the residuals.
         T_lidar_camera: near the minimum.
         reference: T_lidar_camera at which the gradient is taken.
-
-    Returns:
-        (6, 6) true Hessian of half the cost there; (6,) gradient at the reference.
     """
     block = residuals.block.select(inliers).with_scale(scale)
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
-    gradient = block.sums(T_lidar_camera).gradient + hessian @ step_between(
-        T_lidar_camera, reference
-    )
-    return hessian, gradient
+    sums = block.sums(T_lidar_camera)
+    gradient = sums.gradient + hessian @ step_between(T_lidar_camera, reference)
+    return Quadratic(hessian, gradient, sums.hessian)
 
 
 def true_hessian(
@@ -154,7 +166,7 @@ def posterior(state: State, before: int | None = None) -> Posterior:
 
 def closed_posterior(state: State, before: int | None = None) -> Posterior:
     """The same without the frames of the open epoch."""
-    sums, steps = Posterior.from_summaries(state), _steps(state)
+    sums, steps = Posterior.from_summaries(state), steps_of(state)
     for epoch in state.epochs[:-1]:
         sums = sums.add(_until(epoch, before), steps).propagate(state, len(epoch.frames))
     return sums
@@ -165,7 +177,7 @@ def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
 
     As ``posterior(state, number of its first frame)``, each frame added once.
     """
-    sums, steps = Posterior.from_summaries(state), _steps(state)
+    sums, steps = Posterior.from_summaries(state), steps_of(state)
     for place, epoch in enumerate(state.epochs[:-1]):
         sums = sums.add(epoch.frames, steps).propagate(state, len(epoch.frames))
         before = sums
@@ -176,11 +188,11 @@ def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Posterior]]:
 
 def with_open_epoch(sums: Posterior, state: State, before: int | None = None) -> Posterior:
     """The sums over closed epochs with the frames of the open one added."""
-    return sums.add(_until(state.epochs[-1], before), _steps(state))
+    return sums.add(_until(state.epochs[-1], before), steps_of(state))
 
 
-def _steps(state: State) -> Array:
-    """(n, 6) from the references to the estimates."""
+def steps_of(state: State) -> Array:
+    """(n, 6) from the references to the tracker's own estimates."""
     return np.array([*map(step_between, state.references, state.T_lidar_camera)])
 
 

@@ -17,6 +17,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary, step_between
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import refine
+from calibgraph.tracking.place_shift import shift_since
 from calibgraph.tracking.posterior import Posterior, inverse, posterior, quadratic
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
@@ -168,6 +169,7 @@ def _restart_camera(
         state,
         epochs=epochs,
         cross=cross,
+        places=state.places.without(camera),
         references=replace_item(state.references, camera, T_lidar_camera),
         drift=_with_anchor_at(
             drift, camera, step_between(state.references[camera], T_lidar_camera)
@@ -219,9 +221,8 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
         inliers = residuals.inliers(camera_state.scale)
         if np.count_nonzero(inliers) >= MIN_MATCHES:
             reference = state.references[camera]
-            hessian[camera], gradient[camera] = quadratic(
-                residuals, inliers, camera_state.scale, T_lidar_camera, reference
-            )
+            sums = quadratic(residuals, inliers, camera_state.scale, T_lidar_camera, reference)
+            hessian[camera], gradient[camera] = sums.hessian, sums.gradient
             frames[camera] = len(parts)
     return Posterior(hessian, gradient, np.zeros((6 * n, 6 * n)), frames)
 
@@ -236,13 +237,15 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
             cameras.append(camera)
             steps.append(two - one)
             now[camera] = two
-    covariance = _covariance(state, before, after, cameras)
+    covariance = _covariance(state, before, after, cameras, detected.since)
     limits = np.array([alarm_limit(state.total_frames[c]) for c in cameras])
     references = tuple(state.references[c] for c in cameras)
     return Steps(tuple(cameras), np.ravel(steps), covariance, limits, references), now
 
 
-def _covariance(state: State, before: Posterior, after: Posterior, cameras: list[int]) -> Array:
+def _covariance(
+    state: State, before: Posterior, after: Posterior, cameras: list[int], since: int
+) -> Array:
     """(6 m, 6 m) covariance of the difference between the estimates before and after."""
     rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])
     one, two = (block_diagonal(inverse(sums.hessian[cameras])) for sums in (before, after))
@@ -258,4 +261,5 @@ def _covariance(state: State, before: Posterior, after: Posterior, cameras: list
     scatter, spread = (sums[np.ix_(rows, rows)] for sums in (before.scatter, noise))
     inflation = np.repeat([np.sqrt(state.inflation(camera)) for camera in cameras], 6)
     covariance = one @ scatter @ one + two @ spread @ two
-    return np.asarray(covariance * np.outer(inflation, inflation))
+    by_places = shift_since(state, since)[np.ix_(rows, rows)]
+    return np.asarray(covariance * np.outer(inflation, inflation) + by_places)

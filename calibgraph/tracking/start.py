@@ -124,7 +124,7 @@ def _absorb(
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
     sums = quadratic(residuals, inliers, scale, T_lidar_camera, state.references[camera])
-    return frame.add(camera, raw, inliers, sums)
+    return frame.add(camera, raw, inliers, sums._asdict())
 
 
 def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:

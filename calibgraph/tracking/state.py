@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
+from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -24,6 +26,7 @@ from calibgraph.tracking.noise import (
     no_groups,
     widening,
 )
+from calibgraph.tracking.place_sums import PlaceSums
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -115,7 +118,9 @@ class State:
         total_frames: (n,) and of frames.
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
-        systematic_sigmas: rotation [rad], translation [m]: of the error that all frames share.
+        places: sums of the older frames, place by place, of cameras that do not drift.
+        findings: of the errors that frames share, by their matcher.
+        sizes: of these, as the data show them, over what the matcher states.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -130,9 +135,11 @@ class State:
     total: Array
     total_hessian: Array
     total_frames: Array
+    places: PlaceSums
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
-    systematic_sigmas: tuple[float, float] = (0.0, 0.0)
+    findings: MatcherFindings = MatcherFindings()
+    sizes: Sizes = Sizes()
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
@@ -152,6 +159,7 @@ class State:
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
+            places=PlaceSums.empty(n),
         )
 
     @property
@@ -191,13 +199,12 @@ class State:
         """Ratio of the scatter of a camera's epochs to that of their frames, at least 1."""
         return inflation(self.cameras[index].groups)
 
-    def widen(self, scatter: Array) -> Array:
-        """(6 n, 6 n) scatter of all cameras' gradients, widened by the scatter of groups."""
-        parts = []
-        for index, camera in enumerate(self.cameras):
-            noise = self.scatter_of_frames(index)
-            parts.append(np.eye(6) if noise is None else widening(camera.groups, noise))
-        by = block_diagonal(np.array(parts))
+    def widen(self, index: int, scatter: Array) -> Array:
+        """(6, 6) scatter of a camera's gradients, widened by the scatter of groups."""
+        noise = self.scatter_of_frames(index)
+        if noise is None:
+            return scatter
+        by = widening(self.cameras[index].groups, noise)
         return np.asarray(by @ scatter @ by.T)
 
     def scatter_of_frames(self, index: int) -> Array | None:
@@ -207,6 +214,11 @@ class State:
             return None
         rows = pose_rows(index)
         return np.asarray(self.total[rows, rows] / (frames - 1))
+
+    def matches_of_frame(self, index: int) -> float:
+        """Mean number of a camera's matches that are used, of a frame."""
+        counts = self.cameras[index].counts
+        return counts.get("used", 0) / max(counts.get("absorbed", 0), 1)
 
     def overconfidence(self, index: int) -> float:
         """Mean ratio of a camera's Hessian to its information, at least 1."""

@@ -27,17 +27,21 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_file, write_bytes
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
+from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/3"
-"""Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies."""
+FORMAT = "calibgraph-tracker-state/4"
+"""Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies, 3 had
+no places."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
 _EARLIER_MARK = b"calibgraph-tracker/1\n"
@@ -46,8 +50,8 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
-                 ProjectionBlock)
+                 EpochSummary, PlaceSums, MatcherFindings, Sizes, ResidualHistogram,
+                 ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DECODING_ERRORS = (
     ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError, EOFError,

@@ -12,6 +12,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
+from calibgraph.tracking.place_shift import shift_since
 from calibgraph.tracking.posterior import Posterior, posteriors_before_epochs
 from calibgraph.tracking.state import CameraState, State
 
@@ -118,8 +119,9 @@ def detect_small_step(state: State) -> DetectedStep | None:
         if not state.epochs[place].frames:
             continue
         since, after = state.epochs[place].frames[0].number, afterwards[place]
+        by_places = shift_since(state, since)
         for camera, camera_state in enumerate(state.cameras):
-            excess = _shift_excess(state, camera, before, after)
+            excess = _shift_excess(state, camera, before, after, by_places)
             if camera_state.started and excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
@@ -155,7 +157,9 @@ def _sums_from_each_epoch(state: State) -> list[_Sums]:
     return found[::-1]
 
 
-def _shift_excess(state: State, camera: int, before: Posterior, after: _Sums) -> float:
+def _shift_excess(
+    state: State, camera: int, before: Posterior, after: _Sums, by_places: Array
+) -> float:
     """Excess of the contradiction between a camera's frames before and after, over the limit.
 
     A score test: undetermined directions do not count.
@@ -174,6 +178,6 @@ def _shift_excess(state: State, camera: int, before: Posterior, after: _Sums) ->
     scatter = before.scatter[rows, rows]
     covariance = (
         scatter * (after.frames[camera] / (frames - 1)) + uncertain @ scatter @ uncertain.T
-    ) * state.inflation(camera)
+    ) * state.inflation(camera) + hessian @ by_places[rows, rows] @ hessian
     score = after.gradient[camera] + hessian @ step
     return squared_sigmas(score, covariance) / alarm_limit(frames) - 1.0

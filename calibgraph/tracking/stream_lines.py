@@ -6,7 +6,8 @@ A line holds a frame::
                                       "x_m": [...], "y_m": [...], "z_m": [...]}}}
 
 Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``; ``point_index``.
-Optional beside ``frame``: ``stamp_ns`` and ``metadata``.
+Optional beside ``frame``: ``stamp_ns``; ``place``, where the vehicle is, a name or a number; and
+``metadata``.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
 from calibgraph.model.correspondences import Correspondences, as_confidence, concatenate
 from calibgraph.model.table_columns import COORDINATES, INFORMATION
+from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
 from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
 
 MAX_CAMERAS = 1000
@@ -54,6 +56,7 @@ def _is_shallow(value: object, levels: int) -> bool:
 
 
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+PlaceName = Annotated[str, Field(max_length=LONGEST_PLACE)] | Int64
 Metadata = Annotated[dict[str, Any], AfterValidator(_require_shallow)]
 
 
@@ -121,6 +124,7 @@ class FrameLine(BaseModel):
     frame: Int64
     stamp_ns: Int64 = 0
     cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
+    place: PlaceName | None = None
     metadata: Metadata = {}
 
     def to_frame(self) -> StreamFrame:
@@ -136,7 +140,7 @@ class FrameLine(BaseModel):
         if not any("point_index" in columns.given for columns in self.cameras.values()):
             tables = [replace(table, point_index=None) for table in tables]
         table = concatenate([_empty_table(self.metadata), *tables])
-        return StreamFrame(self.frame, stamp_ns, table)
+        return StreamFrame(self.frame, stamp_ns, with_place(table, self.place))
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:

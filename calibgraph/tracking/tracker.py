@@ -24,11 +24,17 @@ from calibgraph.tracking.absorption import (
     set_aside,
     with_open_frame,
 )
-from calibgraph.tracking.assessment import Assessment, assess, prior_hessians, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import number_and_stamp, with_findings_per_frame
+from calibgraph.tracking.frame_order import (
+    PLACE,
+    number_and_stamp,
+    with_metadata_per_frame,
+    with_place,
+)
 from calibgraph.tracking.halves import Halves
+from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
@@ -44,7 +50,7 @@ from calibgraph.tracking.state_bytes import (
     save_state_file,
 )
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
-from calibgraph.tracking.update import Update, current_rig, make_update
+from calibgraph.tracking.update import Update, make_update, rig_at
 from calibgraph.tracking.window import Window
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
@@ -67,7 +73,8 @@ class IncrementalCalibrator:
     _epoch_start: State
     _since_epoch_start: list[tuple[int, Correspondences]]
 
-    _rig_at: tuple[gtsam.Pose3, ...] | None = None
+    _rig_at: tuple[tuple[gtsam.Pose3, ...], Rig] | None = None
+    _assessed: tuple[State, Assessment] | None = None
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -75,10 +82,7 @@ class IncrementalCalibrator:
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        estimates = self._state.T_lidar_camera
-        if self._rig_at is not estimates:
-            self._rig_at, self._rig = estimates, current_rig(self._state)
-        return self._rig
+        return self._at(self._assess().T_lidar_camera)
 
     @property
     def initial_rig(self) -> Rig:
@@ -95,22 +99,34 @@ class IncrementalCalibrator:
         """Number of the last frame, None before the first."""
         return self._state.frame
 
+    @property
+    def place(self) -> str:
+        """Name of the place of the last frame; empty if it is not known."""
+        return self._state.live_frames[-1].place if self._state.live_frames else ""
+
     def calibration(self) -> Calibration:
         """The present estimate as a result of the same type as a batch solve's."""
         return to_calibration(self._state)
 
-    def update(self, table: Correspondences, *, frame: int | None = None) -> Update:
+    def update(
+        self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
+    ) -> Update:
         """Take in one frame: fit, gate, refit; then test whether something moved.
 
         Args:
             table: the correspondences of one frame, of all cameras that have some.
             frame: its number, which an empty table does not have.
+            place: where the vehicle is, by any name or number: frames of one place, within some 20
+                m, share errors, also after coming back. None: by the table's metadata (``place``,
+                or the list of ``places`` that has the frame); frames of which nothing is known are
+                all of one place.
 
         Raises:
             CorrespondenceError: if the table holds several frames, a camera that the rig does not
-                have, or a frame that does not come after the last one. Nothing has changed then.
+                have, a frame that does not come after the last one, or wrong metadata. Nothing has
+                changed then.
         """
-        table = with_findings_per_frame(table)
+        table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         blocks = self._blocks_by_camera(new := without_repeats(self._state, table))
         start, since = self._epoch_start, list(self._since_epoch_start)
@@ -132,15 +148,15 @@ class IncrementalCalibrator:
     def _begin_frame(self, number: int, stamp: int | None, table: Correspondences) -> None:
         self._since_epoch_start.append((number, table))
         state = self._state
-        sigmas = table.findings.systematic_sigmas if len(table) else state.systematic_sigmas
+        place = table.metadata.get(PLACE, "")
         state = replace(
             state,
             frame=number,
             stamp_ns=state.stamp_ns if stamp is None else stamp,
             updates=state.updates + 1,
-            systematic_sigmas=sigmas,
+            findings=table.findings if len(table) else state.findings,
         )
-        self._state = with_open_frame(state, LiveFrame.empty(number, len(state.names)))
+        self._state = with_open_frame(state, LiveFrame.empty(number, len(state.names), place))
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
@@ -153,10 +169,20 @@ class IncrementalCalibrator:
         return make_update(self._state, self.rig, self._assess(), tuple(events), used)
 
     def _assess(self) -> Assessment:
-        """Assess the estimates: the sums over closed epochs are at hand."""
+        """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
-        sums, halves = with_open_epoch(self._closed, state), self._closed_halves
-        return assess(state, sums, halves.add(state.epochs[-1].frames), self._priors)
+        if self._assessed is None or self._assessed[0] is not state:
+            sums, halves = with_open_epoch(self._closed, state), self._closed_halves
+            halves = halves.add(state.epochs[-1].frames)
+            found = assess(state, sums, halves, self._closed_places, self._priors)
+            self._assessed = state, found
+        return self._assessed[1]
+
+    def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
+        """The rig with these estimates; the last one is kept."""
+        if self._rig_at is None or self._rig_at[0] is not estimates:
+            self._rig_at = estimates, rig_at(self._state, estimates)
+        return self._rig_at[1]
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
@@ -203,8 +229,9 @@ class IncrementalCalibrator:
     def _rebuild(self) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
         self._window = Window(self._state)
-        self._priors = prior_hessians(self._state)
         self._copy_estimates()
+        self._priors = Priors.of(self._state)
+        self._closed_places = ClosedPlaces.of(self._state)
         self._closed = closed_posterior(self._state)
         self._closed_halves = Halves.of_closed_epochs(self._state)
 
@@ -212,7 +239,7 @@ class IncrementalCalibrator:
         """The preprocessed matches of each camera that has enough."""
         if not len(table):
             return {}
-        kept = preprocess(self.rig, table, self._state.config)
+        kept = preprocess(self._at(self._state.T_lidar_camera), table, self._state.config)
         blocks = camera_blocks(self._state.rig, kept.table, self._state.config)
         return {self._state.names.index(name): block for name, block in blocks.items()}
 
@@ -245,7 +272,7 @@ class IncrementalCalibrator:
             residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
             reference = self._state.references[camera]
             sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, agreeing[camera], rows, sums)
+            open_frame = open_frame.add(camera, agreeing[camera], rows, sums._asdict())
             self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
         self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
         return used
@@ -296,5 +323,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(self._state)
+        self._resume(with_sizes(self._state))
         return events

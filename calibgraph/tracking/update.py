@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,7 +80,7 @@ def make_update(
     )
 
 
-def current_rig(state: State) -> Rig:
-    """The rig with the present estimates."""
-    estimates = zip(state.names, state.T_lidar_camera, strict=True)
+def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
+    """The rig with these estimates."""
+    estimates = zip(state.names, T_lidar_camera, strict=True)
     return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})

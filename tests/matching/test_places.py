@@ -10,8 +10,9 @@ import pytest
 
 import calibgraph
 from calibgraph import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.matching import places
-from calibgraph.matching.places import Motion, find_places, motions
+from calibgraph.matching.places import Motion, PlaceFinder, find_places, motions
 from tests.conftest import SAMPLE
 
 
@@ -64,6 +65,36 @@ def test_a_frame_without_the_cameras_image_has_no_motion() -> None:
     blind = replace(data.frames[1], image_paths={})
     both = replace(data, frames=(data.frames[0], blind))
     assert motions(both, name, data.rig.cameras[name]) == [None]
+
+
+def test_frame_by_frame_the_places_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first camera's motion if there is one, else the next camera's."""
+    data, name = sample()
+    steps = [driving(15.0), None, None, driving(15.0), driving(1.0)]
+    asked: list[tuple[int, int]] = []
+
+    def motion(both: tuple[tuple[Frame, object], ...], **_: object) -> Motion:
+        (before, _), (now, _) = both
+        asked.append((before.index, now.index))
+        return steps[before.index]
+
+    monkeypatch.setattr(places, "_motion", motion)
+    monkeypatch.setattr(places, "_detect", lambda *_: None)
+    finder = PlaceFinder(data.rig)
+    found = [finder.first_of_place(frame) for frame in data.frames[:6]]
+    monkeypatch.setattr(places, "motions", lambda *_, **__: steps)
+    expected = find_places(replace(data, frames=data.frames[:6]), name, data.rig.cameras[name])
+    assert found == [place[0] for place in expected for _ in place] == [0, 0, 0, 0, 4, 4]
+    cameras = len(data.rig.cameras)
+    assert asked.count((0, 1)) == 1 and asked.count((1, 2)) == cameras
+
+
+def test_a_frame_that_cannot_be_read_is_of_the_place_before() -> None:
+    data, _ = sample()
+    gone = {name: Path("gone.png") for name in data.frames[1].image_paths}
+    finder = PlaceFinder(data.rig)
+    frames = (data.frames[0], replace(data.frames[1], image_paths=gone))
+    assert [finder.first_of_place(frame) for frame in frames] == [frames[0].index] * 2
 
 
 @pytest.mark.realdata

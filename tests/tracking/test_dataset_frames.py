@@ -19,8 +19,11 @@ from calibgraph import (
     concatenate,
 )
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.frame import Frame
 from calibgraph.tracking import command
 from calibgraph.tracking.command import Tracking, track
+from calibgraph.tracking.dataset_frames import with_places
+from calibgraph.tracking.streams import StreamFrame
 from tests.tracking.drives import (
     FRAMES,
     Crashed,
@@ -104,3 +107,34 @@ def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
     first, _ = lines(tmp_path / "crashed", at)
     second, _ = lines(tmp_path / "crashed", None)
     assert first + second == whole
+
+
+class Odometer:
+    """Finds a new place every four frames; notes what it is shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[int] = []
+
+    def first_of_place(self, frame: Frame) -> int:
+        self.shown.append(frame.index)
+        return frame.index // 4 * 4
+
+
+@pytest.mark.parametrize(("last_place", "start"), [("", 0), ("4", 7)])
+def test_frames_of_a_dataset_have_their_places(
+    last_place: str, start: int, world: World, recorded: Dataset
+) -> None:
+    """A restart looks again at the frames of the place where it stopped."""
+    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
+    items = [StreamFrame(n, None, stated[n]) for n in range(start, FRAMES)]
+    finder = Odometer()
+    found = list(with_places(items, recorded, finder, last_place))  # type: ignore[arg-type]
+    names = [item.table.metadata["place"] for item in found if isinstance(item, StreamFrame)]
+    assert names == [str(n // 4 * 4) for n in range(start, FRAMES)]
+    assert finder.shown == list(range(int(last_place or 0), FRAMES))
+
+
+def test_without_an_error_of_places_no_image_is_looked_at(world: World, recorded: Dataset) -> None:
+    finder, items = Odometer(), [StreamFrame(0, None, world.tables[0])]
+    assert list(with_places(items, recorded, finder, "")) == items  # type: ignore[arg-type]
+    assert not finder.shown

@@ -85,9 +85,7 @@ def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
         assert expected is not None and found is not None
         sigmas = np.sqrt(np.diag(expected))
         apart.append(difference(last.T_camera_lidar[name], batch.T_camera_lidar[name]) / sigmas)
-        # The shrunk scatter of 100 frames: (10 / 110) of the difference from the usual one.
-        # The batch takes what is stated to be exact for exact to 1e-5 rad and m, three times over.
-        np.testing.assert_allclose(np.diag(found) + 3e-10, np.diag(expected), rtol=0.1)
+        np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
         assert last.verdicts[name].status == "PASS"
     assert np.sqrt(np.mean(np.square(apart))) < 0.1
     assert not events_of(updates)

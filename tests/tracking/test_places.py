@@ -1,0 +1,302 @@
+"""While driving, the error model of a batch: what frames of one place, and all, have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from benchmarks.accuracy.place_draws import draw_places
+from benchmarks.accuracy.tracked_places import tracked
+from benchmarks.accuracy.uncertainty import Drawn, tied
+from calibgraph import Config, CorrespondenceError, Correspondences, Update
+from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.solver.joint import solve_joint
+from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
+from calibgraph.tracking.frame_order import PLACE, with_place
+from calibgraph.tracking.place_errors import (
+    FrameSpread,
+    PlaceTerms,
+    SharedErrors,
+    shift_covariance,
+)
+from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.stream_lines import frames_of_lines
+from calibgraph.tracking.streams import Refused, StreamFrame
+from calibgraph.trust.evidence import Evidence
+from tests.conftest import stereo_relative_pose
+from tests.tracking.drives import drive, pair_of
+from tests.tracking.test_place_sums import part
+
+Array = np.ndarray
+
+STATED = {
+    "systematic_rotation_rad": 0.0015,
+    "systematic_translation_m": 0.02,
+    "camera_share": 0.6,
+    "place_rotation_rad": 0.0007,
+    "place_translation_m": 0.006,
+    "place_variance": 8.0,
+}
+
+
+def batch_of(drawn: Drawn) -> tuple[dict[str, Array], Array]:
+    solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False))
+    joint = Evidence(solved, guess=drawn.rig).joint_covariance
+    assert joint is not None
+    return solved.T_camera_lidar, joint
+
+
+def sigmas_of_pair(T: dict[str, Array], joint: Array) -> Array:
+    left, right = T.values()
+    return np.sqrt(np.diag(relative_covariance(joint, 0, 1, relative_transform(right, left))))
+
+
+def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
+    rng = np.random.default_rng(places)
+    drawn = draw_places(places, 100, rng, frames=frames, rounds=rounds)
+    return tied(drawn, rng, deg=0.02, cm=0.3) if tie else drawn
+
+
+@pytest.mark.parametrize("tie", [False, True])
+@pytest.mark.parametrize(
+    ("places", "frames", "rounds"), [(1, 20, 1), (2, 10, 1), (6, 5, 1), (3, 5, 2)]
+)
+def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, tie: bool) -> None:
+    """Within 0.1 sigma root mean square, and 8 % in the sigmas, of cameras and of the pair.
+
+    A place is a quadratic here; and a batch weighs places that are off by a loss, which takes the
+    size of the cameras' errors at places for smaller (by half, of 6 places), and with it the part
+    of the variance that is not of all places alike: a sixth.
+    """
+    drawn = drawn_of(places, frames, rounds, tie=tie)
+    T, joint = batch_of(drawn)
+    result, _ = tracked(drawn)
+    found = result.joint_covariance
+    assert found is not None
+    apart = [twist_between(result.T_camera_lidar[name], T[name]) for name in T]
+    sigmas = np.sqrt(np.diag(joint))
+    assert np.sqrt(np.mean(np.square(np.concatenate(apart) / sigmas))) < 0.1
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), sigmas, rtol=0.08)
+    np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.08)
+
+
+def states(table: Correspondences, **more: object) -> Correspondences:
+    return replace(table, metadata={**table.metadata, **STATED, **more})
+
+
+def last_of(tables: list[Correspondences], places: list[str | None]) -> Update:
+    tracker = IncrementalCalibrator(pair_of())
+    for table, place in zip(tables, places, strict=True):
+        update = tracker.update(table, place=place)
+    return update
+
+
+def sigma_of(update: Update) -> float:
+    covariance = update.covariance["left"]
+    assert covariance is not None
+    return float(np.sqrt(np.trace(covariance[:3, :3])))
+
+
+def test_a_vehicle_that_stands_learns_less_than_one_that_drives_or_circles() -> None:
+    """And not knowing where it is is as standing. Without sizes that all frames share."""
+    alone = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
+    tables = [states(table, **alone) for table in drive(pair_of(), 40)]
+    unknown = sigma_of(last_of(tables, [None] * 40))
+    standing = sigma_of(last_of(tables, ["here"] * 40))
+    circling = sigma_of(last_of(tables, [f"corner {frame // 5 % 4}" for frame in range(40)]))
+    driving = sigma_of(last_of(tables, [str(frame // 5) for frame in range(40)]))
+    assert unknown == standing
+    assert driving < 0.9 * circling < 0.9 * 0.8 * standing
+
+
+def test_standing_for_long_moves_the_estimate_no_more_than_passing() -> None:
+    """Two places, whose clouds are displaced apart, one with ten times the frames of the other.
+
+    By frames the estimate would be at 1 / 11 of the way. Both places have the same error, but for
+    that of frames themselves, of which there are few at the second one: so it is before the middle.
+    """
+    rig = pair_of()
+    by = gtsam.Pose3.Expmap(np.array([0, 0, 0.0014, 0, 0, 0])).matrix()
+    away = rig.moved_to({name: T @ by for name, T in rig.T_camera_lidar.items()})
+    tables = [states(table) for table in drive(rig, 50)]
+    tables += [states(replace(table, frame=table.frame + 50)) for table in drive(away, 5, seed=2)]
+    update = last_of(tables, ["here"] * 50 + ["there"] * 5)
+    turned = twist_between(update.T_camera_lidar["left"], rig.T_camera_lidar["left"])
+    whole = twist_between(away.T_camera_lidar["left"], rig.T_camera_lidar["left"])
+    assert 0.25 < turned[:3] @ whole[:3] / (whole[:3] @ whole[:3]) < 0.5
+
+
+def test_relative_poses_share_the_error_of_the_cloud() -> None:
+    """Of 0.0015 rad, 60 % of the variance is the cameras' own: twice that is left of the pair."""
+    tables = [states(table) for table in drive(pair_of(), 40)]
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(tables):
+        tracker.update(table, place=frame // 2)
+    result = tracker.calibration()
+    assert result.joint_covariance is not None
+    variance = np.square(sigmas_of_pair(result.T_camera_lidar, result.joint_covariance)[:3])
+    expected = 2 * 0.6 * STATED["systematic_rotation_rad"] ** 2
+    assert (variance > expected).all() and (variance < 1.5 * expected).all()
+
+
+def test_a_relative_pose_that_contradicts_takes_no_part() -> None:
+    """0.05 rad off, with a sigma of 0.002, of a pair that the matches know to 0.002."""
+    rig = pair_of()
+    right = stereo_relative_pose(rig).model_copy(update={"rotation_sigma_rad": 0.002})
+    turned = gtsam.Pose3.Expmap(np.array([0.0, 0.05, 0, 0, 0, 0])).matrix()
+    wrong = right.model_copy(update={"T_a_b": right.T_a_b @ turned})
+    tables, results = [states(table) for table in drive(rig, 20)], {}
+    for name, pairs in (("none", ()), ("right", (right,)), ("wrong", (wrong,))):
+        tracker = IncrementalCalibrator(rig.model_copy(update={"relative_poses": pairs}))
+        for table in tables:
+            tracker.update(table)
+        results[name] = tracker.calibration()
+    assert [results[name].verdict.status for name in results] == ["PASS", "PASS", "FAIL"]
+    T, off = results["none"].T_camera_lidar, results["wrong"].T_camera_lidar
+    for name in T:  # the own estimate, from which all is a quadratic, is moved a little
+        assert np.abs(twist_between(off[name], T[name])).max() < 1e-3
+    joints = [result.joint_covariance for result in results.values()]
+    without, with_right, with_wrong = (
+        np.diag(joint)[:3].sum() for joint in joints if joint is not None
+    )
+    assert with_right < 0.9 * without < 0.9 * 1.05 * with_wrong
+
+
+# The closed form
+
+
+def test_the_closed_form_is_the_covariance_of_what_places_show() -> None:
+    """One place: V + A D A^T per camera, between cameras A D A^T, all with C and K on top."""
+    rig = pair_of()
+    poses = [gtsam.Pose3(np.linalg.inv(T)) for T in rig.T_camera_lidar.values()]
+    tracker = IncrementalCalibrator(rig)
+    tracker.update(states(drive(rig, 1)[0]))
+    errors = SharedErrors.of(tracker._state.findings, poses, tracker._state.sizes)
+    sums = PlaceSums.empty(2).add([replace(part("a", 0), gradient=np.zeros((2, 6)))])
+    spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
+    seen = FrameSpread(np.tile(np.eye(6), (2, 1, 1)), spread)
+    terms = PlaceTerms.of(sums, np.array([False, True]), seen, errors)
+    found = np.linalg.inv(terms.information.matrix[0])
+    flat = errors.to_cameras.reshape(12, 6)
+    expected = flat @ errors.cloud_at_place @ flat.T
+    for camera in range(2):
+        rows = slice(6 * camera, 6 * camera + 6)
+        own = np.linalg.inv(sums.reweighted[1, camera] + np.diag([1.0] * 3 + [0.01] * 3))
+        expected[rows, rows] += (spread[camera, 0, 0] + 8.0 * 3) * own
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)
+    whole = terms.information.sum(np.array([True])).of_cameras(errors)
+    everywhere = np.kron(np.eye(2), errors.camera) + flat @ errors.cloud @ flat.T
+    np.testing.assert_allclose(
+        np.linalg.inv(whole.matrix), expected + everywhere, rtol=1e-5, atol=1e-9
+    )
+
+
+def test_places_on_both_sides_of_a_time_cancel() -> None:
+    rig = pair_of()
+    poses = [gtsam.Pose3(np.linalg.inv(T)) for T in rig.T_camera_lidar.values()]
+    tracker = IncrementalCalibrator(rig)
+    tracker.update(states(drive(rig, 1)[0]))
+    errors = SharedErrors.of(tracker._state.findings, poses, tracker._state.sizes)
+    frame = np.tile(100.0 * np.eye(6), (2, 1, 1))
+    of = partial(shift_covariance, frame_hessian=frame, errors=errors)
+    here, there = np.array([[10.0, 10], [0, 0]]), np.array([[0.0, 0], [5, 5]])
+    np.testing.assert_allclose(of(here, 3 * here), 0.0, atol=1e-12)
+    apart, half = of(here, there), of(here + 2 * there, there)
+    assert (np.diag(apart) > 0).all()
+    np.testing.assert_allclose(half, apart / 4, rtol=1e-9)
+
+
+# Where the place of a frame comes from
+
+
+def place_after(table: Correspondences, place: str | int | None = None) -> str:
+    tracker = IncrementalCalibrator(pair_of())
+    tracker.update(table, place=place)
+    return tracker.place
+
+
+def test_the_callers_place_counts_before_that_of_the_table() -> None:
+    table = drive(pair_of(), 1)[0]
+    listed = replace(table, metadata={"places": [[7, 8], [3, 0]]})
+    named = replace(table, metadata={"places": [[7, 8], [3, 0]], PLACE: "yard"})
+    assert place_after(table) == ""
+    assert place_after(listed) == "3"
+    assert place_after(named) == "yard"
+    assert place_after(named, 12) == "12"
+    assert place_after(table, "gate") == "gate"
+
+
+@pytest.mark.parametrize(("place", "name"), [('"gate 4"', "gate 4"), ("-7", "-7"), ("null", "")])
+def test_a_line_names_its_place(place: str, name: str) -> None:
+    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
+    (item,) = frames_of_lines([line.encode()], "lines")
+    assert isinstance(item, StreamFrame)
+    assert item.table.metadata.get(PLACE, "") == name
+
+
+@pytest.mark.parametrize("place", ["1.5", "true", "[]", '"' + "x" * 201 + '"'])
+def test_a_line_with_another_place_is_left_out(place: str) -> None:
+    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
+    (item,) = frames_of_lines([line.encode()], "lines")
+    assert isinstance(item, Refused) and "place" in item.message
+
+
+@pytest.mark.parametrize("place", [True, 1.5, "x" * 201, "a\0b"])
+def test_a_place_that_is_no_name_is_refused_and_changes_nothing(place: object) -> None:
+    tracker, table = IncrementalCalibrator(pair_of()), drive(pair_of(), 1)[0]
+    before = tracker.to_bytes()
+    with pytest.raises(CorrespondenceError, match="the place of a frame must"):
+        tracker.update(table, place=place)  # type: ignore[arg-type]
+    with pytest.raises(CorrespondenceError, match="the place of a frame must"):
+        tracker.update(replace(table, metadata={PLACE: place}))
+    assert tracker.to_bytes() == before
+
+
+def test_the_journal_keeps_the_name_of_the_place_and_no_lists() -> None:
+    table = drive(pair_of(), 1)[0]
+    listed = replace(table, metadata={"places": [[0, 3]], "of": "someone"})
+    assert with_place(listed, None).metadata == {PLACE: "0", "of": "someone"}
+
+
+def test_places_are_there_after_a_restart(tmp_path: Path) -> None:
+    tables = [states(table) for table in drive(pair_of(), 24)]
+    folder = tmp_path / "state"
+    whole = IncrementalCalibrator(pair_of())
+    with DurableCalibrator(folder, pair_of()) as calibrator:
+        for frame, table in enumerate(tables[:17]):
+            calibrator.update(table, place=frame // 4 % 3)
+    with DurableCalibrator(folder, pair_of()) as calibrator:
+        assert calibrator.tracker.place == "1"
+        for frame, table in enumerate(tables):
+            expected = whole.update(table, place=frame // 4 % 3)
+            if frame >= 17:
+                found = calibrator.update(table, place=frame // 4 % 3)
+    for name, T in expected.T_camera_lidar.items():
+        np.testing.assert_array_equal(found.T_camera_lidar[name], T)
+        np.testing.assert_array_equal(found.covariance[name], expected.covariance[name])
+
+
+def test_a_new_place_is_no_move() -> None:
+    """The cloud turned by 0.1 deg, two sigmas of a place, after 80 frames of another place."""
+    rig = pair_of()
+    by = gtsam.Pose3.Expmap(np.array([0, 0, 0.0018, 0, 0, 0])).matrix()
+    away = rig.moved_to({name: T @ by for name, T in rig.T_camera_lidar.items()})
+    tables = [states(table) for table in drive(rig, 80, matches=300)]
+    tables += [
+        states(replace(table, frame=table.frame + 80))
+        for table in drive(away, 60, matches=300, seed=2)
+    ]
+
+    def events(places: list[str]) -> list[str]:
+        tracker, found = IncrementalCalibrator(rig), []
+        for table, place in zip(tables, places, strict=True):
+            found += [event.kind for event in tracker.update(table, place=place).events]
+        return [kind for kind in found if kind != "started"]
+
+    assert events(["here"] * 140) == ["moved"]
+    assert not events(["here"] * 80 + ["there"] * 60)
