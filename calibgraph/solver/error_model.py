@@ -44,7 +44,7 @@ Numbers = NDArray[np.int64]
 
 _LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
-_WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
+WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
 _ROUNDS = 3  # of fitting and sizing
@@ -242,7 +242,7 @@ def error_model(
         blocks[name] = placed.with_variance(within.least)
         if any(findings.bend_sigmas):
             pose = to_T_lidar_camera(T_camera_lidar[name])
-            shifts = bend_shifts(block, scales[name], pose, _WEAK)
+            shifts = bend_shifts(block, scales[name], pose, WEAK)
             bends[cameras.index(name)] = shifts * findings.bend_sigmas
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
@@ -317,9 +317,9 @@ def _within_place(
 ) -> WithinPlace:
     block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
     hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
-    root = np.linalg.cholesky(hessians.sum(axis=0) + _WEAK)
+    root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
     robust = robust_hessian(block.with_scale(scale), pose)
-    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + _WEAK
+    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + WEAK
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     inverse = np.linalg.inv(true)
     covariance = root.T @ inverse @ scatter @ inverse @ root
@@ -329,7 +329,7 @@ def _within_place(
         least=least,
         excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
         efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
-        roots=np.asarray(np.linalg.cholesky(hessians + _WEAK)),
+        roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
         frames=placed.frames,
     )
 

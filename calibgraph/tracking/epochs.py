@@ -48,7 +48,19 @@ def close_epoch(
     )
     state = replace(state, cameras=cameras)
     epochs = tuple(_regate(state, epoch) for epoch in state.epochs)
+    state = _with_bends(state, epochs[-1])
     return report_drift(replace(state, epochs=(*epochs, Epoch((), state.T_lidar_camera))))
+
+
+def _with_bends(state: State, epoch: Epoch) -> State:
+    """The state that has learnt from an epoch how matches follow bends of the cloud."""
+    if not any(state.findings.bend_sigmas):
+        return state
+    bends = state.bends
+    for camera, one in enumerate(state.cameras):
+        parts = [frame.raw[camera] for frame in epoch.frames if camera in frame.raw]
+        bends = bends.add(camera, parts, one.scale, epoch.T_lidar_camera[camera])
+    return replace(state, bends=bends)
 
 
 def _regate(state: State, epoch: Epoch) -> Epoch:

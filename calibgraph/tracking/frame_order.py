@@ -16,6 +16,7 @@ _LAST = 2**63 - 1  # other programs write it for "none"
 LONGEST_PLACE = 200
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
+    "elevation_rad", "elevation_stretch", "scan_motion_m",
     "place_rotation_rad", "place_translation_m", "place_variance",
 )  # fmt: skip
 

@@ -114,7 +114,7 @@ class ClosedPlaces:
         for camera, one in enumerate(state.cameras):
             if one.summary.walk:
                 sums = sums.without(camera)
-        errors = SharedErrors.of(state.findings, state.references, state.sizes)
+        errors = SharedErrors.of(state.findings, state.references, state.sizes, state.bends.mean)
         every = np.ones(len(sums.names), dtype=np.bool_)
         seen = _spreads(state, sums, errors)
         terms = PlaceTerms.of(sums, every, seen, errors)

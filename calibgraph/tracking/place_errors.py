@@ -8,7 +8,8 @@ the gradient. What it shows of the pose is -H^-1 b, with the covariance
 
 All cameras of a place are tied by the cloud's displacement there (covariance D, by the adjoints A):
 V + A D A^T. The information of places adds to that of the poses as matches show them everywhere;
-these differ from the poses by C per camera, and by the cloud's displacement everywhere (K).
+these differ from the poses by C per camera, by the bends of the cloud, and by its displacement
+everywhere (K).
 """
 
 from __future__ import annotations
@@ -24,16 +25,14 @@ from numpy.typing import NDArray
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import adjoint_camera_lidar
 from calibgraph.solver.component_sizes import Sizes
+from calibgraph.solver.error_model import WEAK
 from calibgraph.tracking.place_sums import PlaceSums
-from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
 _LEAST_SIGMA = 1e-5  # rad and m, as of the batch
 _EXACT = 100.0 * _LEAST_SIGMA**2  # what is stated to be so, of any size
 _LEAST_VARIANCE = 0.1  # of independent matches
-WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
-"""Information of a pose within sight, so that few matches have an inverse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,7 @@ class SharedErrors:
     Attributes:
         cloud: (6, 6) K, in the LiDAR frame.
         camera: (6, 6) C, in the camera's axes.
+        bends: (n, 6, 3) how each camera's matches follow a standard deviation of each bend.
         cloud_at_place: (6, 6) D, in the LiDAR frame.
         place_variance: q.
         cameras_size: by which what a camera's frames share at a place is larger than usual.
@@ -51,6 +51,7 @@ class SharedErrors:
 
     cloud: Array
     camera: Array
+    bends: Array
     cloud_at_place: Array
     place_variance: float
     cameras_size: float
@@ -58,14 +59,21 @@ class SharedErrors:
 
     @staticmethod
     def of(
-        findings: MatcherFindings, T_lidar_camera: Sequence[gtsam.Pose3], sizes: Sizes
+        findings: MatcherFindings,
+        T_lidar_camera: Sequence[gtsam.Pose3],
+        sizes: Sizes,
+        bend_shifts: Array,
     ) -> SharedErrors:
-        """What a matcher states, times the sizes that the data show, about these poses."""
-        whole = np.square(findings.systematic_sigmas)
+        """What a matcher states, times the sizes that the data show, about these poses.
+
+        ``bend_shifts``: (n, 6, 3), see :class:`calibgraph.tracking.bends.BendShifts`.
+        """
+        whole = np.square(findings.rigid_sigmas)
         at_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
         return SharedErrors(
             cloud=sizes.shared * _covariance((1.0 - findings.camera_share) * whole),
             camera=sizes.shared * _covariance(findings.camera_share * whole),
+            bends=sizes.shared**0.5 * bend_shifts * findings.bend_sigmas,
             cloud_at_place=sizes.cloud * _covariance(at_place),
             place_variance=findings.place_variance,
             cameras_size=sizes.cameras,
@@ -73,10 +81,16 @@ class SharedErrors:
         )
 
     @cached_property
+    def cameras(self) -> Array:
+        """(6 n, 6 n) of the cameras as matches show them everywhere: C, and the bends."""
+        flat, n = self.bends.reshape(-1, self.bends.shape[2]), len(self.bends)
+        return np.asarray(np.kron(np.eye(n), self.camera) + flat @ flat.T)
+
+    @cached_property
     def everywhere(self) -> Array:
-        """(6 n, 6 n) of what all frames share, in the cameras' axes: C and K."""
-        flat, n = self.to_cameras.reshape(-1, 6), len(self.to_cameras)
-        return np.asarray(np.kron(np.eye(n), self.camera) + flat @ self.cloud @ flat.T)
+        """(6 n, 6 n) of what all frames share, in the cameras' axes: C, the bends, and K."""
+        flat = self.to_cameras.reshape(-1, 6)
+        return np.asarray(self.cameras + flat @ self.cloud @ flat.T)
 
     @property
     def are_at_places(self) -> bool:

@@ -35,7 +35,7 @@ def shift_between(state: State, before: Iterable[LiveFrame], after: Iterable[Liv
         after: of the second.
     """
     n = len(state.cameras)
-    errors = SharedErrors.of(state.findings, state.references, state.sizes)
+    errors = SharedErrors.of(state.findings, state.references, state.sizes, state.bends.mean)
     if not errors.are_at_places:
         return np.zeros((6 * n, 6 * n))
     first, second = _counts(before, n), _counts(after, n)

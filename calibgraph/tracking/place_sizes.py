@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.solver.component_sizes import Evidence, Sizes, sizes_by_evidence
-from calibgraph.tracking.place_errors import WEAK, Information, PlaceTerms, SharedErrors
+from calibgraph.solver.error_model import WEAK
+from calibgraph.tracking.place_errors import Information, PlaceTerms, SharedErrors
 from calibgraph.tracking.place_sums import PlaceSums
 
 Array = NDArray[np.float64]
@@ -53,12 +54,12 @@ def _shared_poses(
 ) -> tuple[Array, Array]:
     """The step and covariance of x, m (6 n each) and o: see ``calibgraph.solver.hierarchy``."""
     n = len(errors.to_cameras)
-    flat, eye = errors.to_cameras.reshape(6 * n, 6), np.eye(n)
-    cameras, x, m = np.linalg.inv(errors.camera), slice(6 * n), slice(6 * n, 12 * n)
+    flat, weak = errors.to_cameras.reshape(6 * n, 6), np.kron(np.eye(n), WEAK)
+    cameras, x, m = np.linalg.inv(errors.cameras), slice(6 * n), slice(6 * n, 12 * n)
     hessian, vector = np.zeros((12 * n + 6, 12 * n + 6)), np.zeros(12 * n + 6)
-    hessian[x, x] = of_poses.matrix + np.kron(eye, cameras + WEAK)
-    hessian[m, m] = matched.matrix + np.kron(eye, cameras)
-    hessian[x, m] = hessian[m, x] = -np.kron(eye, cameras)
+    hessian[x, x] = of_poses.matrix + cameras + weak
+    hessian[m, m] = matched.matrix + cameras
+    hessian[x, m] = hessian[m, x] = -cameras
     hessian[m, 12 * n :] = -matched.matrix @ flat
     hessian[12 * n :, m] = hessian[m, 12 * n :].T
     hessian[12 * n :, 12 * n :] = np.linalg.inv(errors.cloud) + flat.T @ matched.matrix @ flat
@@ -73,7 +74,7 @@ def _of_all(step: Array, covariance: Array, errors: SharedErrors) -> Evidence:
     n = len(errors.to_cameras)
     apart = np.hstack([-np.eye(6 * n), np.eye(6 * n), np.zeros((6 * n, 6))])
     inverse = np.zeros((6 * n + 6, 6 * n + 6))
-    inverse[: 6 * n, : 6 * n] = np.kron(np.eye(n), np.linalg.inv(errors.camera))
+    inverse[: 6 * n, : 6 * n] = np.linalg.inv(errors.cameras)
     inverse[6 * n :, 6 * n :] = np.linalg.inv(errors.cloud)
     to_errors = np.vstack([apart, np.eye(12 * n + 6)[12 * n :]])
     error, known = to_errors @ step, to_errors @ covariance @ to_errors.T

@@ -111,6 +111,9 @@ def absorb_frames(
             )
         )
     state = replace(state, epochs=tuple(epochs))
+    if any(state.findings.bend_sigmas):
+        scale = state.cameras[camera].scale
+        state = replace(state, bends=state.bends.add(camera, blocks, scale, T_lidar_camera))
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 

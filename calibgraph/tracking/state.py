@@ -16,6 +16,7 @@ from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.bends import BendShifts
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import (
@@ -119,6 +120,7 @@ class State:
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
         places: sums of the older frames, place by place, of cameras that do not drift.
+        bends: how the cameras' matches follow bends of the cloud.
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         frame: number of the last frame, or None.
@@ -136,6 +138,7 @@ class State:
     total_hessian: Array
     total_frames: Array
     places: PlaceSums
+    bends: BendShifts
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
@@ -160,6 +163,7 @@ class State:
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
             places=PlaceSums.empty(n),
+            bends=BendShifts.unknown(n),
         )
 
     @property

@@ -32,6 +32,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.bends import BendShifts
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
@@ -50,7 +51,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, MatcherFindings, Sizes, ResidualHistogram,
+                 EpochSummary, PlaceSums, BendShifts, MatcherFindings, Sizes, ResidualHistogram,
                  ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DECODING_ERRORS = (

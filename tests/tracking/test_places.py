@@ -67,7 +67,7 @@ def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
     ("places", "frames", "rounds"), [(1, 20, 1), (2, 10, 1), (6, 5, 1), (3, 5, 2)]
 )
 def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, tie: bool) -> None:
-    """Within 0.1 sigma root mean square, and 8 % in the sigmas, of cameras and of the pair.
+    """Within 0.1 sigma root mean square, and 10 % in the sigmas, of cameras and of the pair.
 
     A place is a quadratic here; and a batch weighs places that are off by a loss, which takes the
     size of the cameras' errors at places for smaller (by half, of 6 places), and with it the part
@@ -81,8 +81,8 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     apart = [twist_between(result.T_camera_lidar[name], T[name]) for name in T]
     sigmas = np.sqrt(np.diag(joint))
     assert np.sqrt(np.mean(np.square(np.concatenate(apart) / sigmas))) < 0.1
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), sigmas, rtol=0.08)
-    np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.08)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), sigmas, rtol=0.1)
+    np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.1)
 
 
 def states(table: Correspondences, **more: object) -> Correspondences:
@@ -171,12 +171,13 @@ def test_a_relative_pose_that_contradicts_takes_no_part() -> None:
 
 
 def test_the_closed_form_is_the_covariance_of_what_places_show() -> None:
-    """One place: V + A D A^T per camera, between cameras A D A^T, all with C and K on top."""
+    """One place: V + A D A^T per camera, between cameras A D A^T; with C, K and bends on top."""
     rig = pair_of()
     poses = [gtsam.Pose3(np.linalg.inv(T)) for T in rig.T_camera_lidar.values()]
     tracker = IncrementalCalibrator(rig)
-    tracker.update(states(drive(rig, 1)[0]))
-    errors = SharedErrors.of(tracker._state.findings, poses, tracker._state.sizes)
+    tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
+    shifts = np.random.default_rng(0).normal(size=(2, 6, 3))
+    errors = SharedErrors.of(tracker._state.findings, poses, tracker._state.sizes, shifts)
     sums = PlaceSums.empty(2).add([replace(part("a", 0), gradient=np.zeros((2, 6)))])
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(np.tile(np.eye(6), (2, 1, 1)), spread)
@@ -190,7 +191,9 @@ def test_the_closed_form_is_the_covariance_of_what_places_show() -> None:
         expected[rows, rows] += (spread[camera, 0, 0] + 8.0 * 3) * own
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)
     whole = terms.information.sum(np.array([True])).of_cameras(errors)
+    bent = 0.2 * shifts[:, :, 2].ravel()
     everywhere = np.kron(np.eye(2), errors.camera) + flat @ errors.cloud @ flat.T
+    everywhere += np.outer(bent, bent)
     np.testing.assert_allclose(
         np.linalg.inv(whole.matrix), expected + everywhere, rtol=1e-5, atol=1e-9
     )
@@ -201,7 +204,9 @@ def test_places_on_both_sides_of_a_time_cancel() -> None:
     poses = [gtsam.Pose3(np.linalg.inv(T)) for T in rig.T_camera_lidar.values()]
     tracker = IncrementalCalibrator(rig)
     tracker.update(states(drive(rig, 1)[0]))
-    errors = SharedErrors.of(tracker._state.findings, poses, tracker._state.sizes)
+    errors = SharedErrors.of(
+        tracker._state.findings, poses, tracker._state.sizes, np.zeros((2, 6, 3))
+    )
     frame = np.tile(100.0 * np.eye(6), (2, 1, 1))
     of = partial(shift_covariance, frame_hessian=frame, errors=errors)
     here, there = np.array([[10.0, 10], [0, 0]]), np.array([[0.0, 0], [5, 5]])
@@ -300,3 +305,27 @@ def test_a_new_place_is_no_move() -> None:
 
     assert events(["here"] * 140) == ["moved"]
     assert not events(["here"] * 80 + ["there"] * 60)
+
+
+def test_bends_widen_the_error_bar_along_the_motion_and_survive_a_restart(tmp_path: Path) -> None:
+    """Of cameras that look 90 degrees apart; motion displaces their views by other amounts."""
+    rig = pair_of()
+    turn = np.eye(4)
+    turn[:3, :3] = gtsam.Rot3.Ry(np.pi / 2).matrix()
+    rig = rig.moved_to(
+        {"left": rig.T_camera_lidar["left"], "right": turn @ rig.T_camera_lidar["left"]}
+    )
+    tables = drive(rig, 12)
+    variances = {}
+    for motion_m in (0.0, 0.2):
+        with DurableCalibrator(tmp_path / str(motion_m), rig) as tracker:
+            for table in tables:
+                tracker.update(states(table, scan_motion_m=motion_m))
+            result = tracker.tracker.calibration()
+        with DurableCalibrator(tmp_path / str(motion_m), rig) as tracker:
+            again = tracker.tracker.calibration()
+        assert result.joint_covariance is not None and again.joint_covariance is not None
+        np.testing.assert_array_equal(again.joint_covariance, result.joint_covariance)
+        variances[motion_m] = sigmas_of_pair(result.T_camera_lidar, result.joint_covariance) ** 2
+    added = np.sqrt((variances[0.2] - variances[0.0])[3:].max())
+    assert 0.03 < added < 0.07  # a quarter of a turn: 0.05 m
