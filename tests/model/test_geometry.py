@@ -49,7 +49,10 @@ INVERTING = {
     "calibgraph/tracking/assessment.py": NO_TRANSFORM,
     "calibgraph/tracking/cause.py": NO_TRANSFORM,
     "calibgraph/tracking/epoch_summary.py": NO_TRANSFORM,
+    "calibgraph/tracking/joint_estimate.py": NO_TRANSFORM,
     "calibgraph/tracking/noise.py": NO_TRANSFORM,
+    "calibgraph/tracking/place_errors.py": NO_TRANSFORM,
+    "calibgraph/tracking/place_sizes.py": NO_TRANSFORM,
     "calibgraph/tracking/posterior.py": NO_TRANSFORM,
     "calibgraph/tracking/step_detection.py": NO_TRANSFORM,
 }
