@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.cloud_bends import bend_shifts
-from calibgraph.solver.error_model import WEAK
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.within_place import WEAK
 
 Array = NDArray[np.float64]
 

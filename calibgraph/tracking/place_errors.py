@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import adjoint_camera_lidar
 from calibgraph.solver.component_sizes import Sizes
-from calibgraph.solver.error_model import WEAK
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.place_sums import PlaceSums
 
 Array = NDArray[np.float64]

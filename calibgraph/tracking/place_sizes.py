@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.solver.component_sizes import Evidence, Sizes, sizes_by_evidence
-from calibgraph.solver.error_model import WEAK
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.place_errors import Information, PlaceTerms, SharedErrors
 from calibgraph.tracking.place_sums import PlaceSums
 

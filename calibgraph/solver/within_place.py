@@ -1,0 +1,115 @@
+"""What the matches of one place share, by the scatter of its frames.
+
+What matches of one frame share is not stated by any matcher but shows in the scatter between
+frames. Within a place it is summed up as K, the covariance of a camera's pose by all its frames in
+units of that of independent matches: with H = L L^T the Hessian of independent matches,
+K = L^T (H_t^-1 G H_t^-1) L, where G is the scatter of the frames' gradients about their place's
+mean, with an allowance for few frames, and H_t the true Hessian. The matches of a place stay
+independent, with the least variance k of K, at most 1; what their covariance lacks, K - k, belongs
+to the pose a_cp, together with what the frames of a place share by the matcher's statement
+(``place_variance``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.error_components import error_components
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.hierarchy import PlacedBlock
+from calibgraph.solver.objective import Objective
+from calibgraph.solver.residual_scale import ResidualScale
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
+WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
+"""Information of a pose within sight, so that few matches have an inverse."""
+
+
+@dataclass(frozen=True, eq=False)
+class WithinPlace:
+    """What a camera's matches of one place share, in units of independent matches.
+
+    Attributes:
+        least: k of the module's text.
+        excess: (6, 6) K - k, positive definite.
+        efficiency: of independent matches: their true variance over that of H, in the mean.
+        roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
+        frames: (P,) of each place.
+    """
+
+    least: float
+    excess: Array
+    efficiency: float
+    roots: Array
+    frames: Numbers
+
+    def at_place(self, place_variance: float) -> Array:
+        """(P, 6, 6) covariance of a_cp about m_c."""
+        shared = place_variance * self.efficiency * self.frames[:, None, None] * np.eye(6)
+        inverse = np.linalg.inv(self.roots)
+        covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
+        return (covariance + covariance.transpose(0, 2, 1)) / 2
+
+
+def within_place(
+    inliers: Objective, name: str, T_camera_lidar: Array, scale: ResidualScale, placed: PlacedBlock
+) -> WithinPlace:
+    """What a camera's matches share.
+
+    Args:
+        inliers: after the gate.
+        name: of the camera.
+        T_camera_lidar: (4, 4) its minimum.
+        scale: of its residuals.
+        placed: its matches.
+    """
+    block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
+    hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
+    root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
+    robust = robust_hessian(block.with_scale(scale), pose)
+    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + WEAK
+    scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
+    inverse = np.linalg.inv(true)
+    covariance = root.T @ inverse @ scatter @ inverse @ root
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
+    return WithinPlace(
+        least=least,
+        excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
+        efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
+        roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
+        frames=placed.frames,
+    )
+
+
+def frame_scatter(block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array) -> Array:
+    """(6, 6) covariance of the sum of all frames' gradients, about the means of their places.
+
+    Args:
+        block: of one camera.
+        gradients: (f, 6) of its frames.
+        placed: the same matches, with the place of each frame.
+        true: (6, 6) Hessian.
+    """
+    place, counts = placed.place_of_frame, placed.count_of_frame
+    total = np.zeros((len(placed.frames), 6))
+    np.add.at(total, place, gradients)
+    share = counts / np.bincount(place, counts, len(placed.frames))[place]
+    apart = gradients - share[:, None] * total[place]
+    frames, free = len(gradients), len(gradients) - len(np.unique(place))
+    usual = 1 + error_components().frame_correlation * (len(block) / frames - 1)
+    count = free + 1.0  # as many frames of one place
+    scatter = with_pseudo_frames(
+        apart.T @ apart, true, np.full(6, count), usual * true * count / frames
+    )
+    return scatter * frames / count
