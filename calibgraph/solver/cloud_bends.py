@@ -4,15 +4,19 @@ A rigid motion of the cloud moves all cameras alike. Three errors of recorded se
 that all point higher or lower than is stated, which pitch the cloud along every line of sight;
 beams that are spread too far or too little; and motion during a turn, which displaces each heading
 by another amount. Each is one unknown number of the whole rig; a camera's matches follow it by a
-displacement that their own points show.
+displacement that their own points show. What a pose cannot follow is left in its residuals, and
+shows how large the bends are: little to a narrow camera, much to one that sees all round.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import ProjectionBlock
@@ -20,8 +24,6 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 
 _SAMPLE = 1000  # correspondences: the displacement is a ratio of two sums over them
-_STEP = 1e-4  # of the difference quotient: far below a pixel, far above rounding
-_NO_LOSS = 1e6  # sigmas at which it bends: inliers are far below, and weigh nearly the same
 
 
 def bends_at(points_lidar_m: Array) -> Array:
@@ -43,34 +45,74 @@ def bends_at(points_lidar_m: Array) -> Array:
     return np.stack([elevation, stretch, motion])
 
 
-def bend_shifts(
-    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, weak: Array
-) -> Array:
-    """(6, 3) by how much the pose of a camera's matches follows a unit of each bend.
+@dataclass(frozen=True, eq=False)
+class BendEvidence:
+    """What a camera's matches have to do with a unit of each bend.
 
-    With b the gradient of the squared residuals and H their Hessian, -H^-1 (db / dbend), in the
-    tangent of ``T_lidar_camera``.
+    Half their squared residuals are, near the minimum, those of a pose that has moved by ``shifts``
+    times the bends, and the quadratic of ``information`` and ``vector`` in the bends alone.
+
+    Attributes:
+        shifts: (6, 3) by how much their pose follows.
+        information: (3, 3) of the residuals, if all were independent.
+        vector: (3,) the information times the bends that the points show.
+    """
+
+    shifts: Array
+    information: Array
+    vector: Array
+
+
+def bend_evidence(
+    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, weak: Array
+) -> BendEvidence:
+    """What a camera's matches have to do with the bends, in the tangent of ``T_lidar_camera``.
+
+    With J and K the Jacobians of the whitened residuals by pose and bends, the pose follows by
+    -(J^T J)^-1 J^T K. Of K this leaves what no pose can follow.
 
     Args:
         block: inliers of one camera.
         scale: of their residuals.
         T_lidar_camera: their minimum.
-        weak: (6, 6) information that is added to H, so that few matches have an inverse.
+        weak: (6, 6) information that is added to J^T J, so that few matches have an inverse.
     """
-    some = block.select_evenly(_SAMPLE).block.rescale(scale=_NO_LOSS, sigma=scale.sigma)
-    here = some.sums(T_lidar_camera)
+    some = block.select_evenly(_SAMPLE)
     share = len(some) / len(block)
-    moved = [
-        _displace(some, _STEP * bend).sums(T_lidar_camera).gradient
-        for bend in bends_at(some.points_lidar_m)
-    ]
-    slopes = (np.column_stack(moved) - here.gradient[:, None]) / _STEP
-    return -np.asarray(np.linalg.solve(here.hessian + share * weak, slopes))
+    by_pose, by_bend, residuals = _jacobians(some.block, scale, T_lidar_camera)
+    hessian = by_pose.T @ by_pose + share * weak
+    shifts = -np.asarray(np.linalg.solve(hessian, by_pose.T @ by_bend))
+    left = by_bend + by_pose @ shifts
+    return BendEvidence(shifts, left.T @ left / share, left.T @ residuals / share)
 
 
-def _displace(block: ProjectionBlock, step: Array) -> ProjectionBlock:
-    """The same correspondences, their points moved by (n, 3) [m]."""
-    return ProjectionBlock(
-        block.lens, block.points_lidar_m + step, block.pixels_px,
-        block.sqrt_information, block.loss, block.scale, block.sigma,
-    )  # fmt: skip
+def _jacobians(
+    block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3
+) -> tuple[Array, Array, Array]:
+    """(2 n, 6), (2 n, 3) of the whitened residuals by pose and bends; (2 n,) these."""
+    T = to_T_camera_lidar(T_lidar_camera)
+    points = block.points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    _, by_point = block.lens.project_with_jacobian(points)
+    residuals, _ = block.residuals(T_lidar_camera)
+    bends = np.einsum("ij,knj->nik", T[:3, :3], bends_at(block.points_lidar_m))
+    by_pose = by_point @ np.concatenate(
+        [_crosses(points), np.tile(-np.eye(3), (len(points), 1, 1))], 2
+    )
+    values = np.concatenate([by_pose, by_point @ bends, residuals[..., None]], axis=2)
+    root = block.sqrt_information
+    if root is not None:  # upper triangular
+        values = np.stack(
+            [
+                root[:, :1] * values[:, 0] + root[:, 1:2] * values[:, 1],
+                root[:, 2:] * values[:, 1],
+            ],
+            axis=1,
+        )
+    whitened = values.reshape(-1, values.shape[2]) / scale.sigma
+    return whitened[:, :6], whitened[:, 6:-1], whitened[:, -1]
+
+
+def _crosses(v: Array) -> Array:
+    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
+    (x, y, z), zero = v.T, np.zeros(len(v))
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -45,7 +45,7 @@ class Sizes:
             usual,
             cloud=self.shared * usual.cloud,
             camera=self.shared * usual.camera,
-            bends=self.shared**0.5 * usual.bends,
+            bend_size=self.shared * usual.bend_size,
             pairs=self.shared * usual.pairs,
             cloud_at_place=self.cloud * usual.cloud_at_place,
             at_place=self.cameras * usual.at_place,

@@ -15,7 +15,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
-from calibgraph.solver.cloud_bends import bend_shifts
+from calibgraph.solver.cloud_bends import bend_evidence
 from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
@@ -65,7 +65,7 @@ class ErrorFit:
                 parts,
                 cloud=ratio * parts.cloud,
                 camera=ratio * parts.camera,
-                bends=ratio**0.5 * parts.bends,
+                bend_size=ratio * parts.bend_size,
             ),
         )
         fit = linearize(model, self.fit)
@@ -78,7 +78,7 @@ class ErrorFit:
             usual: the standard deviations that the matcher states.
         """
         values, covariance = bends_of(self.model, self.fit)
-        unit = self.sizes.shared**0.5 * np.asarray(usual)
+        unit = np.asarray(usual)
         return unit * values, unit * np.sqrt(np.diag(covariance))
 
     def without_pose_graph(self) -> HierarchyFit | None:
@@ -101,13 +101,14 @@ def weigh_errors(
 ) -> tuple[ErrorFit | None, Optimum]:
     """The minimum under the error model, where it differs from that of independent matches.
 
-    Where there is nothing but the matches of one place, their minimum is that of both; it stays,
-    and no model is made. Measured relative poses that contradict the correspondences take no part,
-    so that one that is wrong, or two cameras that are swapped, do not move the others. Arguments
-    and what is None as of :func:`fit_errors`.
+    Where there is nothing but the matches of one place, and no bends, their minimum is that of
+    both; it stays, and no model is made. Measured relative poses that contradict the
+    correspondences take no part, so that one that is wrong, or two cameras that are swapped, do not
+    move the others. Arguments and what is None as of :func:`fit_errors`.
     """
     several = inliers.blocks and len(places_of(inliers, metadata)) > 1
-    if not (several or inliers.pairs or inliers.rig.relative_poses):
+    bent = any(MatcherFindings.from_metadata(metadata).bend_sigmas)
+    if not (several or bent or inliers.pairs or inliers.rig.relative_poses):
         return None, optimum
     alone, T = None, optimum.T_camera_lidar
     if inliers.rig.relative_poses:
@@ -218,21 +219,28 @@ def error_model(
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    blocks, bends = {}, np.zeros((len(cameras), 6, len(findings.bend_sigmas)))
+    usual_bends = np.asarray(findings.bend_sigmas)
+    blocks, bends = {}, np.zeros((len(cameras), 6, len(usual_bends)))
+    bend_information, bend_vector = np.zeros((len(usual_bends),) * 2), np.zeros(len(usual_bends))
     for name, block in inliers.blocks.items():
         placed = PlacedBlock.of(block, scales[name], places)
         within = within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
         blocks[name] = placed.with_variance(within.least)
-        if any(findings.bend_sigmas):
+        if usual_bends.any():
             pose = to_T_lidar_camera(T_camera_lidar[name])
-            shifts = bend_shifts(block, scales[name], pose, WEAK)
-            bends[cameras.index(name)] = shifts * findings.bend_sigmas
+            evidence = bend_evidence(block, scales[name], pose, WEAK)
+            bends[cameras.index(name)] = evidence.shifts * usual_bends
+            weight = 1.0 / within.mean_variance(findings.place_variance)
+            bend_information += weight * np.outer(usual_bends, usual_bends) * evidence.information
+            bend_vector += weight * usual_bends * evidence.vector
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
         camera=_covariance(*(share * whole)),
         bends=bends,
+        bend_information=bend_information,
+        bend_vector=bend_vector,
         pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,

@@ -3,7 +3,8 @@
 Variables, each a ``Pose3`` but b; without errors of sensor and matcher all of a camera are equal:
 
     x_c   camera c as it is: ``T_lidar_camera``, what is wanted
-    b     how the sensor bends the cloud, numbers in standard deviations: a prior at zero
+    b     how the sensor bends the cloud, numbers in standard deviations: a prior by what is usual
+          and by the residuals
     m_c   camera c as its matches show it everywhere: tied to x_c and b by ``components.camera``
     n_c   camera c as its pairs show it everywhere: tied to x_c by ``components.pairs``
     o     the cloud as displaced everywhere: a prior at the identity, ``components.cloud``
@@ -50,7 +51,10 @@ class Components:
         cloud: (6, 6) of the cloud everywhere, in the LiDAR frame.
         cloud_at_place: (6, 6) of the cloud at one place besides.
         camera: (6, 6) of all matches of a camera, in its axes.
-        bends: (N, 6, B) by how much they follow one standard deviation of each bend of the cloud.
+        bends: (N, 6, B) by how much they follow one usual standard deviation of each bend.
+        bend_information: (B, B) of the residuals about the bends, in units of these.
+        bend_vector: (B,) the information times the bends that these show.
+        bend_size: variance of the bends before, over the usual one.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
         robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
@@ -61,15 +65,30 @@ class Components:
     cloud_at_place: Array
     camera: Array
     bends: Array
+    bend_information: Array
+    bend_vector: Array
     pairs: Array
     at_place: Array
+    bend_size: float = 1.0
     robust_scale: float = np.inf
 
     @property
     def cameras(self) -> Array:
         """(6 N, 6 N) of the matches of all cameras, which share the bends."""
         shifts = np.concatenate(self.bends)
-        return np.kron(np.eye(len(self.bends)), self.camera) + shifts @ shifts.T
+        of_bends = shifts @ self.bend_covariance @ shifts.T
+        return np.asarray(np.kron(np.eye(len(self.bends)), self.camera) + of_bends)
+
+    @cached_property
+    def bend_covariance(self) -> Array:
+        """(B, B) of the bends, by what is usual and by the residuals."""
+        prior = np.eye(len(self.bend_vector)) / self.bend_size
+        return np.asarray(np.linalg.inv(prior + self.bend_information))
+
+    @cached_property
+    def bend_mean(self) -> Array:
+        """(B,) of the bends, by the same."""
+        return np.asarray(self.bend_covariance @ self.bend_vector)
 
     @cached_property
     def shared_information(self) -> Array:
@@ -198,8 +217,8 @@ def hierarchy_graph(model: Hierarchy) -> gtsam.NonlinearFactorGraph:
     parts, graph = model.components, gtsam.NonlinearFactorGraph()
     cloud, bend, no_motion = gtsam.symbol("o", 0), gtsam.symbol("b", 0), gtsam.Pose3()
     graph.add(gtsam.PriorFactorPose3(cloud, no_motion, _noise(parts.cloud)))
-    zero = np.zeros(parts.bends.shape[2])
-    graph.add(gtsam.PriorFactorVector(bend, zero, gtsam.noiseModel.Unit.Create(len(zero))))
+    of_bends = _noise(parts.bend_covariance)
+    graph.add(gtsam.PriorFactorVector(bend, parts.bend_mean, of_bends))
     for place in range(model.places):
         noise = _robust(parts.cloud_at_place, parts.robust_scale)
         graph.add(gtsam.BetweenFactorPose3(cloud, cloud_key(place), no_motion, noise))

@@ -247,7 +247,7 @@ def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
 
 
 def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
-    """(B,) bends of the cloud in standard deviations, and their (B, B) marginal covariance.
+    """(B,) bends of the cloud in usual standard deviations, and their (B, B) marginal covariance.
 
     The eliminated form has them in the covariance of all m_c about x_c; here they come back.
 
@@ -257,10 +257,11 @@ def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
     """
     edges, free, shifts = shared_edges(model, fit.poses), len(fit.shared_covariance), model.bends
     matches = slice(6, 6 + len(shifts))
-    gain = shifts.T @ edges.information[matches, matches]
+    before = model.components.bend_covariance
+    gain = before @ shifts.T @ edges.information[matches, matches]
     slope = gain @ edges.jacobian[matches, :free]
-    covariance = np.eye(shifts.shape[1]) - gain @ shifts + slope @ fit.shared_covariance @ slope.T
-    return gain @ edges.error[matches], covariance
+    covariance = before - gain @ shifts @ before + slope @ fit.shared_covariance @ slope.T
+    return model.components.bend_mean + gain @ edges.error[matches], covariance
 
 
 def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:

@@ -53,6 +53,12 @@ class WithinPlace:
     roots: Array
     frames: Numbers
 
+    def mean_variance(self, place_variance: float) -> float:
+        """Of all matches of the camera, in units of independent ones, in the mean over a pose."""
+        alike = float(np.square(self.frames).sum() / max(self.frames.sum(), 1))
+        within = self.least + float(np.trace(self.excess)) / 6
+        return within + place_variance * self.efficiency * alike
+
     def at_place(self, place_variance: float) -> Array:
         """(P, 6, 6) covariance of a_cp about m_c."""
         shared = place_variance * self.efficiency * self.frames[:, None, None] * np.eye(6)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.solver.cloud_bends import bend_shifts
+from calibgraph.solver.cloud_bends import bend_evidence
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.within_place import WEAK
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class BendShifts:
-    """Per camera the mean over epochs of :func:`calibgraph.solver.cloud_bends.bend_shifts`.
+    """Per camera the mean over epochs of :func:`calibgraph.solver.cloud_bends.bend_evidence`.
 
     Attributes:
         mean: (n, 6, 3) by a unit of each bend; 0 before a camera has started.
@@ -58,6 +58,6 @@ class BendShifts:
             return self
         mean, epochs = self.mean.copy(), self.epochs.copy()
         epochs[camera] += 1
-        found = bend_shifts(inliers, scale, T_lidar_camera, WEAK)
+        found = bend_evidence(inliers, scale, T_lidar_camera, WEAK).shifts
         mean[camera] += (found - mean[camera]) / epochs[camera]
         return BendShifts(mean, epochs)

@@ -9,8 +9,9 @@ import pytest
 
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.solver.cloud_bends import bend_shifts, bends_at
+from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.cloud_bends import bend_evidence, bends_at
 from calibgraph.solver.joint import solve_joint
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss
@@ -36,9 +37,50 @@ def test_the_shift_is_how_a_solve_of_the_bent_cloud_differs(mixed_rig: Rig, bend
     moved = solve_joint(mixed_rig, bent, config).T_camera_lidar
     for name, T in solution.T_camera_lidar.items():
         pose = to_T_lidar_camera(T)
-        shifts = bend_shifts(inliers.blocks[name], solution.scales[name], pose, np.zeros((6, 6)))
+        block, scale = inliers.blocks[name], solution.scales[name]
+        shifts = bend_evidence(block, scale, pose, np.zeros((6, 6))).shifts
         found = pose.localCoordinates(to_T_lidar_camera(moved[name]))
         expected, unit = shifts[:, bend] * STEP[bend], np.repeat([1e-3, 0.01], 3)
         # Weights of the loss and the gate, which are left out of it, are worth up to 15 %.
         off = np.linalg.norm((found - expected) / unit)
         assert off < 0.2 * np.linalg.norm(expected / unit)
+
+
+@pytest.mark.parametrize("bend", [0, 1, 2])
+def test_a_camera_that_sees_all_round_shows_the_bends(bend: int) -> None:
+    """By what no pose can follow: within three standard deviations, which are far below it."""
+    rig, size = rig_of("panorama"), np.array([2e-3, 2e-2, 0.05])[bend]
+    errors = MatcherErrors(noise_px=0.5, outlier_share=0.0)
+    table = simulate_correspondences(rig, frames=4, matches=400, errors=errors, seed=0)
+    points = table.points_lidar_m
+    bent = replace(table, points_lidar_m=points + size * bends_at(points)[bend])
+    config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
+    solution = solve_joint(rig, bent, config)
+    (name, T), *_ = solution.T_camera_lidar.items()
+    block, scale = solution.inliers.blocks[name], solution.scales[name]
+    found = bend_evidence(block, scale, to_T_lidar_camera(T), np.zeros((6, 6)))
+    sigmas = np.sqrt(np.diag(np.linalg.inv(found.information)))
+    shown = np.linalg.solve(found.information, found.vector)
+    expected = size * np.eye(3)[bend]
+    assert (np.abs(shown - expected) < 3 * sigmas).all()
+    assert sigmas[bend] < size / 4
+
+
+def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
+    """Motion of 0.1 m, of a table that states 0.15 m and nothing else."""
+    rig = rig_of("panorama")
+    table = simulate_correspondences(rig, frames=6, matches=400, seed=0)
+    points = table.points_lidar_m
+    stated = {**table.metadata, "scan_motion_m": 0.15}
+    bent = replace(table, points_lidar_m=points + 0.1 * bends_at(points)[2], metadata=stated)
+    config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
+    without = solve_joint(rig, replace(bent, metadata=table.metadata), config)
+    solution = solve_joint(rig, bent, config)
+    assert solution.errors is not None
+    values, sigmas = solution.errors.bends(bent.findings.bend_sigmas)
+    assert abs(values[2] - 0.1) < 3 * sigmas[2] < 0.06
+    for name, T in rig.T_camera_lidar.items():
+        before, after = (
+            np.abs(twist_between(one.T_camera_lidar[name], T)).max() for one in (without, solution)
+        )
+        assert after < 0.5 * before
