@@ -10,6 +10,7 @@ shows how large the bends are: little to a narrow camera, much to one that sees 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -18,10 +19,12 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.hierarchy import place_of
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 _SAMPLE = 1000  # correspondences: the displacement is a ratio of two sums over them
 
@@ -50,12 +53,12 @@ class BendEvidence:
     """What a camera's matches have to do with a unit of each bend.
 
     Half their squared residuals are, near the minimum, those of a pose that has moved by ``shifts``
-    times the bends, and the quadratic of ``information`` and ``vector`` in the bends alone.
+    times the bends, and the quadratics of ``information`` and ``vector`` in the bends alone.
 
     Attributes:
         shifts: (6, 3) by how much their pose follows.
-        information: (3, 3) of the residuals, if all were independent.
-        vector: (3,) the information times the bends that the points show.
+        information: (P, 3, 3) of the residuals at each place, if all were independent.
+        vector: (P, 3) the information times the bends that the points show.
     """
 
     shifts: Array
@@ -64,26 +67,43 @@ class BendEvidence:
 
 
 def bend_evidence(
-    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, weak: Array
+    block: CameraBlock,
+    scale: ResidualScale,
+    T_lidar_camera: gtsam.Pose3,
+    weak: Array,
+    places: Sequence[Numbers],
 ) -> BendEvidence:
     """What a camera's matches have to do with the bends, in the tangent of ``T_lidar_camera``.
 
     With J and K the Jacobians of the whitened residuals by pose and bends, the pose follows by
-    -(J^T J)^-1 J^T K. Of K this leaves what no pose can follow.
+    -(J^T J)^-1 J^T K. What no pose of a place of its own can follow is left of K there: else a
+    place that is displaced would show bends.
 
     Args:
         block: inliers of one camera.
         scale: of their residuals.
         T_lidar_camera: their minimum.
         weak: (6, 6) information that is added to J^T J, so that few matches have an inverse.
+        places: the numbers of the frames of each place.
     """
     some = block.select_evenly(_SAMPLE)
     share = len(some) / len(block)
     by_pose, by_bend, residuals = _jacobians(some.block, scale, T_lidar_camera)
-    hessian = by_pose.T @ by_pose + share * weak
-    shifts = -np.asarray(np.linalg.solve(hessian, by_pose.T @ by_bend))
-    left = by_bend + by_pose @ shifts
-    return BendEvidence(shifts, left.T @ left / share, left.T @ residuals / share)
+    weak = share * weak
+    bends = by_bend.shape[1]
+    information, vector = np.zeros((len(places), bends, bends)), np.zeros((len(places), bends))
+    place = np.repeat(place_of(some.frame, places), 2)
+    for number in np.unique(place):
+        rows = place == number
+        left = by_bend[rows] + by_pose[rows] @ _follow(by_pose[rows], by_bend[rows], weak)
+        information[number] = left.T @ left / share
+        vector[number] = left.T @ residuals[rows] / share
+    return BendEvidence(_follow(by_pose, by_bend, weak), information, vector)
+
+
+def _follow(by_pose: Array, by_bend: Array, weak: Array) -> Array:
+    """(6, 3) the pose by a unit of each bend, from the Jacobians of both."""
+    return -np.asarray(np.linalg.solve(by_pose.T @ by_pose + weak, by_pose.T @ by_bend))
 
 
 def _jacobians(

@@ -182,6 +182,9 @@ def fit_errors(
     fit = fit_hierarchy(
         model, start_poses(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
+    if fit is not None and np.isfinite(usual.robust_scale):  # what a wrong place shows, it errs in
+        usual = replace(usual, bend_weight=fit.place_weights(usual.robust_scale))
+        model = replace(model, components=usual)
     for _ in range(_ROUNDS):
         found = sizes if fit is None else sizes_of(model, fit, sizes)
         if fit is None or found.is_near(sizes):
@@ -221,7 +224,8 @@ def error_model(
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
     usual_bends = np.asarray(findings.bend_sigmas)
     blocks, bends = {}, np.zeros((len(cameras), 6, len(usual_bends)))
-    bend_information, bend_vector = np.zeros((len(usual_bends),) * 2), np.zeros(len(usual_bends))
+    shape = len(places), len(cameras), len(usual_bends)
+    bend_vector, bend_information = np.zeros(shape), np.zeros((*shape, shape[2]))
     for name, block in inliers.blocks.items():
         placed = PlacedBlock.of(block, scales[name], places)
         within = within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
@@ -229,11 +233,12 @@ def error_model(
         blocks[name] = placed.with_variance(within.least)
         if usual_bends.any():
             pose = to_T_lidar_camera(T_camera_lidar[name])
-            evidence = bend_evidence(block, scales[name], pose, WEAK)
+            evidence = bend_evidence(block, scales[name], pose, WEAK, places)
             bends[cameras.index(name)] = evidence.shifts * usual_bends
             weight = 1.0 / within.mean_variance(findings.place_variance)
-            bend_information += weight * np.outer(usual_bends, usual_bends) * evidence.information
-            bend_vector += weight * usual_bends * evidence.vector
+            units = np.outer(usual_bends, usual_bends)
+            bend_information[:, cameras.index(name)] = weight * units * evidence.information
+            bend_vector[:, cameras.index(name)] = weight * usual_bends * evidence.vector
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
@@ -241,6 +246,7 @@ def error_model(
         bends=bends,
         bend_information=bend_information,
         bend_vector=bend_vector,
+        bend_weight=np.ones(shape[:2]),
         pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,

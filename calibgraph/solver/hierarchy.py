@@ -52,8 +52,10 @@ class Components:
         cloud_at_place: (6, 6) of the cloud at one place besides.
         camera: (6, 6) of all matches of a camera, in its axes.
         bends: (N, 6, B) by how much they follow one usual standard deviation of each bend.
-        bend_information: (B, B) of the residuals about the bends, in units of these.
-        bend_vector: (B,) the information times the bends that these show.
+        bend_information: (P, N, B, B) of a camera's residuals at a place about the bends, in units
+            of these.
+        bend_vector: (P, N, B) the information times the bends that these show.
+        bend_weight: (P, N) by which these count.
         bend_size: variance of the bends before, over the usual one.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
@@ -67,6 +69,7 @@ class Components:
     bends: Array
     bend_information: Array
     bend_vector: Array
+    bend_weight: Array
     pairs: Array
     at_place: Array
     bend_size: float = 1.0
@@ -82,13 +85,15 @@ class Components:
     @cached_property
     def bend_covariance(self) -> Array:
         """(B, B) of the bends, by what is usual and by the residuals."""
-        prior = np.eye(len(self.bend_vector)) / self.bend_size
-        return np.asarray(np.linalg.inv(prior + self.bend_information))
+        prior = np.eye(self.bends.shape[2]) / self.bend_size
+        shown = np.einsum("pn,pnij->ij", self.bend_weight, self.bend_information)
+        return np.asarray(np.linalg.inv(prior + shown))
 
     @cached_property
     def bend_mean(self) -> Array:
         """(B,) of the bends, by the same."""
-        return np.asarray(self.bend_covariance @ self.bend_vector)
+        shown = np.einsum("pn,pni->i", self.bend_weight, self.bend_vector)
+        return np.asarray(self.bend_covariance @ shown)
 
     @cached_property
     def shared_information(self) -> Array:

@@ -61,6 +61,11 @@ class HierarchyFit:
         cameras = 6 * ((len(self.poses.shared) - 2) // 3)
         return self.shared_covariance[:cameras, :cameras]
 
+    def place_weights(self, robust_scale: float) -> Array:
+        """(P, N) by which a camera's matches at a place count, in the loss of places."""
+        weight = (1.0 + (self.distances / robust_scale) ** 2) ** -2
+        return np.asarray(weight[:, :1] * weight[:, 1:])
+
     def T_camera_lidar(self, model: Hierarchy) -> dict[str, Array]:
         """(4, 4) of every camera."""
         return dict(zip(model.cameras, invert(self.poses.shared), strict=False))

@@ -58,6 +58,8 @@ class BendShifts:
             return self
         mean, epochs = self.mean.copy(), self.epochs.copy()
         epochs[camera] += 1
-        found = bend_evidence(inliers, scale, T_lidar_camera, WEAK).shifts
+        found = bend_evidence(
+            inliers, scale, T_lidar_camera, WEAK, [np.unique(inliers.frame)]
+        ).shifts
         mean[camera] += (found - mean[camera]) / epochs[camera]
         return BendShifts(mean, epochs)

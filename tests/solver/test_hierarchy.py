@@ -133,6 +133,7 @@ def with_correlations(model: Hierarchy) -> Hierarchy:
             bends,
             parts.bend_information + np.diag([0.5, 1.0, 2.0]),
             parts.bend_vector + np.array([0.4, -0.3, 0.8]),
+            rng.uniform(0.2, 1.0, parts.bend_weight.shape),
             mixed(parts.pairs),
             at_place,
             bend_size=1.5,
