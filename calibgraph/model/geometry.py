@@ -200,3 +200,9 @@ def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
     """
     tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
     return tangents
+
+
+def crosses(v: Array) -> Array:
+    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
+    (x, y, z), zero = v.T, np.zeros(len(v))
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import crosses, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.hierarchy import place_of
 from calibgraph.solver.residual_scale import ResidualScale
@@ -116,7 +116,7 @@ def _jacobians(
     residuals, _ = block.residuals(T_lidar_camera)
     bends = np.einsum("ij,knj->nik", T[:3, :3], bends_at(block.points_lidar_m))
     by_pose = by_point @ np.concatenate(
-        [_crosses(points), np.tile(-np.eye(3), (len(points), 1, 1))], 2
+        [crosses(points), np.tile(-np.eye(3), (len(points), 1, 1))], 2
     )
     values = np.concatenate([by_pose, by_point @ bends, residuals[..., None]], axis=2)
     root = block.sqrt_information
@@ -130,9 +130,3 @@ def _jacobians(
         )
     whitened = values.reshape(-1, values.shape[2]) / scale.sigma
     return whitened[:, :6], whitened[:, 6:-1], whitened[:, -1]
-
-
-def _crosses(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    (x, y, z), zero = v.T, np.zeros(len(v))
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

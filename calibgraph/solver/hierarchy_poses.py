@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import adjoints, invert, invert_each
+from calibgraph.model.geometry import adjoints, crosses, invert, invert_each
 from calibgraph.model.pose_kernel import exponential_times, logarithms
 from calibgraph.solver.hierarchy import Hierarchy
 
@@ -140,16 +140,10 @@ def _logarithm_jacobians(twists: Array) -> Array:
     The series of Bernoulli numbers, up to the fourth power: displacements are far below a radian.
     """
     ad = np.zeros((len(twists), 6, 6))
-    ad[:, :3, :3] = ad[:, 3:, 3:] = _crosses(twists[:, :3])
-    ad[:, 3:, :3] = _crosses(twists[:, 3:])
+    ad[:, :3, :3] = ad[:, 3:, 3:] = crosses(twists[:, :3])
+    ad[:, 3:, :3] = crosses(twists[:, 3:])
     squared = ad @ ad
     return np.asarray(np.eye(6) + ad / 2 + squared / 12 - squared @ squared / 720)
-
-
-def _crosses(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    (x, y, z), zero = v.T, np.zeros(len(v))
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def _retract(T: Array, tangents: Array) -> Array:
