@@ -1,10 +1,12 @@
-"""Error bars over many rendered scenes with sensors that err, each scene once.
+"""Error bars over many rendered scenes with sensors and lenses that err, each scene once.
 
-    python -m benchmarks.accuracy.error_bars --scenes out/error_bars --groups 0:72 --jobs 2
-    python -m benchmarks.accuracy.error_bars --groups 12:16 --streets 20
+    python -m benchmarks.accuracy.error_bars --groups 116:180 --jobs 2
+    python -m benchmarks.accuracy.error_bars --groups 116:120 --streets 20
 
-A group is a sensor with errors of its own, and five streets that it drove through, three frames
-each: one place. Rigs, beams and the size of the errors change from group to group. The second table
+A group is a rig with errors of its own, and five streets that it drove through, three frames each:
+one place. Rigs and beams change from group to group; errors of the LiDAR are those of ``simulate
+street --sensor-errors SIZE --vary-layout``, those of the lenses of half the size. Groups 100 to 115
+are to choose by, 116 to 179 are kept out. The second table
 solves again with the correspondences of one, two, five, ten and twenty of a group's streets, as far
 as it has as many; the third with those of five, changed: a relative pose is known, a camera has no
 matches or few, frames are repeated. NEES is the squared error in the metric of its covariance; its
@@ -46,6 +48,7 @@ from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_ma
 from calibgraph.model.correspondences import concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.solver.joint import solve_joint
@@ -54,7 +57,6 @@ from calibgraph.trust.evidence import Evidence
 STREETS = 5
 _FURTHER = 100_000  # seeds of more streets than that
 FRAMES, STEP_M = 3, 4.0
-SIZES = (0.0, 0.5, 1.0, 2.0)
 GUESS_DEG, GUESS_M = 1.0, 0.1
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -93,7 +95,7 @@ def main() -> None:
     arguments = parse_options()
     first, last = arguments.groups
     cases = [
-        Key("scene", RIGS[group % len(RIGS)][0], str(SIZES[group // len(RIGS) % len(SIZES)]), seed)
+        Key("scene", RIGS[group % len(RIGS)][0], f"{arguments.size:g}", seed)
         for group in range(first, last)
         for seed in seeds_of(group, arguments.streets)
     ]
@@ -114,8 +116,9 @@ def parse_options() -> argparse.Namespace:
     )
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "error_bars")
     parser.add_argument(
-        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[12, 72]
+        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[100, 180]
     )
+    parser.add_argument("--size", type=float, default=2.0, help="of the errors; one folder each")
     parser.add_argument("--streets", type=int, default=STREETS, help="of each sensor")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "error_bars.jsonl")
@@ -145,9 +148,12 @@ def run_case(case: Key, scenes: Path) -> Record:
         shutil.rmtree(folder, ignore_errors=True)
         simulate_street(
             folder, truth, beams=beams, frames=FRAMES, step_m=STEP_M, seed=case.seed,
-            sensor_errors=draw_scan_errors(beams, size, rng),
+            sensor_errors=draw_scan_errors(beams, size, rng), vary_layout=True,
         )  # fmt: skip
+    truth = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
+    truth.save(folder / "reference.yaml")
     guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
+    guess.save(folder / "rig.yaml")
     result = calibrate(load_dataset(folder), guess)
     assert result.correspondences is not None
     result.correspondences.save(folder / "correspondences.parquet")
@@ -162,7 +168,7 @@ def run_case(case: Key, scenes: Path) -> Record:
 
 
 COLUMNS = (
-    "sensor errors", "cameras", "rotation, median [deg]", "largest", "position, median [cm]",
+    "size of errors", "cameras", "rotation, median [deg]", "largest", "position, median [cm]",
     "largest", "mean NEES / 6", "in the 95 % region", "off", "PASS, WARN, FAIL",
 )  # fmt: skip
 
@@ -204,7 +210,7 @@ def report_places(records: Sequence[Record], scenes: Path) -> Table:
         (str(places), size, of, *_cells(values))
         for (places, size, of), values in sorted(found.items())
     ]
-    columns = ("places", "sensor errors", "of", *_CELLS)
+    columns = ("places", "size", "of", *_CELLS)
     return Table("Streets of one sensor solved together", columns, tuple(rows))
 
 
@@ -220,7 +226,7 @@ def report_changes(records: Sequence[Record], scenes: Path) -> Table:
             for what in solve_streets(change(streets, rng)):
                 found.setdefault((name, size, what.of), []).append(what)
     rows = [(*key, *_cells(values)) for key, values in found.items()]
-    columns = ("five places", "sensor errors", "of", *_CELLS)
+    columns = ("five places", "size", "of", *_CELLS)
     return Table("Streets of one sensor solved together, changed", columns, tuple(rows))
 
 

@@ -72,6 +72,14 @@ def simulate(
             rich_help_panel=_STREET,
         ),
     ] = None,
+    lens_errors: Annotated[
+        float | None,
+        typer.Option(
+            help="Of the lenses in the rig files: 0 for exact ones, 1 for errors that a good "
+            "calibration with a target leaves. (default: 0)",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
     vary_layout: Annotated[
         bool,
         typer.Option(
@@ -98,13 +106,15 @@ def simulate(
                 rotation_deg=rotation_deg,
                 translation_m=translation_m,
                 sensor_errors=0.0 if sensor_errors is None else sensor_errors,
+                lens_errors=0.0 if lens_errors is None else lens_errors,
                 vary_layout=vary_layout,
                 progress=progress,
             )
         else:
             of_street = {
                 "--rig": rig, "--beams": beams, "--step-m": step_m,
-                "--sensor-errors": sensor_errors, "--vary-layout": vary_layout or None,
+                "--sensor-errors": sensor_errors, "--lens-errors": lens_errors,
+                "--vary-layout": vary_layout or None,
             }  # fmt: skip
             _refuse_options_of_street(scenario, of_street)
             written = simulate_table(

@@ -23,6 +23,7 @@ from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
+from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
 from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
@@ -44,9 +45,9 @@ MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
-_MAX_SENSOR_ERRORS = 10.0
+_MAX_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT = range(7)  # each has its own random stream
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT, _LENS = range(8)  # each has its own random stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
     sensor_errors: float | ScanErrors = 0.0,
+    lens_errors: float = 0.0,
     vary_layout: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -94,6 +96,8 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         sensor_errors: of the LiDAR; or their size, 0 for an ideal one, 1 for what real ones have:
             elevations of beams, width of beams, motion during a turn, ranges on dark surfaces, as
             the seed draws them.
+        lens_errors: size of the errors of the lenses in the rig files, 1 for those that a good
+            calibration with a target leaves; the truth is then what goes best with these lenses.
         vary_layout: draw the street's width, curves, gardens, heights and what stands in it by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
         progress: called with the stage, its steps done, and their number.
@@ -110,7 +114,10 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
     _require_range(frames, step_m)
     _require_sizes(rig)
-    guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
+    stated = draw_lens_errors(
+        rig, _size("lens", lens_errors), np.random.default_rng([seed, _LENS])
+    )
+    guess = perturb(stated, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
@@ -120,7 +127,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         made = Path(folder)
         _write_scans(made / "lidar", lidar, drive, seed, progress)
         _write_images(made / "cameras", rig, drive, seed, progress)
-        rig.save(made / REFERENCE_FILE)
+        stated.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
         for name in _WRITTEN:
             (made / name).rename(out / name)
@@ -131,10 +138,14 @@ def simulate_street(  # noqa: PLR0913 - each of its own
 def _draw_errors(wanted: float | ScanErrors, beams: int, seed: int) -> ScanErrors:
     if isinstance(wanted, ScanErrors):
         return wanted
-    if not 0 <= wanted <= _MAX_SENSOR_ERRORS:
-        raise ValueError(f"sensor errors of {wanted}: 0 to {_MAX_SENSOR_ERRORS:g} expected")
     rng = np.random.default_rng([seed, _SENSOR])
-    return draw_scan_errors(beams, wanted, rng) if wanted else ScanErrors()
+    return draw_scan_errors(beams, wanted, rng) if _size("sensor", wanted) else ScanErrors()
+
+
+def _size(of: str, wanted: float) -> float:
+    if not 0 <= wanted <= _MAX_ERRORS:
+        raise ValueError(f"{of} errors of {wanted}: 0 to {_MAX_ERRORS:g} expected")
+    return wanted
 
 
 def build_drive(
