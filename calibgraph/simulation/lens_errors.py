@@ -62,9 +62,9 @@ def _as_stated(camera: Camera, size: float, rng: np.random.Generator) -> Camera:
 
 def _nearest(stated: Camera, camera: Camera) -> Array:
     """(4, 4) T_camera_lidar with which the stated lens projects as the true camera does."""
-    u, v = (np.linspace(0, side - 1, count)
-            for side, count in zip((camera.width_px, camera.height_px), _GRID_PX, strict=True))  # fmt: skip
-    pixels_px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    sides = zip((camera.width_px, camera.height_px), _GRID_PX, strict=True)
+    grid = np.meshgrid(*(np.linspace(0, side - 1, count) for side, count in sides))
+    pixels_px = np.stack(grid, axis=-1).reshape(-1, 2)
     directions = pixel_directions(camera, pixels_px)
     seen = directions.any(axis=1)
     points = np.concatenate([depth * directions[seen] for depth in _DEPTHS_M])

@@ -47,7 +47,8 @@ _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
 _MAX_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT, _LENS = range(8)  # each has its own random stream
+# Each has its own random stream.
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT, _LENS = range(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +115,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
     _require_range(frames, step_m)
     _require_sizes(rig)
-    stated = draw_lens_errors(
-        rig, _size("lens", lens_errors), np.random.default_rng([seed, _LENS])
-    )
+    stated = draw_lens_errors(rig, _size("lens", lens_errors), np.random.default_rng([seed, _LENS]))
     guess = perturb(stated, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     progress = progress or no_progress

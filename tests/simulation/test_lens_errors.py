@@ -1,0 +1,74 @@
+"""Lenses that are not quite as the rig files state them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import Camera, Rig, load_rig, simulate_street
+from calibgraph.simulation.cameras import pixel_directions
+from calibgraph.simulation.lens_errors import draw_lens_errors
+from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+from tests.simulation.conftest import small_camera
+
+
+def missed_px(stated: Camera, camera: Camera, T_camera_lidar: np.ndarray) -> float:
+    """Root mean square, over the middle of the image and 5 to 40 m, of where points are seen."""
+    sides = (np.linspace(0.1 * n, 0.9 * n, 9) for n in (camera.width_px, camera.height_px))
+    pixels_px = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    rays = pixel_directions(camera, pixels_px)
+    seen = rays.any(axis=1)
+    errors = []
+    for depth in (5.0, 10.0, 20.0, 40.0):
+        points = depth * rays[seen]
+        T = T_camera_lidar @ np.linalg.inv(camera.T_camera_lidar)
+        there, _ = stated.lens.project(points @ T[:3, :3].T + T[:3, 3])
+        errors.append(np.linalg.norm(there - pixels_px[seen], axis=1))
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+@pytest.mark.parametrize("name", [name for name in RIG_NAMES if name != "panorama"])
+def test_the_stated_pose_goes_best_with_the_stated_lens(name: str) -> None:
+    rig = rig_of(name)
+    stated = draw_lens_errors(rig, 1.0, np.random.default_rng(3))
+    for key, camera in rig.cameras.items():
+        one = stated.cameras[key]
+        assert one.intrinsics_px != camera.intrinsics_px
+        own = missed_px(one, camera, one.T_camera_lidar)
+        assert own < 0.7 * missed_px(one, camera, camera.T_camera_lidar)
+        assert own < 5e-4 * camera.width_px
+
+
+def test_the_size_scales_them_and_none_changes_nothing() -> None:
+    rig = rig_of("walkley")
+    assert draw_lens_errors(rig, 0.0, np.random.default_rng(0)) == rig
+    for size in (1.0, 2.0):
+        rng = np.random.default_rng(1)
+        cameras = [c for _ in range(200) for c in draw_lens_errors(rig, size, rng).cameras.values()]
+        true = rig.cameras["primary"].intrinsics_px
+        focal = np.std([c.intrinsics_px.fx / true.fx for c in cameras])
+        centre = np.std([c.intrinsics_px.cy for c in cameras])
+        assert focal == pytest.approx(1e-3 * size, rel=0.2)
+        assert centre == pytest.approx(5e-4 * 1920 * size, rel=0.2)
+    panorama = rig_of("panorama")
+    assert draw_lens_errors(panorama, 1.0, np.random.default_rng(0)) == panorama
+
+
+def test_both_rig_files_state_them_and_the_sensors_see_as_before(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    rig = Rig(cameras={"front": small_camera("pinhole")})
+    for name, size in (("exact", 0.0), ("stated", 1.0)):
+        simulate_street(tmp_path / name, rig, beams=16, frames=1, seed=5, lens_errors=size)
+    files = {path.relative_to(tmp_path / "exact") for path in (tmp_path / "exact").rglob("*.*")}
+    for file in files:
+        exact, stated = (tmp_path / name / file for name in ("exact", "stated"))
+        assert (exact.read_bytes() == stated.read_bytes()) == (file.suffix != ".yaml"), file
+    guess, truth = (load_rig(tmp_path / "stated" / f"{n}.yaml") for n in ("rig", "reference"))
+    assert (
+        guess.cameras["front"].lens.packed.tolist() == truth.cameras["front"].lens.packed.tolist()
+    )
+    with pytest.raises(ValueError, match="lens errors of -1"):
+        simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, lens_errors=-1)
+    assert not (tmp_path / "wrong").exists()
