@@ -72,11 +72,13 @@ class Evidence:
         """Their names, in the rig's order."""
         return tuple(self.solution.T_camera_lidar)
 
-    @cached_property
+    @property
     def of_correspondences(self) -> Evidence:
         """The same of the solution without what cameras see in common."""
-        if self.solution.before_pairs is None:
-            return self
+        return self if self.solution.before_pairs is None else self._without_pairs
+
+    @cached_property
+    def _without_pairs(self) -> Evidence:
         return Evidence(self.solution.without_pairs(), self.guess)
 
     @property

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -96,3 +99,16 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)
+
+
+def test_it_goes_without_the_garbage_collector(pair: Rig) -> None:
+    table = simulated(pair, frames=3)
+    gc.disable()
+    try:
+        evidence = Evidence(solve_joint(pair, table), guess=pair)
+        assert evidence.of_correspondences.joint_covariance is not None
+        gone = weakref.ref(evidence)
+        del evidence
+        assert gone() is None
+    finally:
+        gc.enable()

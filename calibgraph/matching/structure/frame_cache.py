@@ -43,7 +43,7 @@ class FrameCache:
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
         self._clouds.keep_only(lambda key: key[0][0] in kept)
         self._images.keep_only(lambda key: key[0][0] in kept)
-        self._tables.keep_only(self._clouds.values())
+        self._tables.keep_only(cloud.identity for cloud in self._clouds.values())
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""

@@ -34,12 +34,14 @@ class PreparedCloud:
         seen_from_origin: whether the points were measured from the LiDAR frame's origin. Clouds
             that join several sensors, or are in a vehicle's frame, were not.
         tables: where the windows of this and other clouds are kept.
+        identity: by which they know this cloud; not the cloud, which knows them.
     """
 
     points_lidar_m: Array
     intensity_rank: Array
     seen_from_origin: bool
     tables: WindowTables = field(default_factory=WindowTables)
+    identity: object = field(default_factory=object)
 
     @staticmethod
     def from_points(
@@ -95,7 +97,7 @@ class PreparedCloud:
 
         if not self.seen_from_origin:
             return make()
-        return self.tables.get((self, spacing_rad, stride_spacings, fine), make)
+        return self.tables.get((self.identity, spacing_rad, stride_spacings, fine), make)
 
     def count_windows(
         self, camera: Camera, spacing_rad: float, stride_spacings: float, *, most: int

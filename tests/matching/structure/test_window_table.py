@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -101,3 +103,17 @@ def test_a_tree_of_neighbours_that_was_dropped_is_built_again_alike(
     fresh = select_windows(alone, right, level, max_windows=500)
     for name in vars(fresh):
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+
+
+def test_a_cloud_and_its_windows_go_without_the_garbage_collector(truth: Rig) -> None:
+    """Else a program that calibrates again and again holds the clouds of the last dozen calls."""
+    data = calibgraph.load_dataset(SAMPLE)
+    gc.disable()
+    try:
+        cloud = PreparedCloud.from_points(data.frames[0].load_cloud())
+        select_windows(cloud, truth.cameras["front_left"], LEVELS[3], max_windows=100)
+        gone = weakref.ref(cloud)
+        del cloud
+        assert gone() is None
+    finally:
+        gc.enable()
