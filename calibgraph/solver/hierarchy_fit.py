@@ -27,6 +27,8 @@ TOLERANCE = 1e-6
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 
+_ROUNDING = 1e-14  # smallest part of a sum that a difference may leave
+
 _DAMPINGS = (0.0, *10.0 ** np.arange(-4, 5))
 """Of the diagonal: the first that descends; mostly none is needed."""
 
@@ -137,7 +139,9 @@ class Equations:
         if not np.isfinite(of_cameras).all() or diagonal.min() <= 0:
             return False
         values = np.linalg.eigvalsh(unit_diagonal(of_cameras)[0])
-        return bool(values[0] > _SINGULAR * values[-1])
+        before = np.sqrt(np.diag(hessian)[:rows])  # of which a difference is left
+        left = np.linalg.eigvalsh(of_cameras / np.outer(before, before))[0]
+        return bool(values[0] > _SINGULAR * values[-1] and left > _ROUNDING)
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Of the shared poses, and of those of each place."""
