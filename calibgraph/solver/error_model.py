@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.cloud_bends import bend_evidence
 from calibgraph.solver.component_sizes import Sizes, sizes_of
@@ -199,8 +198,6 @@ def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
     """The numbers of the frames of each place, over all cameras."""
     blocks = [block.frame_numbers for block in inliers.blocks.values()]
     frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
-    if not all(isinstance(block, CameraBlock) for block in inliers.blocks.values()):
-        return [frames]  # of a table in many files: sums over places are not to be had
     return split_places(metadata, frames)
 
 

@@ -150,20 +150,18 @@ class PlacedBlock:
         """The correspondences of a camera.
 
         Args:
-            camera: its correspondences; of a table in many files, all of one place.
+            camera: its correspondences.
             scale: of their residuals.
             places: the frame numbers of each place.
         """
-        of_frame = place_of(camera.frame_numbers, places)
+        of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
         if len(places) == 1:
-            counts = camera.frame_counts
             edges = np.array([0, len(camera)])
             return PlacedBlock(camera.with_scale(scale), edges, of_frame, counts)
-        counts = np.diff(camera.frame_edges)
-        of_row = np.repeat(of_frame, counts)
-        rows = np.argsort(of_row, kind="stable")
-        edges = np.searchsorted(of_row[rows], np.arange(len(places) + 1))
-        return PlacedBlock(camera.select(rows).with_scale(scale), edges, of_frame, counts)
+        edges = np.zeros(len(places) + 1, dtype=np.int64)
+        np.add.at(edges[1:], of_frame, counts)
+        block = camera.sorted_by(of_frame).with_scale(scale)
+        return PlacedBlock(block, edges.cumsum(), of_frame, counts)
 
     @property
     def frames(self) -> Numbers:
