@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.block_arrays import RobustBlock
+from factors.block_arrays import RobustBlock, contiguous
 from factors.block_sums import BlockSums, unpack_sums
 from factors.compiled import compiled
 from factors.lens import Lens
@@ -99,9 +99,14 @@ class EpipolarBlock(RobustBlock):
 
     def frame_sums(self, T_a_b: gtsam.Pose3, edges: NDArray[np.int64]) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the features, stacked."""
-        R, t = np.ascontiguousarray(T_a_b.rotation().matrix()), np.asarray(T_a_b.translation())
+        return self.run_sums(T_a_b.matrix()[None], edges)
+
+    def run_sums(self, T_a_b: Array, edges: NDArray[np.int64]) -> BlockSums:
+        """As :meth:`frame_sums`, with an (r, 4, 4) pose of each run, or (1, 4, 4) of all."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        packed = _accumulate(R, t, self._rays, loss_id(self.loss), self.scale * self.sigma, edges)
+        packed = _accumulate(
+            contiguous(T_a_b), self._rays, loss_id(self.loss), self.scale * self.sigma, edges
+        )
         return unpack_sums(packed / self.sigma**2)
 
     def residuals(self, T_a_b: gtsam.Pose3) -> Array:
@@ -189,12 +194,13 @@ def _sampson(R, t, row, jacobian, scratch):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def _accumulate(R, t, rays, loss, scale, edges):  # type: ignore[no-untyped-def]
+def _accumulate(T_a_b, rays, loss, scale, edges):  # type: ignore[no-untyped-def]
     """(segments, 28) sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
     out = np.zeros((len(edges) - 1, 28))
     jacobian, scratch = np.empty(6), np.empty((2, 6))
     for segment in range(len(edges) - 1):
-        sums = out[segment]
+        T = T_a_b[min(np.int64(segment), len(T_a_b) - 1)]
+        R, t, sums = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), out[segment]
         for k in range(edges[segment], edges[segment + 1]):
             r = _sampson(R, t, rays[k], jacobian, scratch)
             rho, psi = loss_and_weight(loss, scale, r * r)

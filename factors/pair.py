@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block import ProjectionBlock
+from factors.block import ProjectionBlock, to_runs
 from factors.block_sums import BlockSums, square_root
 from factors.epipolar import EpipolarBlock, epipolar_residual
 from factors.lens import Lens
@@ -109,6 +109,31 @@ def pair_sums(block: PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) 
     sums = block.sums(T_lidar_a.between(T_lidar_b))
     chain = pair_chain(T_lidar_a, T_lidar_b)
     return BlockSums(chain.T @ sums.hessian @ chain, chain.T @ sums.gradient, sums.cost)
+
+
+def pair_run_sums(
+    block: PairBlock, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]
+) -> BlockSums:
+    """As :func:`pair_sums` of each run of the features at poses of its own, stacked.
+
+    Args:
+        block: of features of camera A, seen in camera B.
+        T_lidar_a: (r, 4, 4) of each run.
+        T_lidar_b: (r, 4, 4) of each run.
+        edges: (r + 1,) where the runs begin, and the end.
+    """
+    if isinstance(block, SurfaceBlock):
+        return block.run_sums(T_lidar_a, T_lidar_b, edges)
+    poses = [(gtsam.Pose3(a), gtsam.Pose3(b)) for a, b in zip(T_lidar_a, T_lidar_b, strict=True)]
+    chains = np.stack([pair_chain(a, b) for a, b in poses])
+    if isinstance(block, ProjectionBlock):
+        T_b_a = np.stack([b.between(a).matrix() for a, b in poses])
+        sums = block.run_sums(T_b_a, to_runs(edges))
+    else:
+        sums = block.run_sums(np.stack([a.between(b).matrix() for a, b in poses]), edges)
+    turned = chains.transpose(0, 2, 1)
+    gradient = (turned @ sums.gradient[..., None])[..., 0]
+    return BlockSums(turned @ sums.hessian @ chains, gradient, sums.cost)
 
 
 def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:

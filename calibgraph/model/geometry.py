@@ -168,12 +168,10 @@ def adjoints(T_a_b: Array) -> Array:
     Args:
         T_a_b: (f, 4, 4).
     """
-    R, (x, y, z) = T_a_b[:, :3, :3], T_a_b[:, :3, 3].T
-    zero = np.zeros(len(R))
-    crossed = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    R = T_a_b[:, :3, :3]
     Ad = np.zeros((len(R), 6, 6))
     Ad[:, :3, :3] = Ad[:, 3:, 3:] = R
-    Ad[:, 3:, :3] = crossed @ R
+    Ad[:, 3:, :3] = crosses(T_a_b[:, :3, 3]) @ R
     return Ad
 
 

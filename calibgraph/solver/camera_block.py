@@ -85,6 +85,10 @@ class CameraBlock:
         edges = self.frame_edges
         return np.repeat(np.isin(self.frame[edges[:-1]], numbers), np.diff(edges))
 
+    def sorted_by(self, of_frame: NDArray[np.int64]) -> CameraBlock:
+        """The same correspondences in the order of a number of their frames, (f,)."""
+        return self.select(np.argsort(np.repeat(of_frame, self.frame_counts), kind="stable"))
+
     def select_evenly(self, most: int) -> CameraBlock:
         """Every k-th correspondence, so that at most so many are left."""
         step = -(-len(self.frame) // most)

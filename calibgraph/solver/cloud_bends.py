@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import crosses, to_T_camera_lidar
+from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.hierarchy import place_of
 from calibgraph.solver.residual_scale import ResidualScale
@@ -88,13 +88,15 @@ def bend_evidence(
     """
     some = block.select_evenly(_SAMPLE)
     share = len(some) / len(block)
-    by_pose, by_bend, residuals = _jacobians(some.block, scale, T_lidar_camera)
+    place = place_of(some.frame, places)
+    order = np.argsort(place, kind="stable")
+    by_pose, by_bend, residuals = _jacobians(some.block.select(order), scale, T_lidar_camera)
     weak = share * weak
     bends = by_bend.shape[1]
     information, vector = np.zeros((len(places), bends, bends)), np.zeros((len(places), bends))
-    place = np.repeat(place_of(some.frame, places), 2)
-    for number in np.unique(place):
-        rows = place == number
+    edges = 2 * np.searchsorted(place[order], np.arange(len(places) + 1))
+    for number in np.flatnonzero(np.diff(edges)):
+        rows = slice(edges[number], edges[number + 1])
         left = by_bend[rows] + by_pose[rows] @ _follow(by_pose[rows], by_bend[rows], weak)
         information[number] = left.T @ left / share
         vector[number] = left.T @ residuals[rows] / share
@@ -114,19 +116,17 @@ def _jacobians(
     points = block.points_lidar_m @ T[:3, :3].T + T[:3, 3]
     _, by_point = block.lens.project_with_jacobian(points)
     residuals, _ = block.residuals(T_lidar_camera)
-    bends = np.einsum("ij,knj->nik", T[:3, :3], bends_at(block.points_lidar_m))
-    by_pose = by_point @ np.concatenate(
-        [crosses(points), np.tile(-np.eye(3), (len(points), 1, 1))], 2
+    bends = (bends_at(block.points_lidar_m) @ T[:3, :3].T).transpose(0, 2, 1)
+    gradient, (x, y, z) = by_point.transpose(2, 1, 0).copy(), points.T
+    across, down, ahead = gradient
+    by_rotation = np.stack(  # of a point q and the gradient g: g x q
+        [down * z - ahead * y, ahead * x - across * z, across * y - down * x]
     )
-    values = np.concatenate([by_pose, by_point @ bends, residuals[..., None]], axis=2)
+    by_bend = np.einsum("jin,kjn->kin", gradient, bends)
+    values = np.concatenate([by_rotation, -gradient, by_bend, residuals.T[None]])  # (10, 2, n)
     root = block.sqrt_information
     if root is not None:  # upper triangular
-        values = np.stack(
-            [
-                root[:, :1] * values[:, 0] + root[:, 1:2] * values[:, 1],
-                root[:, 2:] * values[:, 1],
-            ],
-            axis=1,
-        )
-    whitened = values.reshape(-1, values.shape[2]) / scale.sigma
+        s00, s01, s11 = root.T
+        values = np.stack([s00 * values[:, 0] + s01 * values[:, 1], s11 * values[:, 1]], axis=1)
+    whitened = values.transpose(2, 1, 0).reshape(-1, len(values)) / scale.sigma
     return whitened[:, :6], whitened[:, 6:-1], whitened[:, -1]

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.cloud_bends import bend_evidence
 from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
-from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock
+from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock, PlacedPair
 from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy, linearize
 from calibgraph.solver.hierarchy_poses import start_poses
 from calibgraph.solver.objective import Objective, Scales
@@ -84,7 +83,7 @@ class ErrorFit:
     def without_pose_graph(self) -> HierarchyFit | None:
         """The fit without priors and measured relative poses, of the same sizes."""
         model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
-        return fit_hierarchy(model, self.fit.poses, relative_tolerance=_COARSE_TOLERANCE)
+        return fit_hierarchy(model, self.fit, relative_tolerance=_COARSE_TOLERANCE)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -190,8 +189,8 @@ def fit_errors(
         if fit is None or found.is_near(sizes):
             break
         model, sizes = replace(model, components=found.scale(usual)), found
-        fit = fit_hierarchy(model, fit.poses, relative_tolerance=_COARSE_TOLERANCE)
-    fit = None if fit is None else fit_hierarchy(model, fit.poses)
+        fit = fit_hierarchy(model, fit, relative_tolerance=_COARSE_TOLERANCE)
+    fit = None if fit is None else fit_hierarchy(model, fit)
     return None if fit is None else ErrorFit(model, fit, tuple(places), sizes)
 
 
@@ -199,8 +198,6 @@ def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
     """The numbers of the frames of each place, over all cameras."""
     blocks = [block.frame_numbers for block in inliers.blocks.values()]
     frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
-    if not all(isinstance(block, CameraBlock) for block in inliers.blocks.values()):
-        return [frames]  # of a table in many files: sums over places are not to be had
     return split_places(metadata, frames)
 
 
@@ -269,16 +266,10 @@ def _held_graph(
     return graph
 
 
-def _placed_pairs(
-    pairs: Sequence[PairTerm], places: Sequence[Numbers]
-) -> list[tuple[int, PairTerm]]:
-    """Each term at each place, its information that of features which err as usual in a frame."""
+def _placed_pairs(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PlacedPair]:
+    """Each term, its information that of features which err as usual in a frame."""
     found = []
     for pair in pairs:
         own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
-        deflated = pair.deflate(usual_excess(own))
-        for place, frames in enumerate(places):
-            rows = np.isin(deflated.frame, frames)
-            if rows.any():
-                found.append((place, deflated.select(rows)))
+        found.append(PlacedPair.of(pair.deflate(usual_excess(own)), places))
     return found

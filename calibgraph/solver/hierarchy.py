@@ -17,7 +17,7 @@ o_p^-1 n_b. Priors and measured relative poses act on x_c.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,6 +32,7 @@ from calibgraph.solver.factor_graph import join
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import (
     BlockSums,
+    PairBlock,
     ProjectionBlock,
     bent_between_factor,
     pair_block_factor,
@@ -149,20 +150,18 @@ class PlacedBlock:
         """The correspondences of a camera.
 
         Args:
-            camera: its correspondences; of a table in many files, all of one place.
+            camera: its correspondences.
             scale: of their residuals.
             places: the frame numbers of each place.
         """
-        of_frame = place_of(camera.frame_numbers, places)
+        of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
         if len(places) == 1:
-            counts = camera.frame_counts
             edges = np.array([0, len(camera)])
             return PlacedBlock(camera.with_scale(scale), edges, of_frame, counts)
-        counts = np.diff(camera.frame_edges)
-        of_row = np.repeat(of_frame, counts)
-        rows = np.argsort(of_row, kind="stable")
-        edges = np.searchsorted(of_row[rows], np.arange(len(places) + 1))
-        return PlacedBlock(camera.select(rows).with_scale(scale), edges, of_frame, counts)
+        edges = np.zeros(len(places) + 1, dtype=np.int64)
+        np.add.at(edges[1:], of_frame, counts)
+        block = camera.sorted_by(of_frame).with_scale(scale)
+        return PlacedBlock(block, edges.cumsum(), of_frame, counts)
 
     @property
     def frames(self) -> Numbers:
@@ -189,20 +188,57 @@ class PlacedBlock:
 
 
 @dataclass(frozen=True, eq=False)
+class PlacedPair:
+    """What two cameras see in common, place by place.
+
+    Attributes:
+        a, b: their names.
+        block: the features, sorted by place.
+        places: (r,) of those that have features, in rising order.
+        edges: (r + 1,) where each begins in the block, and the end.
+    """
+
+    a: str
+    b: str
+    block: PairBlock
+    places: Numbers
+    edges: Numbers
+
+    @staticmethod
+    def of(term: PairTerm, places: Sequence[Numbers]) -> PlacedPair:
+        """The features of a term.
+
+        Args:
+            term: with its sigma.
+            places: the frame numbers of each place.
+        """
+        of_row = place_of(term.frame, places)
+        rows = np.argsort(of_row, kind="stable")
+        found, first = np.unique(of_row[rows], return_index=True)
+        edges = np.append(first, len(rows))
+        return PlacedPair(term.a, term.b, term.block.select(rows), found, edges)
+
+    def at_each_place(self) -> Iterator[tuple[int, PairBlock]]:
+        """The features of each place."""
+        for place, first, end in zip(self.places, self.edges[:-1], self.edges[1:], strict=True):
+            yield int(place), self.block.select(np.arange(first, end))
+
+
+@dataclass(frozen=True, eq=False)
 class Hierarchy:
     """The data, place by place, and the covariances of what they have in common.
 
     Attributes:
         cameras: their names.
         blocks: per camera with correspondences.
-        pairs: what cameras see in common: the place of each term, and the term.
+        pairs: what cameras see in common.
         pose_graph: priors and measured relative poses, on ``x_c``.
         components: of the error.
     """
 
     cameras: tuple[str, ...]
     blocks: Mapping[str, PlacedBlock]
-    pairs: Sequence[tuple[int, PairTerm]]
+    pairs: Sequence[PlacedPair]
     pose_graph: gtsam.NonlinearFactorGraph
     components: Components
 
@@ -239,9 +275,10 @@ def hierarchy_graph(model: Hierarchy) -> gtsam.NonlinearFactorGraph:
             if name in model.blocks:
                 block = model.blocks[name].at_place(place)
                 graph.add(pair_block_factor(cloud_key(place), key, block))
-    for place, term in model.pairs:
-        key_a, key_b = (gtsam.symbol("n", model.cameras.index(n)) for n in (term.a, term.b))
-        graph.add(placed_pair_factor(cloud_key(place), key_a, key_b, term.block))
+    for pair in model.pairs:
+        key_a, key_b = (gtsam.symbol("n", model.cameras.index(n)) for n in (pair.a, pair.b))
+        for place, features in pair.at_each_place():
+            graph.add(placed_pair_factor(cloud_key(place), key_a, key_b, features))
     return join(graph, model.pose_graph)
 
 

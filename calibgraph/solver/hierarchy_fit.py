@@ -7,6 +7,7 @@ on the whole graph, at a fraction of the time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +19,7 @@ from calibgraph.model.geometry import adjoints, invert, invert_each
 from calibgraph.solver.factor_graph import MAX_ITERATIONS
 from calibgraph.solver.hierarchy import Hierarchy
 from calibgraph.solver.hierarchy_poses import Poses, placed_edges, shared_edges
-from factors import pair_sums, unit_diagonal
+from factors import pair_run_sums, unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,7 @@ class HierarchyFit:
 
     Attributes:
         poses: of all variables.
+        equations: normal equations there.
         shared_covariance: (G, G) marginal of all shared poses but the identity, in their tangents.
         place_slope: (P, L, G) the poses of a place move by minus this times the shared ones.
         place_covariance: (P, L, L) of the poses of a place, the shared ones given.
@@ -49,6 +51,7 @@ class HierarchyFit:
     """
 
     poses: Poses
+    equations: Equations
     shared_covariance: Array
     place_slope: Array
     place_covariance: Array
@@ -73,26 +76,109 @@ class HierarchyFit:
         return dict(zip(model.cameras, invert(self.poses.shared), strict=False))
 
 
-class Equations:
-    """The normal equations of all poses, in blocks: those of a place meet its own and the shared.
+class Blocks:
+    """Parts of the normal equations: the poses of a place meet its own and the shared.
 
     Attributes:
         shared: (S, S, 6, 6); placed: (P, L, L, 6, 6); across: (P, L, S, 6, 6) of the Hessian.
         shared_gradient: (S, 6); placed_gradient: (P, L, 6).
         cost: twice GTSAM's error.
-        distances: (P, L) of the poses of a place from the shared ones, in sigmas.
     """
 
-    def __init__(self, model: Hierarchy, poses: Poses) -> None:
+    def __init__(self, poses: Poses) -> None:
         S, (P, L) = len(poses.shared), poses.placed.shape[:2]
         self.shared, self.shared_gradient = np.zeros((S, S, 6, 6)), np.zeros((S, 6))
         self.placed, self.placed_gradient = np.zeros((P, L, L, 6, 6)), np.zeros((P, L, 6))
         self.across, self.cost = np.zeros((P, L, S, 6, 6)), 0.0
-        self.distances = np.zeros((P, L))
-        self._add_shared(model, poses)
-        self._add_places(model, poses)
+
+    def add(self, other: Blocks) -> None:
+        """Add other parts, of the same poses."""
+        self.shared += other.shared
+        self.shared_gradient += other.shared_gradient
+        self.placed += other.placed
+        self.placed_gradient += other.placed_gradient
+        self.across += other.across
+        self.cost += other.cost
+
+    def add_shared(self, numbers: Sequence[int], hessian: Array, gradient: Array) -> None:
+        """What acts on some of the shared poses.
+
+        Args:
+            numbers: of these.
+            hessian: (6 n, 6 n).
+            gradient: (6 n,).
+        """
+        blocks = hessian.reshape(len(numbers), 6, len(numbers), 6).swapaxes(1, 2)
+        self.shared[np.ix_(numbers, numbers)] += blocks
+        self.shared_gradient[numbers] += gradient.reshape(-1, 6)
+
+
+class DataSums(Blocks):
+    """Correspondences and pairs of cameras at given poses, whatever the components of the error."""
+
+    def __init__(self, model: Hierarchy, poses: Poses) -> None:
+        super().__init__(poses)
         self._add_matches(model, poses)
         self._add_pairs(model, poses)
+
+    def _add_matches(self, model: Hierarchy, poses: Poses) -> None:
+        """Correspondences, on o_p^-1 a_cp."""
+        for name, block in model.blocks.items():
+            local = 1 + model.cameras.index(name)
+            T_camera_cloud = invert_each(poses.placed[:, local]) @ poses.placed[:, 0]
+            sums = block.sums(T_camera_cloud)
+            cloud = -adjoints(T_camera_cloud)
+            by_cloud = sums.hessian @ cloud
+            self.cost += float(sums.cost.sum())
+            self.placed[:, 0, 0] += cloud.transpose(0, 2, 1) @ by_cloud
+            self.placed[:, local, 0] += by_cloud
+            self.placed[:, 0, local] += by_cloud.transpose(0, 2, 1)
+            self.placed[:, local, local] += sums.hessian
+            self.placed_gradient[:, 0] += np.einsum("pij,pi->pj", cloud, sums.gradient)
+            self.placed_gradient[:, local] += sums.gradient
+
+    def _add_pairs(self, model: Hierarchy, poses: Poses) -> None:
+        """Features that two cameras share, on o_p^-1 n_a and o_p^-1 n_b."""
+        if not model.pairs:
+            return
+        N = len(model.cameras)
+        T_cloud_lidar = invert_each(poses.placed[:, 0])
+        T_paired_lidar = invert_each(poses.shared[2 * N : 3 * N])
+        T_paired_cloud = T_paired_lidar[:, None] @ poses.placed[:, 0]
+        by_cloud = -adjoints(T_paired_cloud.reshape(-1, 4, 4)).reshape(N, -1, 6, 6)
+        for pair in model.pairs:
+            cameras, places = [model.cameras.index(name) for name in (pair.a, pair.b)], pair.places
+            numbers = [2 * N + camera for camera in cameras]
+            seen = [T_cloud_lidar[places] @ poses.shared[number] for number in numbers]
+            sums = pair_run_sums(pair.block, seen[0], seen[1], pair.edges)
+            chain = np.concatenate([by_cloud[camera, places] for camera in cameras], axis=1)
+            turned = chain.transpose(0, 2, 1)
+            across = turned @ sums.hessian
+            self.cost += float(sums.cost.sum())
+            self.placed[places, 0, 0] += across @ chain
+            self.placed_gradient[places, 0] += (turned @ sums.gradient[..., None])[..., 0]
+            halves = across.reshape(-1, 6, 2, 6).transpose(0, 2, 1, 3)
+            self.across[places[:, None], 0, numbers] += halves
+            self.add_shared(numbers, sums.hessian.sum(axis=0), sums.gradient.sum(axis=0))
+
+
+class Equations(Blocks):
+    """The normal equations of all poses.
+
+    Attributes:
+        model: of the error.
+        data: their part of the data.
+        distances: (P, L) of the poses of a place from the shared ones, in sigmas.
+    """
+
+    def __init__(self, model: Hierarchy, poses: Poses, data: DataSums | None = None) -> None:
+        super().__init__(poses)
+        self.model = model
+        self.data = DataSums(model, poses) if data is None else data
+        self.add(self.data)
+        self.distances: Array = np.zeros(poses.placed.shape[:2])
+        self._add_shared(model, poses)
+        self._add_places(model, poses)
         self._add_pose_graph(model, poses)
 
     @cached_property
@@ -157,87 +243,48 @@ class Equations:
         self.shared_gradient += (edges.jacobian.T @ edges.weighted).reshape(S, 6)
 
     def _add_places(self, model: Hierarchy, poses: Poses) -> None:
-        edges, (P, L) = placed_edges(model, poses), self.distances.shape
-        place, local = np.repeat(np.arange(P), L), np.tile(np.arange(L), P)
+        edges, (P, L) = placed_edges(model, poses), poses.placed.shape[:2]
         self.distances = np.sqrt(edges.squared).reshape(P, L)
         self.cost += float(edges.cost.sum())
         information = edges.information * edges.weight[:, None, None]
-        own = edges.to_second.transpose(0, 2, 1) @ information
-        shared = edges.to_first.transpose(0, 2, 1) @ information
-        error = edges.error[..., None]
-        self.placed[place, local, local] += own @ edges.to_second
-        self.placed_gradient[place, local] += (own @ error)[..., 0]
-        self.across[place, local, edges.first] += own @ edges.to_first
-        first = edges.first[:L]  # of every place the same, each once
-        of_all = (shared @ edges.to_first).reshape(P, L, 6, 6).sum(axis=0)
-        self.shared[first, first] += of_all
-        self.shared_gradient[first] += (shared @ error).reshape(P, L, 6).sum(axis=0)
-
-    def _add_matches(self, model: Hierarchy, poses: Poses) -> None:
-        """Correspondences, on o_p^-1 a_cp."""
-        for name, block in model.blocks.items():
-            local = 1 + model.cameras.index(name)
-            T_camera_cloud = invert_each(poses.placed[:, local]) @ poses.placed[:, 0]
-            sums = block.sums(T_camera_cloud)
-            cloud = -adjoints(T_camera_cloud)
-            by_cloud = sums.hessian @ cloud
-            self.cost += float(sums.cost.sum())
-            self.placed[:, 0, 0] += cloud.transpose(0, 2, 1) @ by_cloud
-            self.placed[:, local, 0] += by_cloud
-            self.placed[:, 0, local] += by_cloud.transpose(0, 2, 1)
-            self.placed[:, local, local] += sums.hessian
-            self.placed_gradient[:, 0] += np.einsum("pij,pi->pj", cloud, sums.gradient)
-            self.placed_gradient[:, local] += sums.gradient
-
-    def _add_pairs(self, model: Hierarchy, poses: Poses) -> None:
-        """Features that two cameras share, on o_p^-1 n_a and o_p^-1 n_b."""
-        N = len(model.cameras)
-        for place, term in model.pairs:
-            cloud = gtsam.Pose3(poses.placed[place, 0])
-            numbers = [2 * N + model.cameras.index(name) for name in (term.a, term.b)]
-            cameras = [gtsam.Pose3(poses.shared[number]) for number in numbers]
-            sums = pair_sums(term.block, *(cloud.between(pose) for pose in cameras))
-            chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
-            by_cloud = (chain.T @ sums.hessian).reshape(6, 2, 6).swapaxes(0, 1)
-            self.cost += float(sums.cost)
-            self.placed[place, 0, 0] += chain.T @ sums.hessian @ chain
-            self.placed_gradient[place, 0] += chain.T @ sums.gradient
-            self.across[place, 0, numbers] += by_cloud
-            self._add_blocks(numbers, sums.hessian, sums.gradient)
+        both = np.concatenate([edges.to_second, edges.to_first, edges.error[..., None]], axis=2)
+        own = edges.to_second.transpose(0, 2, 1) @ information @ both
+        own, local, first = own.reshape(P, L, 6, 13), np.arange(L), edges.first[:L]
+        self.placed[:, local, local] += own[..., :6]
+        self.across[:, local, first] += own[..., 6:12]
+        self.placed_gradient += own[..., 12]
+        shared = edges.to_first.transpose(0, 2, 1) @ information @ both[..., 6:]
+        of_all = shared.reshape(P, L, 6, 7).sum(axis=0)
+        self.shared[first, first] += of_all[..., :6]
+        self.shared_gradient[first] += of_all[..., 6]
 
     def _add_pose_graph(self, model: Hierarchy, poses: Poses) -> None:
         """Priors and measured relative poses, on x_c."""
         values, graph = gtsam.Values(), model.pose_graph
+        if not graph.size():
+            return
         for camera in range(len(model.cameras)):
             values.insert(gtsam.symbol("x", camera), gtsam.Pose3(poses.shared[camera]))
-        for index in range(graph.size()):
-            factor = graph.at(index)
-            jacobian, right = factor.linearize(values).jacobian()
-            self.cost += float(right @ right)
-            numbers = [gtsam.symbolIndex(key) for key in list(factor.keys())]
-            self._add_blocks(numbers, jacobian.T @ jacobian, -jacobian.T @ right)
-
-    def _add_blocks(self, numbers: list[int], hessian: Array, gradient: Array) -> None:
-        """Of one factor on some of the shared poses."""
-        blocks = hessian.reshape(len(numbers), 6, len(numbers), 6).swapaxes(1, 2)
-        self.shared[np.ix_(numbers, numbers)] += blocks
-        self.shared_gradient[numbers] += gradient.reshape(-1, 6)
+        jacobian, right = graph.linearize(values).jacobian()  # its columns by rising keys
+        self.cost += float(right @ right)
+        numbers = sorted(int(gtsam.symbolIndex(key)) for key in graph.keyVector())
+        self.add_shared(numbers, jacobian.T @ jacobian, -jacobian.T @ right)
 
 
 def fit_hierarchy(
-    model: Hierarchy, start: Poses, *, relative_tolerance: float = TOLERANCE
+    model: Hierarchy, start: Poses | HierarchyFit, *, relative_tolerance: float = TOLERANCE
 ) -> HierarchyFit | None:
     """Minimize by Gauss-Newton, damped where a whole step does not descend.
 
     Args:
         model: of the error.
-        start: of all poses.
+        start: all poses, or a fit of the same data, from whose minimum it goes on.
         relative_tolerance: relative change of the cost at which it stops.
 
     Returns:
         None if a direction is not determined.
     """
-    poses, equations, iterations, converged = start, Equations(model, start), 0, False
+    (poses, equations), iterations, converged = _equations_at(model, start), 0, False
     if not equations.is_determined(len(model.cameras)):
         return None
     while iterations < MAX_ITERATIONS and not converged:
@@ -252,7 +299,7 @@ def fit_hierarchy(
 
 def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
     """A fit with the marginals of another model at the same poses."""
-    return _to_fit(fit.poses, Equations(model, fit.poses), fit.iterations, fit.converged)
+    return _to_fit(*_equations_at(model, fit), fit.iterations, fit.converged)
 
 
 def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
@@ -277,6 +324,7 @@ def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool
     hessian, _, solved = equations.reduced
     return HierarchyFit(
         poses,
+        equations,
         np.asarray(np.linalg.inv(hessian)),
         solved[..., :-1],
         np.asarray(np.linalg.inv(equations.of_places())),
@@ -285,6 +333,16 @@ def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool
         iterations,
         converged,
     )
+
+
+def _equations_at(model: Hierarchy, start: Poses | HierarchyFit) -> tuple[Poses, Equations]:
+    """What a fit has summed up of the same data is not summed up again."""
+    if isinstance(start, Poses):
+        return start, Equations(model, start)
+    known = start.equations
+    if known.model is not model:
+        known = Equations(model, start.poses, known.data)
+    return start.poses, known
 
 
 def _descend(

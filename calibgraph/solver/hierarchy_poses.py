@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import adjoints, crosses, invert, invert_each
-from calibgraph.model.pose_kernel import exponential_times, logarithms
+from calibgraph.model.geometry import invert
+from calibgraph.model.pose_kernel import between_errors, exponential_times
 from calibgraph.solver.hierarchy import Hierarchy
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ def shared_edges(model: Hierarchy, poses: Poses) -> SharedEdges:
     N, S = len(model.cameras), len(poses.shared)
     first = np.r_[3 * N + 1, np.arange(N), np.arange(N)]
     second = np.r_[3 * N, N : 2 * N, 2 * N : 3 * N]
-    error, to_first, to_second = _between(poses.shared[first], poses.shared[second])
+    error, to_first, to_second = between_errors(poses.shared[first], poses.shared[second])
     error[1 : 1 + N] -= model.components.bends @ model.components.bend_mean
     jacobian, edges = np.zeros((len(first), 6, S, 6)), np.arange(len(first))
     jacobian[edges, :, first], jacobian[edges, :, second] = to_first, to_second
@@ -122,28 +122,9 @@ def placed_edges(model: Hierarchy, poses: Poses) -> Edges:
     N, parts = len(model.cameras), model.components
     first, flat = np.tile(np.r_[3 * N, N : 2 * N], model.places), poses.placed.reshape(-1, 4, 4)
     information = parts.place_information.reshape(-1, 6, 6)
-    between = _between(poses.shared[first], flat)
-    return Edges(first, np.arange(len(flat)), *between, information, parts.robust_scale)
-
-
-def _between(one: Array, two: Array) -> tuple[Array, Array, Array]:
-    """(n, 6) error log(one^-1 two), and its (n, 6, 6) derivatives by both tangents."""
-    T_one_two = invert_each(one) @ two
-    error = logarithms(T_one_two)
-    second = _logarithm_jacobians(error)
-    return error, -second @ adjoints(invert_each(T_one_two)), second
-
-
-def _logarithm_jacobians(twists: Array) -> Array:
-    """(n, 6, 6) derivatives of log(T exp(xi)) at T = exp(twist), by xi at 0.
-
-    The series of Bernoulli numbers, up to the fourth power: displacements are far below a radian.
-    """
-    ad = np.zeros((len(twists), 6, 6))
-    ad[:, :3, :3] = ad[:, 3:, 3:] = crosses(twists[:, :3])
-    ad[:, 3:, :3] = crosses(twists[:, 3:])
-    squared = ad @ ad
-    return np.asarray(np.eye(6) + ad / 2 + squared / 12 - squared @ squared / 720)
+    error, by_one, by_two = between_errors(poses.shared[first], flat)
+    number = np.arange(len(flat))
+    return Edges(first, number, error, by_one, by_two, information, parts.robust_scale)
 
 
 def _retract(T: Array, tangents: Array) -> Array:

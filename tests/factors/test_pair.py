@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -19,6 +20,7 @@ from factors import (
     epipolar_factor,
     pair_block_factor,
     pair_projection_factor,
+    pair_run_sums,
     pair_sums,
     surface_factor,
     unproject,
@@ -196,6 +198,24 @@ def test_residuals_equal_the_literal_formula(lenses: tuple[Lens, Lens]) -> None:
             expected = features.lenses[1].project(X_b)[0][0] - features.pixels_b[n]
             factor = features.separate(kind, "l2", 1.0).at(n)
             assert factor.unwhitenedError(values) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_runs_have_the_sums_of_their_features_at_poses_of_their_own(kind: str) -> None:
+    rng, edges = np.random.default_rng(3), np.array([0, 70, 70, 90, 100])  # more than a tile
+    block = Features(LENSES["mixed"], 100).block(kind).rescale(scale=2.0, sigma=0.7)
+    poses = [
+        tuple(pose.retract(rng.normal(0, 0.02, 6)) for pose in (T_LIDAR_A, T_LIDAR_B))
+        for _ in edges[1:]
+    ]
+    T_lidar_a, T_lidar_b = (np.stack([each[k].matrix() for each in poses]) for k in (0, 1))
+    found = pair_run_sums(block, T_lidar_a, T_lidar_b, edges)
+    for run, (first, end) in enumerate(pairwise(edges)):
+        expected = pair_sums(block.select(np.arange(first, end)), *poses[run])
+        assert found.cost[run] == pytest.approx(expected.cost, rel=1e-12)
+        for one, two in zip((found.hessian, found.gradient),
+                            (expected.hessian, expected.gradient), strict=True):  # fmt: skip
+            np.testing.assert_allclose(one[run], two, rtol=1e-9, atol=1e-9 * np.abs(two).max())
 
 
 def test_an_epipolar_residual_is_the_distance_from_the_epipolar_line() -> None:

@@ -98,6 +98,30 @@ def test_frames_that_repeat_one_of_another_file_count_once(
     assert {counts["repeated_frames"] for counts in found.counts.values()} == {1}
 
 
+@pytest.mark.parametrize("own", [False, True], ids=["all places", "their own"])
+def test_places_are_those_of_one_table(
+    table: Correspondences, guess: Rig, tmp_path: Path, own: bool
+) -> None:
+    """Of frames in several files; or every file states those of its frames alone."""
+    places = [[0, 1], [2, 3], [4, 5], [6, 7]] if own else [[0, 5, 6], [1, 2, 11], [3, 9]]
+    stated = {"systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.01,
+              "place_rotation_rad": 7e-4, "place_translation_m": 0.006, "place_variance": 8.0,
+              "elevation_rad": 1e-3}  # fmt: skip
+    placed = replace(table, metadata={**table.metadata, **stated, "places": places})
+    folder = save_parts(placed, tmp_path / "parts", 6)
+    for number, path in enumerate(sorted(folder.iterdir()) if own else []):
+        part = calibgraph.load_correspondences(path)
+        part = replace(part, metadata={**part.metadata, "places": [[2 * number, 2 * number + 1]]})
+        path.unlink()
+        part.save(path)
+    if own:
+        places += [[8, 9], [10, 11]]
+    one = calibgraph.solve(guess, replace(placed, metadata={**placed.metadata, "places": places}))
+    assert one.counts["image_2"]["places"] == (6 if own else 4)
+    found = solve_sharded(guess, folder, engine="local")
+    require_equal(found, one)
+
+
 def test_a_frame_in_two_files_is_refused(
     table: Correspondences, guess: Rig, tmp_path: Path
 ) -> None:

@@ -229,6 +229,17 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
         np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
 
 
+def test_a_fit_that_goes_on_is_that_of_its_poses(pair: Rig) -> None:
+    """What it knows of the data holds for other components and another pose graph."""
+    errors = solve_model(tie(pair), table_of(pair, 8, False, PLACES["four"]), pairs=True)
+    other = replace(with_correlations(errors.model), pose_graph=gtsam.NonlinearFactorGraph())
+    for model in (errors.model, other):
+        found, expected = (fit_hierarchy(model, start) for start in (errors.fit, errors.fit.poses))
+        assert found is not None and expected is not None
+        np.testing.assert_allclose(found.poses.shared, expected.poses.shared, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-15)
+
+
 def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
     """Of what is stated, of the scatter of frames, and of independent matches."""
     table = table_of(pair, 8, False, [])

@@ -45,6 +45,7 @@ class ShardedProjection:
     camera: str
     loss_scale: float
     sigma: float
+    run_parts: tuple[Numbers, ...] = ()  # per file, the run of each frame, as `ShardedBlock` has it
 
     @property
     def scale(self) -> float:
@@ -58,6 +59,17 @@ class ShardedProjection:
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c at a pose: 28 numbers of each file."""
         return unpack_sums(np.sum(self._call("sums", T_lidar_camera.matrix()), axis=0))
+
+    def run_sums(self, T_camera_lidar: Array, runs: Numbers) -> BlockSums:
+        """H, b and c of each run at a pose of its own: 28 numbers of each run and file.
+
+        Args:
+            T_camera_lidar: (r, 4, 4).
+            runs: (r, 2) of the correspondences, those of ``ShardedBlock.sorted_by``.
+        """
+        given = (self.stage, self.camera, T_camera_lidar, self.loss_scale, self.sigma)
+        parts = self.workers.call("run_sums", *given, each=[(part,) for part in self.run_parts])
+        return unpack_sums(np.sum(parts, axis=0))
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
@@ -83,6 +95,7 @@ class ShardedBlock:
         frame_parts: per file, the numbers of the camera's frames.
         count_parts: per file, the correspondences of these.
         whitened: whether residuals have weights or information.
+        run_parts: per file, the run of each frame, if the correspondences are sorted by one.
     """
 
     workers: Workers
@@ -91,6 +104,7 @@ class ShardedBlock:
     frame_parts: tuple[Numbers, ...]
     count_parts: tuple[Numbers, ...]
     whitened: bool
+    run_parts: tuple[Numbers, ...] = ()
 
     def __len__(self) -> int:
         return int(sum(counts.sum() for counts in self.count_parts))
@@ -117,8 +131,13 @@ class ShardedBlock:
 
     def with_scale(self, scale: ResidualScale) -> ShardedProjection:
         """The reprojection term with its loss, in units of the residuals' sigma."""
-        bend = scale.loss_scale / scale.sigma
-        return ShardedProjection(self.workers, self.stage, self.camera, bend, scale.sigma)
+        bend, runs = scale.loss_scale / scale.sigma, self.run_parts
+        return ShardedProjection(self.workers, self.stage, self.camera, bend, scale.sigma, runs)
+
+    def sorted_by(self, of_frame: Numbers) -> ShardedBlock:
+        """As ``CameraBlock.sorted_by``, for sums by (f,) numbers from 0 on: nothing moves."""
+        edges = np.cumsum([len(numbers) for numbers in self.frame_parts])[:-1]
+        return replace(self, run_parts=tuple(np.split(of_frame, edges)))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
         """As ``CameraBlock.scale``: exact quantiles over all files."""

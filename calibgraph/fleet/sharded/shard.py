@@ -24,7 +24,7 @@ from calibgraph.solver.repeats import point_hashes
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.stage1 import frames_from
 from calibgraph.solver.whitening import sqrt_information
-from factors import ProjectionBlock
+from factors import ProjectionBlock, to_runs
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -136,6 +136,18 @@ class Shard:
         block = self._blocks[stage, camera].block.rescale(scale=scale, sigma=sigma)
         sums = block.sums(gtsam.Pose3(T))
         return np.concatenate([sums.hessian[_UPPER], sums.gradient, [sums.cost]])
+
+    def run_sums(  # noqa: PLR0913, PLR0917
+        self, stage: str, camera: str, T: Array, scale: float, sigma: float, run: Numbers
+    ) -> Array:
+        """(r, 28) of each run of frames at its own of (r, 4, 4) T_camera_lidar; (f,) their runs."""
+        own = self._blocks[stage, camera]
+        block = own.block.rescale(scale=scale, sigma=sigma)
+        sums, total = block.run_sums(T[run], to_runs(own.frame_edges)), np.zeros((len(T), 28))
+        np.add.at(total[:, :21], run, sums.hessian[:, _UPPER[0], _UPPER[1]])
+        np.add.at(total[:, 21:27], run, sums.gradient)
+        np.add.at(total[:, 27], run, sums.cost)
+        return total
 
     def gradients(self, stage: str, camera: str, T: Array, scale: float, sigma: float) -> Array:
         """(p, 6) b at each of (p, 4, 4) T_camera_lidar."""

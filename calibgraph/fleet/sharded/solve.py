@@ -32,6 +32,7 @@ from calibgraph.solver.error_model import weigh_errors
 from calibgraph.solver.joint import count_correspondences, solve_joint
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.preprocess import Preprocessed
+from calibgraph.solver.repeats import PLACES, lists_of_frames
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat
 from calibgraph.solver.start import best_start, require_determined
@@ -192,7 +193,15 @@ def sample_frames(workers: Workers, files: Sequence[Inventory]) -> Correspondenc
         each.append((numbers[-first % step :: step],))
         first += len(numbers)
     parts = [part for part in workers.call("frame_rows", each=each) if len(part)]
-    return concatenate(parts)
+    sample, places = concatenate(parts), places_of_files(files)
+    metadata = {**sample.metadata, PLACES: places} if places else sample.metadata
+    return replace(sample, metadata=metadata)
+
+
+def places_of_files(files: Sequence[Inventory]) -> list[list[int]]:
+    """The frames of each place that some file states; what several state alike is one place."""
+    stated = [place for file in files for place in lists_of_frames(file.metadata, PLACES)]
+    return [list(place) for place in dict.fromkeys(map(tuple, stated))]
 
 
 def _judge(
