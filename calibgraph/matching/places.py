@@ -1,7 +1,8 @@
 """The places of a recording: frames that are near each other show the same objects, and err alike.
 
-The motion of a camera from one frame to the next follows from features of its images that both see,
-with depths from the cloud: robust PnP, in metres, without odometry.
+The motion from one frame to the next follows from features of a camera's images that both see,
+with depths from the cloud: robust PnP, in metres, without odometry; or from the two clouds. Who
+comes back to a place, in whatever direction, is recognised by the cloud of the place's first frame.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
+from calibgraph.matching.cloud_similarity import UprightCloud, align_with_any
+from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 
@@ -30,15 +32,17 @@ PLACE_M = 20.0
 ahead matches objects at 10 to 50 m."""
 
 Motion = NDArray[np.float64] | None
-"""(4, 4) T_later_earlier of the camera; None where the two frames have too little in common."""
+"""(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
 
 
 def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[list[int]]:
     """The numbers of the frames of each place, in the order of the frames.
 
-    A frame begins a new place if it is farther than PLACE_M from the first of the place, or of
-    another recording. While the motion cannot be found, frames stay at one place, which is the
-    cautious side: it widens the error bar. Whoever comes back later is at a new place.
+    Where features do not show the motion, as beyond some 5 m, the clouds may. A frame farther than
+    PLACE_M from the first of its place, or of another recording, or after an unknown motion, is
+    compared with the first frames of all places. It is of the most similar one within PLACE_M, else
+    of a new one; where not even the motion is known, of the place before, which is the cautious
+    side: it widens the error bar.
 
     Args:
         dataset: images and clouds.
@@ -57,40 +61,98 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
 
 
 class PlaceWalk:
-    """The place of one frame after the other."""
+    """The place of one frame after the other.
 
-    def __init__(self) -> None:
-        self._T_now_first, self._folder, self._first = np.eye(4), Path(), -1
+    Args:
+        most_places: that are remembered, those visited last; None: all.
+    """
+
+    def __init__(self, most_places: int | None = None) -> None:
+        self._T_now_first, self._first = np.eye(4), -1
+        self._before: Frame | None = None
+        self._known: dict[int, UprightCloud] = {}  # by their first frames, the last visited last
+        self._most = most_places
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
         """The number of the first frame of this frame's place.
 
         Args:
             frame: the next one.
-            step: from the frame before.
+            step: from the frame before, as its images show it.
         """
-        if step is not None:
-            self._T_now_first = step @ self._T_now_first
-        here = frame.cloud_path.parent
-        far = np.linalg.norm(self._T_now_first[:3, 3]) > PLACE_M
-        if self._first < 0 or here != self._folder or far:
-            self._T_now_first, self._folder, self._first = np.eye(4), here, frame.index
+        before, self._before = self._before, frame
+        if before is None or before.cloud_path.parent != frame.cloud_path.parent:
+            self._find_place(frame, may_stay=False)
+            return self._first
+        step = _motion_by_clouds(before, frame) if step is None else step
+        if step is None:
+            self._find_place(frame, may_stay=True)
+            return self._first
+        self._T_now_first = step @ self._T_now_first
+        if _distance_m(self._T_now_first) > PLACE_M:
+            self._find_place(frame, may_stay=False, left=self._first)
         return self._first
+
+    def remember(self, frame: Frame) -> None:
+        """Know the place of which this is the first frame."""
+        self._visit(frame.index, _upright_cloud(frame))
+
+    def _find_place(self, frame: Frame, *, may_stay: bool, left: int | None = None) -> None:
+        """The most similar known place, but for one that was left; the present one; a new one."""
+        cloud = _upright_cloud(frame)
+        known = [first for first in self._known if first != left]
+        found = cloud and align_with_any(cloud, [self._known[first] for first in known])
+        if found and _distance_m(found[1]) <= PLACE_M:
+            self._first, self._T_now_first = known[found[0]], found[1]
+            self._visit(self._first, self._known[self._first])
+        elif found or not may_stay:
+            self._first, self._T_now_first = frame.index, np.eye(4)
+            self._visit(frame.index, cloud)
+
+    def _visit(self, first: int, cloud: UprightCloud | None) -> None:
+        self._known.pop(first, None)
+        if cloud is not None:
+            self._known[first] = cloud
+        while self._most is not None and len(self._known) > self._most:
+            del self._known[next(iter(self._known))]
+
+
+def _motion_by_clouds(before: Frame, now: Frame) -> Motion:
+    earlier, later = _upright_cloud(before), _upright_cloud(now)
+    found = earlier and later and align_with_any(later, [earlier])
+    return found[1] if found else None
+
+
+def _upright_cloud(frame: Frame) -> UprightCloud | None:
+    """What stands in a frame's cloud; None if it cannot be read, which the matcher reports."""
+    try:
+        return frame.derive("upright", lambda: UprightCloud.of(frame.load_cloud()))
+    except (CalibrationError, OSError):
+        return None
+
+
+def _distance_m(T: Array) -> float:
+    return float(np.linalg.norm(T[:3, 3]))
 
 
 class PlaceFinder:
-    """The place of one frame after the other, from their images.
+    """The place of one frame after the other, from their images and clouds.
 
     While the motion is not found by the first camera of the rig, the next ones are tried.
 
     Args:
         rig: cameras at their extrinsics.
+        most_places: that are remembered, those visited last; None: all.
         seed: of the robust fits.
     """
 
-    def __init__(self, rig: Rig, *, seed: int = 0) -> None:
-        self._rig, self._seed, self._walk = rig, seed, PlaceWalk()
+    def __init__(self, rig: Rig, *, most_places: int | None = None, seed: int = 0) -> None:
+        self._rig, self._seed, self._walk = rig, seed, PlaceWalk(most_places)
         self._before: _SeenFrame | None = None
+
+    def remember(self, frame: Frame) -> None:
+        """Know the place of which this is the first frame, without being there."""
+        self._walk.remember(frame)
 
     def first_of_place(self, frame: Frame) -> int:
         """The number of the first frame of this frame's place; see `find_places`.
@@ -130,7 +192,7 @@ class _SeenFrame:
 
 
 def motions(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[Motion]:
-    """The motion of a camera from each frame to the next; arguments as of `find_places`."""
+    """The motion from each frame to the next; arguments as of `find_places`."""
     with core_pool() as cores:
         seen = list(cores.map(partial(_detect, camera=camera, lens=lens), dataset.frames))
         step = partial(_motion, lens=lens, seed=seed)
@@ -161,4 +223,5 @@ def _motion(
     inverse = np.einsum("ni,ni->n", planes, rays)
     near = inverse > 0  # false where there is no plane
     points = rays[near] / inverse[near, None]
-    return relative_pose(points, after.rays[rows[near, 1]], seed=seed)
+    T_later_earlier = relative_pose(points, after.rays[rows[near, 1]], seed=seed)
+    return None if T_later_earlier is None else invert(T) @ T_later_earlier @ T

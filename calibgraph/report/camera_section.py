@@ -35,7 +35,7 @@ _COUNT_MEANINGS = {
     "frames_waiting": "frames that wait for others that agree with them",
     "outlier_frames": "frames left out, far from where frames are densest",
     "repeated_frames": "frames of the same place or content as another one, counted as part of it",
-    "places": "places that they are from, at least 20 m apart, or in different recordings",
+    "places": "places that they are from, some 20 m apart; one that was visited twice counts once",
     "frames_without_pnp": "frames in which PnP found no pose",
 }
 _FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped", "used")

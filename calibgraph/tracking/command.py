@@ -27,6 +27,7 @@ from calibgraph.tracking.dataset_frames import (
 )
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
+from calibgraph.tracking.place_sums import MOST_PLACES
 from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.run import Notify, RunCounts, follow
 from calibgraph.tracking.streams import Item, frames_of
@@ -148,8 +149,9 @@ def _opened(
     later = matched_frames(
         replace(data, frames=tuple(rest)), matcher, config, lambda: calibrator.tracker.rig
     )
-    finder = PlaceFinder(calibrator.tracker.initial_rig, seed=config.seed)
-    return with_places(chain(head, later), data, finder, calibrator.tracker.place), calibrator
+    rig = calibrator.tracker.initial_rig
+    finder = PlaceFinder(rig, most_places=MOST_PLACES, seed=config.seed)
+    return with_places(chain(head, later), data, finder, calibrator.tracker.places), calibrator
 
 
 def _report_recovery(calibrator: DurableCalibrator, notify: Notify) -> DurableCalibrator:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,9 @@ from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking.frame_order import with_place
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
+
+MOST_AGAIN = 200
+"""Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
 
 
 def first_frames(dataset: Dataset, matcher: FullMatcher, config: Config) -> Calibration:
@@ -63,9 +66,9 @@ def matched_frames(
 
 
 def with_places(
-    items: Iterable[Item], dataset: Dataset, finder: PlaceFinder, last_place: str
+    items: Iterable[Item], dataset: Dataset, finder: PlaceFinder, known: Sequence[str]
 ) -> Iterator[Item]:
-    """The items with the place of each frame named, as by how far the vehicle drove.
+    """The items with the place of each frame named, as its images and its cloud show it.
 
     Where the matcher's error has a part that frames of one place share.
 
@@ -73,21 +76,25 @@ def with_places(
         items: frames, those of the dataset, in order.
         dataset: all its frames.
         finder: at the first estimate, which a restart also has.
-        last_place: of the last frame that was taken in; empty before the first. The frames from its
-            first one on are looked at again, so that a restart finds the same places.
+        known: names of the places of before a restart, that of the last frame last. Their first
+            frames are looked at again, and the frames since the newest of them, or the last
+            MOST_AGAIN, so that a restart finds the same places.
     """
     frames = {frame.index: frame for frame in dataset.frames}
-    taken = int(last_place) if last_place.isdigit() else None
+    first = [int(name) for name in known if name.isdigit() and int(name) in frames]
+    again = bool(first)
     for item in items:
         if isinstance(item, Refused) or not item.table.findings.place_variance:
             yield item
             continue
-        if taken is not None:
-            for number in (n for n in frames if taken <= n < item.frame):
+        if again:
+            for number in first:
+                finder.remember(frames[number])
+            for number in [n for n in frames if max(first) <= n < item.frame][-MOST_AGAIN:]:
                 finder.first_of_place(frames[number])
-            taken = None
-        first = finder.first_of_place(frames[item.frame])
-        yield replace(item, table=with_place(item.table, first))
+            again = False
+        place = finder.first_of_place(frames[item.frame])
+        yield replace(item, table=with_place(item.table, place))
 
 
 def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> Correspondences:

@@ -104,6 +104,12 @@ class IncrementalCalibrator:
         """Name of the place of the last frame; empty if it is not known."""
         return self._state.live_frames[-1].place if self._state.live_frames else ""
 
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Names of the places that are kept apart, the last visited last."""
+        visited = *self._state.places.names[1:], *(f.place for f in self._state.live_frames)
+        return tuple(reversed(dict.fromkeys(reversed(visited))))
+
     def calibration(self) -> Calibration:
         """The present estimate as a result of the same type as a batch solve's."""
         return to_calibration(self._state)

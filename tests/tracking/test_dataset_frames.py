@@ -20,7 +20,7 @@ from calibgraph import (
 )
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import Frame
-from calibgraph.tracking import command
+from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
 from calibgraph.tracking.dataset_frames import with_places
 from calibgraph.tracking.streams import StreamFrame
@@ -114,27 +114,45 @@ class Odometer:
 
     def __init__(self) -> None:
         self.shown: list[int] = []
+        self.remembered: list[int] = []
 
     def first_of_place(self, frame: Frame) -> int:
         self.shown.append(frame.index)
         return frame.index // 4 * 4
 
+    def remember(self, frame: Frame) -> None:
+        self.remembered.append(frame.index)
 
-@pytest.mark.parametrize(("last_place", "start"), [("", 0), ("4", 7)])
+
+@pytest.mark.parametrize(
+    ("known", "start", "again"),
+    [((), 0, 0), (("", "gate"), 2, 2), (("0", "4"), 7, 4), (("4", "0"), 9, 4)],
+)
 def test_frames_of_a_dataset_have_their_places(
-    last_place: str, start: int, world: World, recorded: Dataset
+    known: tuple[str, ...], start: int, again: int, world: World, recorded: Dataset
 ) -> None:
-    """A restart looks again at the frames of the place where it stopped."""
+    """A restart looks again at the first frames of all places, and at those since the newest."""
     stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
     items = [StreamFrame(n, None, stated[n]) for n in range(start, FRAMES)]
     finder = Odometer()
-    found = list(with_places(items, recorded, finder, last_place))  # type: ignore[arg-type]
+    found = list(with_places(items, recorded, finder, known))  # type: ignore[arg-type]
     names = [item.table.metadata["place"] for item in found if isinstance(item, StreamFrame)]
     assert names == [str(n // 4 * 4) for n in range(start, FRAMES)]
-    assert finder.shown == list(range(int(last_place or 0), FRAMES))
+    assert finder.remembered == [int(name) for name in known if name.isdigit()]
+    assert finder.shown == list(range(again, FRAMES))
+
+
+def test_a_restart_looks_again_at_few_frames(
+    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_frames, "MOST_AGAIN", 2)
+    stated = replace(world.tables[8], metadata={"place_variance": 8.0})
+    finder = Odometer()
+    list(with_places([StreamFrame(8, None, stated)], recorded, finder, ("0",)))  # type: ignore[arg-type]
+    assert finder.shown == [6, 7, 8]
 
 
 def test_without_an_error_of_places_no_image_is_looked_at(world: World, recorded: Dataset) -> None:
     finder, items = Odometer(), [StreamFrame(0, None, world.tables[0])]
-    assert list(with_places(items, recorded, finder, "")) == items  # type: ignore[arg-type]
+    assert list(with_places(items, recorded, finder, ())) == items  # type: ignore[arg-type]
     assert not finder.shown

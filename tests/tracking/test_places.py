@@ -282,6 +282,7 @@ def test_places_are_there_after_a_restart(tmp_path: Path) -> None:
             calibrator.update(table, place=frame // 4 % 3)
     with DurableCalibrator(folder, pair_of()) as calibrator:
         assert calibrator.tracker.place == "1"
+        assert calibrator.tracker.places == ("2", "0", "1")
         for frame, table in enumerate(tables):
             expected = whole.update(table, place=frame // 4 % 3)
             if frame >= 17:

@@ -1,0 +1,60 @@
+"""Clouds of one place are aligned, from other positions and headings; those of others are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibgraph.matching.cloud_similarity import UprightCloud, align_with_any
+from calibgraph.model.geometry import invert
+from calibgraph.simulation.recording import Drive
+from tests.conftest import SAMPLE
+from tests.matching.streets import displaced, scan_at
+
+Array = NDArray[np.float64]
+
+
+def cloud_at(drive: Drive, T_world_lidar: Array, seed: int = 0) -> UprightCloud:
+    return UprightCloud.of(scan_at(drive, T_world_lidar, seed))
+
+
+@pytest.mark.parametrize(("stop", "turned_deg"), [(0, 77.0), (1, 0.0), (1, 180.0)])
+def test_the_motion_between_two_scans_of_a_place_is_found(
+    drive: Drive, stop: int, turned_deg: float
+) -> None:
+    """It decides about 20 m: a twentieth is enough, and the turn between two images from above."""
+    T_first = drive.T_world_lidar[0]
+    T_now = displaced(drive.T_world_lidar[stop], left_m=2.0, turned_deg=turned_deg)
+    first, now = cloud_at(drive, T_first), cloud_at(drive, T_now, seed=1)
+    found = align_with_any(now, [first])
+    assert found is not None
+    row, T_now_first = found
+    assert row == 0
+    off = T_now_first @ invert(T_first) @ T_now
+    assert np.linalg.norm(off[:3, 3]) < 1.0
+    assert np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()) < 1.5
+
+
+def test_other_places_are_not_aligned(drive: Drive) -> None:
+    """40 m on in the same street, and in another one."""
+    now = cloud_at(drive, drive.T_world_lidar[5])
+    other = UprightCloud.of(np.load(SAMPLE / "lidar" / "000000.npy"))
+    assert align_with_any(now, [cloud_at(drive, drive.T_world_lidar[0]), other]) is None
+
+
+def test_of_many_known_places_the_nearest_is_found(drive: Drive) -> None:
+    known = [cloud_at(drive, T) for T in drive.T_world_lidar]
+    now = cloud_at(drive, displaced(drive.T_world_lidar[3], left_m=1.0, turned_deg=5.0), seed=1)
+    found = align_with_any(now, known)
+    assert found is not None and found[0] == 3
+
+
+def test_where_nothing_is_upright_nothing_is_known() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-40, 40, (5000, 2)), rng.normal(-1.8, 0.01, 5000)])
+    empty = np.empty((0, 4), np.float32)
+    for cloud in (flat, empty):
+        assert align_with_any(UprightCloud.of(cloud), [UprightCloud.of(cloud)]) is None
+    assert align_with_any(UprightCloud.of(flat), []) is None
