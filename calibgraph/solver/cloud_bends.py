@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.geometry import adjoints, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.hierarchy import place_of
 from calibgraph.solver.residual_scale import ResidualScale
@@ -101,6 +101,34 @@ def bend_evidence(
         information[number] = left.T @ left / share
         vector[number] = left.T @ residuals[rows] / share
     return BendEvidence(_follow(by_pose, by_bend, weak), information, vector)
+
+
+def shifts_of_pairs(
+    shifts: Array, seen: NDArray[np.bool_], T_lidar_camera: Array, pairs: Sequence[tuple[int, int]]
+) -> Array:
+    """(N, 6, B) by how much what pairs show of a camera follows the bends.
+
+    Images show the relative pose of two cameras whatever the cloud; how both lie to the cloud,
+    their features show by its surfaces, which are bent as the matches see them. So a pair follows
+    by one motion of the cloud, the mean of what its cameras see, and a camera by the mean over its
+    pairs.
+
+    Args:
+        shifts: (N, 6, B) of the matches of all cameras.
+        seen: (N,) which cameras have matches.
+        T_lidar_camera: (N, 4, 4).
+        pairs: numbers of the cameras of each.
+    """
+    to_cloud = adjoints(T_lidar_camera)
+    of_cloud = to_cloud @ shifts
+    total, count = np.zeros_like(shifts), np.zeros(len(shifts))
+    for pair in pairs:
+        known = [camera for camera in pair if seen[camera]]
+        if known:
+            total[list(pair)] += of_cloud[known].mean(axis=0)
+            count[list(pair)] += 1.0
+    mean = total / np.maximum(count, 1.0)[:, None, None]
+    return np.asarray(np.linalg.solve(to_cloud, mean))
 
 
 def _follow(by_pose: Array, by_bend: Array, weak: Array) -> Array:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
-from calibgraph.solver.cloud_bends import bend_evidence
+from calibgraph.solver.cloud_bends import bend_evidence, shifts_of_pairs
 from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.factor_graph import Optimum, join, pose_key
@@ -241,6 +241,12 @@ def error_model(
         cloud_at_place=_covariance(*of_place),
         camera=_covariance(*(share * whole)),
         bends=bends,
+        pair_bends=shifts_of_pairs(
+            bends,
+            np.isin(cameras, list(inliers.blocks)),
+            invert(np.stack([T_camera_lidar[name] for name in cameras])),
+            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in inliers.pairs}),
+        ),
         bend_information=bend_information,
         bend_vector=bend_vector,
         bend_weight=np.ones(shape[:2]),

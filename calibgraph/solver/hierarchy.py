@@ -53,6 +53,7 @@ class Components:
         cloud_at_place: (6, 6) of the cloud at one place besides.
         camera: (6, 6) of all matches of a camera, in its axes.
         bends: (N, 6, B) by how much they follow one usual standard deviation of each bend.
+        pair_bends: (N, 6, B) by how much what pairs show of a camera follows it.
         bend_information: (P, N, B, B) of a camera's residuals at a place about the bends, in units
             of these.
         bend_vector: (P, N, B) the information times the bends that these show.
@@ -68,6 +69,7 @@ class Components:
     cloud_at_place: Array
     camera: Array
     bends: Array
+    pair_bends: Array
     bend_information: Array
     bend_vector: Array
     bend_weight: Array
@@ -77,11 +79,18 @@ class Components:
     robust_scale: float = np.inf
 
     @property
+    def all_bends(self) -> Array:
+        """(12 N, B) by how much the matches of all cameras, then their pairs, follow the bends."""
+        return np.concatenate([*self.bends, *self.pair_bends])
+
+    @property
     def cameras(self) -> Array:
-        """(6 N, 6 N) of the matches of all cameras, which share the bends."""
-        shifts = np.concatenate(self.bends)
-        of_bends = shifts @ self.bend_covariance @ shifts.T
-        return np.asarray(np.kron(np.eye(len(self.bends)), self.camera) + of_bends)
+        """(12 N, 12 N) of the matches of all cameras, then of their pairs: both share the bends."""
+        N = len(self.bends)
+        covariance = np.asarray(self.all_bends @ self.bend_covariance @ self.all_bends.T)
+        covariance[: 6 * N, : 6 * N] += np.kron(np.eye(N), self.camera)
+        covariance[6 * N :, 6 * N :] += np.kron(np.eye(N), self.pairs)
+        return covariance
 
     @cached_property
     def bend_covariance(self) -> Array:
@@ -99,11 +108,9 @@ class Components:
     @cached_property
     def shared_information(self) -> Array:
         """(6 (2 N + 1),) squared: of the cloud, of all cameras' matches, and of their pairs."""
-        N = len(self.bends)
-        whole, matches = np.zeros((6 * (2 * N + 1),) * 2), slice(6, 6 + 6 * N)
+        whole = np.zeros((6 * (2 * len(self.bends) + 1),) * 2)
         whole[:6, :6] = np.linalg.inv(self.cloud)
-        whole[matches, matches] = np.linalg.inv(self.cameras)
-        whole[6 + 6 * N :, 6 + 6 * N :] = np.kron(np.eye(N), np.linalg.inv(self.pairs))
+        whole[6:, 6:] = np.linalg.inv(self.cameras)
         return whole
 
     @cached_property
@@ -243,11 +250,6 @@ class Hierarchy:
     components: Components
 
     @property
-    def bends(self) -> Array:
-        """(6 N, B) by how much the matches of all cameras follow the bends, under each other."""
-        return np.concatenate(self.components.bends)
-
-    @property
     def places(self) -> int:
         """How many there are."""
         return len(self.components.at_place)
@@ -267,7 +269,8 @@ def hierarchy_graph(model: Hierarchy) -> gtsam.NonlinearFactorGraph:
         pose, matched, paired = (gtsam.symbol(letter, camera) for letter in "xmn")
         noise = _noise(parts.camera)
         graph.add(bent_between_factor(pose, bend, matched, parts.bends[camera], noise))
-        graph.add(gtsam.BetweenFactorPose3(pose, paired, no_motion, _noise(parts.pairs)))
+        noise = _noise(parts.pairs)
+        graph.add(bent_between_factor(pose, bend, paired, parts.pair_bends[camera], noise))
         for place in range(model.places):
             noise = _robust(parts.at_place[place, camera], parts.robust_scale)
             key = placed_key(model, camera, place)

@@ -305,19 +305,19 @@ def linearize(model: Hierarchy, fit: HierarchyFit) -> HierarchyFit:
 def bends_of(model: Hierarchy, fit: HierarchyFit) -> tuple[Array, Array]:
     """(B,) bends of the cloud in usual standard deviations, and their (B, B) marginal covariance.
 
-    The eliminated form has them in the covariance of all m_c about x_c; here they come back.
+    The eliminated form has them in the covariance of all m_c and n_c about x_c; here they return.
 
     Args:
         model: of the error.
         fit: its minimum.
     """
-    edges, free, shifts = shared_edges(model, fit.poses), len(fit.shared_covariance), model.bends
-    matches = slice(6, 6 + len(shifts))
+    edges, free = shared_edges(model, fit.poses), len(fit.shared_covariance)
+    shifts, cameras = model.components.all_bends, slice(6, None)
     before = model.components.bend_covariance
-    gain = before @ shifts.T @ edges.information[matches, matches]
-    slope = gain @ edges.jacobian[matches, :free]
+    gain = before @ shifts.T @ edges.information[cameras, cameras]
+    slope = gain @ edges.jacobian[cameras, :free]
     covariance = before - gain @ shifts @ before + slope @ fit.shared_covariance @ slope.T
-    return model.components.bend_mean + gain @ edges.error[matches], covariance
+    return model.components.bend_mean + gain @ edges.error[cameras], covariance
 
 
 def _to_fit(poses: Poses, equations: Equations, iterations: int, converged: bool) -> HierarchyFit:

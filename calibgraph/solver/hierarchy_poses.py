@@ -110,7 +110,8 @@ def shared_edges(model: Hierarchy, poses: Poses) -> SharedEdges:
     first = np.r_[3 * N + 1, np.arange(N), np.arange(N)]
     second = np.r_[3 * N, N : 2 * N, 2 * N : 3 * N]
     error, to_first, to_second = between_errors(poses.shared[first], poses.shared[second])
-    error[1 : 1 + N] -= model.components.bends @ model.components.bend_mean
+    bent = model.components.all_bends @ model.components.bend_mean
+    error[1:] -= bent.reshape(2 * N, 6)
     jacobian, edges = np.zeros((len(first), 6, S, 6)), np.arange(len(first))
     jacobian[edges, :, first], jacobian[edges, :, second] = to_first, to_second
     information = model.components.shared_information

@@ -124,13 +124,16 @@ def with_correlations(model: Hierarchy) -> Hierarchy:
         return (scale[:, None] * mix) @ (scale[:, None] * mix).T
 
     parts = model.components
-    bends = parts.bends + 1e-3 * rng.standard_normal(parts.bends.shape)
+    bends, pair_bends = (
+        each + 1e-3 * rng.standard_normal(each.shape) for each in (parts.bends, parts.pair_bends)
+    )
     at_place = np.array([[mixed(one) for one in place] for place in parts.at_place])
     return replace(
         model,
         components=Components(
             *(mixed(c) for c in (parts.cloud, parts.cloud_at_place, parts.camera)),
             bends,
+            pair_bends,
             parts.bend_information + np.diag([0.5, 1.0, 2.0]),
             parts.bend_vector + np.array([0.4, -0.3, 0.8]),
             rng.uniform(0.2, 1.0, parts.bend_weight.shape),
