@@ -58,17 +58,22 @@ COLUMNS = (
 
 def main() -> None:
     """Draw, solve, and print one table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--matches", type=int, default=100)
-    parser.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
-    add_record_option(parser)
-    options = parser.parse_args()
+    options = parse_options(__doc__, [*CASES])
     rows = [row for case in options.cases for row in rows_of(case, options.draws, options.matches)]
     title = f"{options.draws} draws, {FRAMES} frames a place, {options.matches} matches each"
     publish("accuracy.place_draws", [Table(title, COLUMNS, tuple(rows))], record=options.record)
+
+
+def parse_options(description: str | None, cases: list[str]) -> argparse.Namespace:
+    """How many draws of how many matches, and which cases."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--matches", type=int, default=100)
+    parser.add_argument("--cases", nargs="+", default=cases, choices=cases)
+    add_record_option(parser)
+    return parser.parse_args()
 
 
 def rows_of(case: str, draws: int, matches: int) -> Iterator[tuple[str, ...]]:

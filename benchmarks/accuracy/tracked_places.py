@@ -10,16 +10,15 @@ are reported are false: nothing moves.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.place_draws import Drawn, draw_places
+from benchmarks.accuracy.place_draws import Drawn, draw_places, parse_options
 from benchmarks.accuracy.uncertainty import calibration
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, publish
 from calibgraph import Config, IncrementalCalibrator
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
@@ -40,14 +39,7 @@ COLUMNS = ("case", "error of", "mean NEES / 6", "in the 95 % region", "error [de
 
 def main() -> None:
     """Draw, track, and print one table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--matches", type=int, default=100)
-    parser.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
-    add_record_option(parser)
-    options = parser.parse_args()
+    options = parse_options(__doc__, [*CASES])
     rows = [row for case in options.cases for row in rows_of(case, options.draws, options.matches)]
     title = f"{options.draws} draws, 60 frames, {options.matches} matches each"
     publish("accuracy.tracked_places", [Table(title, COLUMNS, tuple(rows))], record=options.record)

@@ -57,11 +57,14 @@ class BendEvidence:
 
     Attributes:
         shifts: (6, 3) by how much their pose follows.
+        hessian: (6, 6) J^T J of all of them, and what is known without them: shifts of several sets
+            of matches have a mean by these.
         information: (P, 3, 3) of the residuals at each place, if all were independent.
         vector: (P, 3) the information times the bends that the points show.
     """
 
     shifts: Array
+    hessian: Array
     information: Array
     vector: Array
 
@@ -100,7 +103,8 @@ def bend_evidence(
         left = by_bend[rows] + by_pose[rows] @ _follow(by_pose[rows], by_bend[rows], weak)
         information[number] = left.T @ left / share
         vector[number] = left.T @ residuals[rows] / share
-    return BendEvidence(_follow(by_pose, by_bend, weak), information, vector)
+    hessian = (by_pose.T @ by_pose + weak) / share
+    return BendEvidence(_follow(by_pose, by_bend, weak), hessian, information, vector)
 
 
 def shifts_of_pairs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +11,9 @@ from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
 from calibgraph.tracking.cause import squared_sigmas
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.outlier_frames import find_outlier_frame
+from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
+from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
+from calibgraph.tracking.place_shift import agrees_at_its_place
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
 
@@ -28,22 +29,43 @@ def with_open_frame(state: State, frame: LiveFrame) -> State:
     return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, frame))))
 
 
-def set_aside(state: State, camera: int, block: CameraBlock) -> State:
+def select_agreeing(
+    state: State, blocks: Mapping[int, CameraBlock]
+) -> tuple[State, dict[int, CameraBlock]]:
+    """The blocks of started cameras that agree with the estimate; the others are set aside.
+
+    One that agrees with the pose of its place does, too.
+    """
+    agreeing = {}
+    for camera, block in blocks.items():
+        one, T_lidar_camera = state.cameras[camera], state.T_lidar_camera[camera]
+        if not one.started:
+            continue
+        if agrees(block, T_lidar_camera, one):
+            agreeing[camera] = block
+            continue
+        own = find_outlier_frame(
+            state.frame or 0,
+            block,
+            T_lidar_camera,
+            camera=state.rig.cameras[state.names[camera]],
+            camera_state=one,
+            config=state.config,
+        )
+        if own is not None and agrees_at_its_place(state, camera, own):
+            agreeing[camera] = block
+        else:
+            state = _set_aside(state, camera, own)
+    return state, agreeing
+
+
+def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
     """The state with a camera's block counted as left out.
 
     It is kept as an outlier frame if another T_lidar_camera explains it; otherwise the matching has
     failed.
     """
-    camera_state = state.cameras[camera]
-    number = state.frame or 0
-    own = find_outlier_frame(
-        number,
-        block,
-        state.T_lidar_camera[camera],
-        camera=state.rig.cameras[state.names[camera]],
-        camera_state=camera_state,
-        config=state.config,
-    )
+    camera_state, number = state.cameras[camera], state.frame or 0
     kept = camera_state.outlier_frames
     camera_state = replace(
         camera_state,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
 
@@ -36,6 +36,11 @@ def alarm_limit(frames: float) -> float:
     freedom = max(frames - _POSE, 4.0)
     quantile = float(fdtri(_POSE, freedom, 1 - ALARM_CHANCE))
     return _POSE * (freedom + _POSE - 1) / freedom * quantile
+
+
+def chance_limit() -> float:
+    """The same of a known covariance: chi squared."""
+    return float(chdtri(_POSE, ALARM_CHANCE))
 
 
 @dataclass(frozen=True, eq=False)

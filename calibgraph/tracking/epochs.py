@@ -48,19 +48,16 @@ def close_epoch(
     )
     state = replace(state, cameras=cameras)
     epochs = tuple(_regate(state, epoch) for epoch in state.epochs)
-    state = _with_bends(state, epochs[-1])
-    return report_drift(replace(state, epochs=(*epochs, Epoch((), state.T_lidar_camera))))
+    epochs = (*epochs[:-1], _with_bends(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
+    return report_drift(replace(state, epochs=epochs))
 
 
-def _with_bends(state: State, epoch: Epoch) -> State:
-    """The state that has learnt from an epoch how matches follow bends of the cloud."""
-    if not any(state.findings.bend_sigmas):
-        return state
-    bends = state.bends
-    for camera, one in enumerate(state.cameras):
-        parts = [frame.raw[camera] for frame in epoch.frames if camera in frame.raw]
-        bends = bends.add(camera, parts, one.scale, epoch.T_lidar_camera[camera])
-    return replace(state, bends=bends)
+def _with_bends(state: State, epoch: Epoch) -> Epoch:
+    """The epoch with what its matches have to do with bends of the cloud, if these are stated."""
+    if any(state.findings.bend_sigmas):
+        for camera, one in enumerate(state.cameras):
+            epoch = epoch.with_bends(camera, one.scale)
+    return epoch
 
 
 def _regate(state: State, epoch: Epoch) -> Epoch:
@@ -201,7 +198,11 @@ def _summarize_oldest(state: State) -> State:
     scores = np.hstack([s.scores for s in sums])
     cross, gain = state.cross + _between_cameras(scores), block_diagonal(np.array(gains))
     state = replace(
-        state, cameras=tuple(summarized), cross=gain @ cross @ gain.T, epochs=tuple(younger)
+        state,
+        cameras=tuple(summarized),
+        cross=gain @ cross @ gain.T,
+        epochs=tuple(younger),
+        bends=state.bends + epoch.bends,
     )
     parts = [_to_part(name, [at[row] for at in at_places]) for row, name in enumerate(names)]
     return _with_places(state, parts, drifted)

@@ -84,7 +84,7 @@ class ClosedPlaces:
     Attributes:
         sums: per place; of a camera that drifts, none.
         findings: with which the rest was made.
-        errors: what frames share.
+        errors: what frames share, of the bends what is usual.
         seen: by the frames of each camera.
         terms: of each place.
     """
@@ -94,11 +94,6 @@ class ClosedPlaces:
     errors: SharedErrors
     seen: FrameSpread
     terms: PlaceTerms
-
-    @cached_property
-    def information(self) -> Information:
-        """Of each place."""
-        return self.terms.information
 
     def is_settled(self, state: State) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
@@ -114,11 +109,24 @@ class ClosedPlaces:
         for camera, one in enumerate(state.cameras):
             if one.summary.walk:
                 sums = sums.without(camera)
-        errors = SharedErrors.of(state.findings, state.references, state.sizes, state.bends.mean)
+        shifts = state.all_bends.shifts
+        errors = SharedErrors.of(state.findings, state.references, state.sizes, shifts)
         every = np.ones(len(sums.names), dtype=np.bool_)
         seen = _spreads(state, sums, errors)
         terms = PlaceTerms.of(sums, every, seen, errors)
         return ClosedPlaces(sums, state.findings, errors, seen, terms)
+
+    @cached_property
+    def information(self) -> Information:
+        """Of each place."""
+        return self.terms.information
+
+    def errors_shown(self, state: State, places: PlaceSums, seen: FrameSpread) -> SharedErrors:
+        """The errors with what residuals show of the bends, but with a preset of the paper."""
+        if state.config.preset != "auto":
+            return self.errors
+        variance = seen.mean_variance(places, state.findings.place_variance)
+        return self.errors.with_residuals(state.all_bends, variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +162,15 @@ def joint_estimate(
     if closed.findings != state.findings:
         closed = ClosedPlaces.of(state)
     places = _with_open_epoch(state, sums, closed)
-    own = _information(state, places, closed).of_cameras(closed.errors)
+    seen = closed.seen if closed.is_settled(state) else _spreads(state, places, closed.errors)
+    errors = closed.errors_shown(state, places, seen)
+    own = _information(state, places, closed, seen).of_cameras(errors)
     conflicts = _conflicts(state, places, own)
     agreeing = own + priors.without(conflicts)
     covariance = np.asarray(np.linalg.inv(agreeing.matrix), dtype=np.float64)
     estimates = state.T_lidar_camera
-    if state.config.preset == "auto" and (priors.measured or not places.is_of_one_place):
+    several = priors.measured or errors.bend_mean.any() or not places.is_of_one_place
+    if state.config.preset == "auto" and several:
         steps = (covariance @ agreeing.vector).reshape(-1, _POSE)
         moved = zip(state.references, steps, strict=True)
         estimates = tuple(reference.retract(step) for reference, step in moved)
@@ -176,9 +187,10 @@ def with_sizes(state: State) -> State:
         if closed.sums.is_of_one_place and not priors.measured:
             return state
         every = np.ones(len(closed.sums.names), dtype=np.bool_)
-        own = closed.information.sum(every).of_cameras(closed.errors)
+        errors = closed.errors_shown(state, closed.sums, closed.seen)
+        own = closed.information.sum(every).of_cameras(errors)
         of_poses = priors.without(_conflicts(state, closed.sums, own))
-        found = sizes_shown(closed.sums, closed.terms, closed.errors, of_poses, sizes)
+        found = sizes_shown(closed.sums, closed.terms, errors, of_poses, sizes)
         if found.is_near(sizes):
             break
         sizes = found
@@ -204,9 +216,10 @@ def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> Pla
     return places if state.config.preset == "auto" else places.bounded(most=0)
 
 
-def _information(state: State, places: PlaceSums, closed: ClosedPlaces) -> Information:
+def _information(
+    state: State, places: PlaceSums, closed: ClosedPlaces, seen: FrameSpread
+) -> Information:
     """Of all places: those that the open epoch adds to are computed anew."""
-    seen = closed.seen if closed.is_settled(state) else _spreads(state, places, closed.errors)
     if len(places.names) == 1:  # the weights of a preset of the paper
         every = np.ones(1, dtype=np.bool_)
         return PlaceTerms.of(places, every, seen, closed.errors).information.sum(every)

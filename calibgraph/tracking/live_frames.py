@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.bends import BendSums
 
 Array = NDArray[np.float64]
 
@@ -79,10 +81,28 @@ class Epoch:
     Attributes:
         frames: in order.
         T_lidar_camera: per camera, the estimate.
+        bends: what its matches have to do with bends of the cloud; of an open epoch, those of the
+            frames from which a camera has started in it.
     """
 
     frames: tuple[LiveFrame, ...]
     T_lidar_camera: tuple[gtsam.Pose3, ...]
+    bends: BendSums
+
+    @staticmethod
+    def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
+        """Without frames."""
+        return Epoch((), T_lidar_camera, BendSums.empty(len(T_lidar_camera)))
+
+    def with_bends(self, camera: int, scale: ResidualScale) -> Epoch:
+        """The epoch with what a camera's matches have to do with bends computed anew."""
+        parts = [frame.raw[camera] for frame in self.frames if camera in frame.raw]
+        numbers: dict[str, list[int]] = {}
+        for frame in self.frames:
+            numbers.setdefault(frame.place, []).append(frame.number)
+        places = [np.array(of_place, dtype=np.int64) for of_place in numbers.values()]
+        pose = self.T_lidar_camera[camera]
+        return replace(self, bends=self.bends.with_epoch(camera, parts, places, scale, pose))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,14 @@ the gradient. What it shows of the pose is -H^-1 b, with the covariance
 All cameras of a place are tied by the cloud's displacement there (covariance D, by the adjoints A):
 V + A D A^T. The information of places adds to that of the poses as matches show them everywhere;
 these differ from the poses by C per camera, by the bends of the cloud, and by its displacement
-everywhere (K).
+everywhere (K). Of the bends, what is usual and what the residuals show make a mean and a
+covariance: the mean displaces the poses that matches show, the covariance is part of their error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -26,6 +27,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import adjoint_camera_lidar
 from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.place_sums import PlaceSums
 
 Array = NDArray[np.float64]
@@ -42,7 +44,9 @@ class SharedErrors:
     Attributes:
         cloud: (6, 6) K, in the LiDAR frame.
         camera: (6, 6) C, in the camera's axes.
-        bends: (n, 6, 3) how each camera's matches follow a standard deviation of each bend.
+        bends: (n, 6, 3) how each camera's matches follow a unit of each bend.
+        bend_covariance: (3, 3) of the bends.
+        bend_mean: (3,) of the bends.
         cloud_at_place: (6, 6) D, in the LiDAR frame.
         place_variance: q.
         cameras_size: by which what a camera's frames share at a place is larger than usual.
@@ -52,6 +56,8 @@ class SharedErrors:
     cloud: Array
     camera: Array
     bends: Array
+    bend_covariance: Array
+    bend_mean: Array
     cloud_at_place: Array
     place_variance: float
     cameras_size: float
@@ -66,25 +72,51 @@ class SharedErrors:
     ) -> SharedErrors:
         """What a matcher states, times the sizes that the data show, about these poses.
 
-        ``bend_shifts``: (n, 6, 3), see :class:`calibgraph.tracking.bends.BendShifts`.
+        Args:
+            findings: of the matcher.
+            T_lidar_camera: per camera.
+            sizes: of the errors over what is stated.
+            bend_shifts: (n, 6, 3), see :class:`calibgraph.tracking.bends.BendSums`.
         """
+        of_bends = np.square(findings.bend_sigmas)
         whole = np.square(findings.rigid_sigmas)
         at_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
         return SharedErrors(
             cloud=sizes.shared * _covariance((1.0 - findings.camera_share) * whole),
             camera=sizes.shared * _covariance(findings.camera_share * whole),
-            bends=sizes.shared**0.5 * bend_shifts * findings.bend_sigmas,
+            bends=bend_shifts,
+            bend_covariance=sizes.shared * np.diag(of_bends),
+            bend_mean=np.zeros(len(of_bends)),
             cloud_at_place=sizes.cloud * _covariance(at_place),
             place_variance=findings.place_variance,
             cameras_size=sizes.cameras,
             to_cameras=np.array([*map(adjoint_camera_lidar, T_lidar_camera)]),
         )
 
+    def with_residuals(self, bends: BendSums, variance: Array) -> SharedErrors:
+        """With what the residuals show of the bends, about which only what is usual was known.
+
+        Args:
+            bends: of all epochs.
+            variance: (n,) of each camera's matches, over that of independent ones.
+        """
+        information = (bends.information / variance[:, None, None]).sum(axis=0)
+        vector = (bends.vector / variance[:, None]).sum(axis=0)
+        less = np.eye(len(vector)) + self.bend_covariance @ information
+        covariance = np.asarray(np.linalg.solve(less, self.bend_covariance), dtype=np.float64)
+        return replace(self, bend_covariance=covariance, bend_mean=covariance @ vector)
+
     @cached_property
     def cameras(self) -> Array:
         """(6 n, 6 n) of the cameras as matches show them everywhere: C, and the bends."""
         flat, n = self.bends.reshape(-1, self.bends.shape[2]), len(self.bends)
-        return np.asarray(np.kron(np.eye(n), self.camera) + flat @ flat.T)
+        of_bends = flat @ self.bend_covariance @ flat.T
+        return np.asarray(np.kron(np.eye(n), self.camera) + of_bends)
+
+    @property
+    def offset(self) -> Array:
+        """(6 n,) step from the cameras to how matches show them everywhere, by the bends' mean."""
+        return np.asarray(self.bends @ self.bend_mean).ravel()
 
     @cached_property
     def everywhere(self) -> Array:
@@ -125,7 +157,7 @@ class Information:
     def of_cameras(self, errors: SharedErrors) -> Information:
         """Of the poses themselves: less what all frames share."""
         widened = np.eye(len(self.matrix)) + self.matrix @ errors.everywhere
-        both = np.column_stack([self.matrix, self.vector])
+        both = np.column_stack([self.matrix, self.vector - self.matrix @ errors.offset])
         found = np.asarray(np.linalg.solve(widened, both), dtype=np.float64)
         matrix = found[:, :-1]
         return Information((matrix + matrix.T) / 2, found[:, -1])
@@ -148,6 +180,20 @@ class FrameSpread:
     def least(self) -> Array:
         """(n,) the variance that matches keep for themselves, as in a batch."""
         return np.clip(np.linalg.eigvalsh(self.spread)[:, 0], _LEAST_VARIANCE, 1.0)
+
+    def mean_variance(self, sums: PlaceSums, place_variance: float) -> Array:
+        """(n,) of all matches of each camera, over that of independent ones, as in a batch.
+
+        In the mean over the directions of a pose; infinite without frames.
+
+        Args:
+            sums: of the frames.
+            place_variance: q.
+        """
+        inverse = np.linalg.inv(self.root)
+        whole = self.spread + place_variance * sums.alike[:, None, None] * np.eye(6)
+        variance = np.einsum("nji,njk,nki->n", inverse, whole, inverse) / 6
+        return np.where(sums.frames.any(axis=0), variance, np.inf)
 
 
 @dataclass(frozen=True, eq=False)

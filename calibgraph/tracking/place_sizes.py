@@ -65,6 +65,8 @@ def _shared_poses(
     hessian[12 * n :, 12 * n :] = np.linalg.inv(errors.cloud) + flat.T @ matched.matrix @ flat
     vector[x], vector[m], vector[12 * n :] = of_poses.vector, matched.vector, 0.0
     vector[12 * n :] = -flat.T @ matched.vector
+    vector[x] -= cameras @ errors.offset
+    vector[m] += cameras @ errors.offset
     covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
     return covariance @ vector, covariance
 
@@ -78,6 +80,7 @@ def _of_all(step: Array, covariance: Array, errors: SharedErrors) -> Evidence:
     inverse[6 * n :, 6 * n :] = np.linalg.inv(errors.cloud)
     to_errors = np.vstack([apart, np.eye(12 * n + 6)[12 * n :]])
     error, known = to_errors @ step, to_errors @ covariance @ to_errors.T
+    error[: 6 * n] -= errors.offset
     return Evidence(float(error @ inverse @ error), 6 * n + 6 - float((inverse * known).sum()))
 
 

@@ -139,6 +139,12 @@ class PlaceSums:
         return counts
 
     @property
+    def alike(self) -> Array:
+        """(n,) frames of a place, in the mean over frames."""
+        squared = self.older_squared + np.square(self.frames[1:]).sum(axis=0)
+        return np.asarray(squared / np.maximum(self.frames.sum(axis=0), 1.0))
+
+    @property
     def of_all(self) -> tuple[Array, Array, Array]:
         """(n, 6, 6) scatter of the frames' gradients about the means of their places.
 

@@ -170,6 +170,7 @@ def _restart_camera(
         epochs=epochs,
         cross=cross,
         places=state.places.without(camera),
+        bends=state.bends.at_new_pose(camera),
         references=replace_item(state.references, camera, T_lidar_camera),
         drift=_with_anchor_at(
             drift, camera, step_between(state.references[camera], T_lidar_camera)

@@ -110,10 +110,9 @@ def absorb_frames(
                 T_lidar_camera=replace_item(epoch.T_lidar_camera, camera, T_lidar_camera),
             )
         )
-    state = replace(state, epochs=tuple(epochs))
     if any(state.findings.bend_sigmas):
-        scale = state.cameras[camera].scale
-        state = replace(state, bends=state.bends.add(camera, blocks, scale, T_lidar_camera))
+        epochs = [epoch.with_bends(camera, state.cameras[camera].scale) for epoch in epochs]
+    state = replace(state, epochs=tuple(epochs))
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 

@@ -16,7 +16,7 @@ from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.bends import BendShifts
+from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import (
@@ -120,7 +120,7 @@ class State:
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
         places: sums of the older frames, place by place, of cameras that do not drift.
-        bends: how the cameras' matches follow bends of the cloud.
+        bends: what the matches of older epochs have to do with bends of the cloud.
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         frame: number of the last frame, or None.
@@ -138,7 +138,7 @@ class State:
     total_hessian: Array
     total_frames: Array
     places: PlaceSums
-    bends: BendShifts
+    bends: BendSums
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
@@ -157,13 +157,13 @@ class State:
             config=config,
             cameras=tuple(CameraState() for _ in range(n)),
             references=guess,
-            epochs=(Epoch((), guess),),
+            epochs=(Epoch.empty(guess),),
             cross=np.zeros((6 * n, 6 * n)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
             places=PlaceSums.empty(n),
-            bends=BendShifts.unknown(n),
+            bends=BendSums.empty(n),
         )
 
     @property
@@ -180,6 +180,11 @@ class State:
     def live_frames(self) -> tuple[LiveFrame, ...]:
         """The frames of all live epochs."""
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
+
+    @property
+    def all_bends(self) -> BendSums:
+        """What the matches of all epochs have to do with bends of the cloud."""
+        return sum((epoch.bends for epoch in self.epochs), self.bends)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""

@@ -32,7 +32,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.bends import BendShifts
+from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
@@ -40,9 +40,9 @@ from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/4"
+FORMAT = "calibgraph-tracker-state/5"
 """Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies, 3 had
-no places."""
+no places, 4 nothing of what residuals show of the cloud's bends."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
 _EARLIER_MARK = b"calibgraph-tracker/1\n"
@@ -51,7 +51,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, BendShifts, MatcherFindings, Sizes, ResidualHistogram,
+                 EpochSummary, PlaceSums, BendSums, MatcherFindings, Sizes, ResidualHistogram,
                  ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DECODING_ERRORS = (

@@ -21,7 +21,7 @@ from calibgraph.tracking.absorption import (
     add_to_totals,
     count_absent,
     count_absorbed,
-    set_aside,
+    select_agreeing,
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
@@ -36,7 +36,6 @@ from calibgraph.tracking.frame_order import (
 from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
@@ -166,7 +165,8 @@ class IncrementalCalibrator:
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        used = self._absorb(self._select_agreeing(blocks))
+        self._state, agreeing = select_agreeing(self._state, blocks)
+        used = self._absorb(agreeing)
         events = self._start_cameras(table, blocks)
         self._state, seen = count_absent(self._state, used)
         events += seen + self._restart_after_step()
@@ -248,19 +248,6 @@ class IncrementalCalibrator:
         kept = preprocess(self._at(self._state.T_lidar_camera), table, self._state.config)
         blocks = camera_blocks(self._state.rig, kept.table, self._state.config)
         return {self._state.names.index(name): block for name, block in blocks.items()}
-
-    def _select_agreeing(self, blocks: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
-        """The blocks that agree with the estimate; the others are set aside."""
-        agreeing = {}
-        for camera, block in blocks.items():
-            camera_state = self._state.cameras[camera]
-            if not camera_state.started:
-                continue
-            if agrees(block, self._state.T_lidar_camera[camera], camera_state):
-                agreeing[camera] = block
-            else:
-                self._state = set_aside(self._state, camera, block)
-        return agreeing
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add the blocks, gate them at the new estimate, replace them."""

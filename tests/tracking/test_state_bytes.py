@@ -85,10 +85,10 @@ def compressed() -> bytes:
         (b"", "is not a tracker's state"),
         (b"other", "is not a tracker's state"),
         (archive(json=np.array([object()])), "is not a tracker's state .*pickle"),
-        (archive(json=text({"format": "calibgraph-tracker-state/5"})), "is of format .*state/5"),
+        (archive(json=text({"format": "calibgraph-tracker-state/6"})), "is of format .*state/6"),
         (
-            archive(json=text({"format": "calibgraph-tracker-state/3"})),
-            "is of format .*state/3', expected .*state/4",
+            archive(json=text({"format": "calibgraph-tracker-state/4"})),
+            "is of format .*state/4', expected .*state/5",
         ),
         (archive(json=text([])), "is not a tracker's state"),
         (archive(other=text([])), "is not a tracker's state"),
