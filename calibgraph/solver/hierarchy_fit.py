@@ -28,7 +28,7 @@ TOLERANCE = 1e-6
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 
-_ROUNDING = 1e-14  # smallest part of a sum that a difference may leave
+_ROUNDING = 2e-15  # smallest part of a sum that a difference may leave
 
 _DAMPINGS = (0.0, *10.0 ** np.arange(-4, 5))
 """Of the diagonal: the first that descends; mostly none is needed."""

@@ -53,6 +53,7 @@ INVERTING = {
     "calibgraph/tracking/joint_estimate.py": NO_TRANSFORM,
     "calibgraph/tracking/noise.py": NO_TRANSFORM,
     "calibgraph/tracking/place_errors.py": NO_TRANSFORM,
+    "calibgraph/tracking/place_shift.py": NO_TRANSFORM,
     "calibgraph/tracking/place_sizes.py": NO_TRANSFORM,
     "calibgraph/tracking/posterior.py": NO_TRANSFORM,
     "calibgraph/tracking/step_detection.py": NO_TRANSFORM,
