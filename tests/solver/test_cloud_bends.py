@@ -9,9 +9,9 @@ import pytest
 
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.model.geometry import adjoints, invert, to_T_lidar_camera, twist_between
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.cloud_bends import bend_evidence, bends_at
+from calibgraph.solver.cloud_bends import bend_evidence, bends_at, shifts_of_pairs
 from calibgraph.solver.joint import solve_joint
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss
@@ -87,3 +87,16 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
             np.abs(twist_between(one.T_camera_lidar[name], T)).max() for one in (without, solution)
         )
         assert after < 0.5 * before
+
+
+def test_a_pair_follows_the_bends_by_one_motion_of_the_cloud(mixed_rig: Rig) -> None:
+    """The mean of what its cameras see, so that their relative pose stays; a silent one with it."""
+    T = np.stack([invert(camera.T_camera_lidar) for camera in mixed_rig.cameras.values()])
+    shifts = np.random.default_rng(0).standard_normal((3, 6, 2))
+    seen, to_cloud = np.array([True, True, False]), adjoints(T)
+    found = to_cloud @ shifts_of_pairs(shifts, seen, T, [(0, 1)])
+    both = (to_cloud[0] @ shifts[0] + to_cloud[1] @ shifts[1]) / 2
+    np.testing.assert_allclose(found, [both, both, np.zeros((6, 2))], rtol=0, atol=1e-12)
+    found = to_cloud @ shifts_of_pairs(shifts, seen, T, [(0, 1), (1, 2)])
+    alone = to_cloud[1] @ shifts[1]
+    np.testing.assert_allclose(found, [both, (both + alone) / 2, alone], rtol=0, atol=1e-12)
