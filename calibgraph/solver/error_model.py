@@ -236,6 +236,7 @@ def error_model(
             units = np.outer(usual_bends, usual_bends)
             bend_information[:, cameras.index(name)] = weight * units * evidence.information
             bend_vector[:, cameras.index(name)] = weight * usual_bends * evidence.vector
+    pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # of some the gate leaves nothing
     components = Components(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
@@ -245,7 +246,7 @@ def error_model(
             bends,
             np.isin(cameras, list(inliers.blocks)),
             invert(np.stack([T_camera_lidar[name] for name in cameras])),
-            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in inliers.pairs}),
+            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
         ),
         bend_information=bend_information,
         bend_vector=bend_vector,
@@ -255,7 +256,7 @@ def error_model(
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
     )
     graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
-    return Hierarchy(cameras, blocks, _placed_pairs(inliers.pairs, places), graph, components)
+    return Hierarchy(cameras, blocks, _placed_pairs(pairs, places), graph, components)
 
 
 def _covariance(rotation_rad2: float, translation_m2: float) -> Array:

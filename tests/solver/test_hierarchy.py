@@ -18,6 +18,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.solver.camera_pairs import Kind, pair_terms
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.hierarchy import Components, Hierarchy, hierarchy_graph
 from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy
@@ -190,13 +191,26 @@ def all_poses(model: Hierarchy, poses: Poses) -> dict[int, gtsam.Pose3]:
 
 
 @pytest.mark.parametrize("kind", ["surface", "point"])
+def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig, kind: Kind) -> None:
+    table, matches = table_of(pair, 6, False, []), simulated_pairs(pair, count=40)
+    solution = solve_joint(pair, table, Config(learnt_weights=False), camera_matches=matches)
+    term = pair_terms(pair, matches, Config(), kind=kind)[0].with_sigma(1.0)
+    empty = term.select(np.zeros(len(term.frame), np.bool_))
+    more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
+    found, expected = (
+        fit_errors(inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+        for inliers in (more, solution.inliers)
+    )
+    assert found is not None and expected is not None
+    np.testing.assert_array_equal(found.fit.covariance, expected.fit.covariance)
+
+
+@pytest.mark.parametrize("kind", ["surface", "point"])
 def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(
-    pair: Rig, kind: str
+    pair: Rig, kind: Kind
 ) -> None:
     """Its error is that of the pair seen from the cloud, its Jacobian that by differences."""
-    from calibgraph.solver.camera_pairs import pair_terms  # noqa: PLC0415
-
-    term = pair_terms(pair, simulated_pairs(pair), Config(), kind=kind)[0]  # type: ignore[arg-type]
+    term = pair_terms(pair, simulated_pairs(pair), Config(), kind=kind)[0]
     cloud = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]))
     poses = [to_T_lidar_camera(pair.T_camera_lidar[name]) for name in (term.a, term.b)]
     values = gtsam.Values()
