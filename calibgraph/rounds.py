@@ -172,12 +172,27 @@ def _solve(
             matches = with_surfaces(matches, dataset, matched[0])
             return solve_joint(*matched, config, terms, camera_matches=matches)
         with suppress(CorrespondenceError):
-            return solve_joint(*matched, config, terms, hold=True)
+            return _solve_some(*matched, config, terms)
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise
         hint = f"{error}; the images fit better if the guess is {intended}"
         raise CorrespondenceError(hint, camera=error.camera) from error
+
+
+def _solve_some(rig: Rig, table: Correspondences, config: Config, terms: Terms) -> Solution:
+    """The joint solve, in which cameras whose correspondences do not agree on a pose are held.
+
+    Raises:
+        CorrespondenceError: if that is so of all cameras.
+    """
+    while True:
+        try:
+            return solve_joint(rig, table, config, terms, hold=True)
+        except CorrespondenceError as error:
+            if error.camera is None or not table.counts().get(error.camera):
+                raise
+            table = table.select(table.camera_index != table.cameras.index(error.camera))
 
 
 def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:

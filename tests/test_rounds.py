@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import calibgraph
-from calibgraph import perturb, simulate_correspondences
+from calibgraph import Config, CorrespondenceError, perturb, simulate_correspondences
+from calibgraph.model.geometry import pose_difference
+from calibgraph.rounds import _solve_some
+from calibgraph.solver.joint import solve_joint
 from tests.conftest import SAMPLE
 from tests.matching.structure.data import with_noise_images
 
@@ -33,3 +38,21 @@ def test_a_camera_that_nothing_determines_fails_and_the_others_are_calibrated(
         assert result.sigmas(name) is not None
     result.save(tmp_path / "out")
     assert calibgraph.load_calibration(tmp_path / "out").sigmas("left") is None
+
+
+def test_a_camera_whose_matches_do_not_agree_is_held_and_the_others_are_solved() -> None:
+    """Enough of them to begin with, and too few within the gate: it fails, not the whole rig."""
+    truth = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    table = simulate_correspondences(truth, frames=3, matches=100)
+    own = np.flatnonzero(table.camera_index == table.cameras.index("left"))
+    pixels = table.pixels_px.copy()
+    pixels[own[3:7]] += [[200, 0], [0, 150], [-180, 20], [30, -160]]
+    other = np.flatnonzero(table.camera_index != table.cameras.index("left"))
+    table = replace(table, pixels_px=pixels).select(np.sort(np.r_[own[:7], other]))
+    with pytest.raises(CorrespondenceError, match="within the gate"):
+        solve_joint(truth, table, Config(), hold=True)
+    solution = _solve_some(truth, table, Config(), "full")
+    assert solution.held == ("left",)
+    for name in ("front_left", "front_right"):
+        T = solution.T_camera_lidar[name]
+        assert pose_difference(T, truth.cameras[name].T_camera_lidar)[0] < 0.1
