@@ -6,11 +6,10 @@
 A group is a rig with errors of its own, and five streets that it drove through, three frames each:
 one place. Rigs and beams change from group to group; errors of the LiDAR are those of ``simulate
 street --sensor-errors SIZE --vary-layout``, those of the lenses of half the size. Groups 100 to 115
-are to choose by, 116 to 179 are kept out. The second table
-solves again with the correspondences of one, two, five, ten and twenty of a group's streets, as far
-as it has as many; the third with those of five, changed: a relative pose is known, a camera has no
-matches or few, frames are repeated. NEES is the squared error in the metric of its covariance; its
-mean over 6 should be 1.
+are to choose by, 116 to 179 are kept out. The second table solves again with the correspondences of
+one, two, five, ten and twenty of a group's streets, as far as it has as many; the third with those
+of five, changed: a relative pose is known, a camera has no matches or few, frames are repeated.
+NEES is the squared error in the metric of its covariance; its mean over 6 should be 1.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Variables, each a ``Pose3`` but b; without errors of sensor and matcher all of a
     b     how the sensor bends the cloud, numbers in standard deviations: a prior by what is usual
           and by the residuals
     m_c   camera c as its matches show it everywhere: tied to x_c and b by ``components.camera``
-    n_c   camera c as its pairs show it everywhere: tied to x_c by ``components.pairs``
+    n_c   camera c as its pairs show it everywhere: tied to x_c and b by ``components.pairs``
     o     the cloud as displaced everywhere: a prior at the identity, ``components.cloud``
     o_p   the cloud as displaced at place p: tied to o by ``components.cloud_at_place``
     a_cp  camera c as its matches at place p show it: tied to m_c by ``components.at_place``
@@ -84,7 +84,7 @@ class Components:
         return np.concatenate([*self.bends, *self.pair_bends])
 
     @property
-    def cameras(self) -> Array:
+    def matches_and_pairs(self) -> Array:
         """(12 N, 12 N) of the matches of all cameras, then of their pairs: both share the bends."""
         N = len(self.bends)
         covariance = np.asarray(self.all_bends @ self.bend_covariance @ self.all_bends.T)
@@ -110,7 +110,7 @@ class Components:
         """(6 (2 N + 1),) squared: of the cloud, of all cameras' matches, and of their pairs."""
         whole = np.zeros((6 * (2 * len(self.bends) + 1),) * 2)
         whole[:6, :6] = np.linalg.inv(self.cloud)
-        whole[6:, 6:] = np.linalg.inv(self.cameras)
+        whole[6:, 6:] = np.linalg.inv(self.matches_and_pairs)
         return whole
 
     @cached_property

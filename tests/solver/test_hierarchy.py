@@ -267,7 +267,7 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
     block = errors.model.blocks["left"]
     assert isinstance(block.block, ProjectionBlock)
     hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
-    camera = parts.cameras[:6, :6]  # with the bends of the cloud
+    camera = parts.matches_and_pairs[:6, :6]  # with the bends of the cloud
     expected = camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
     sigmas = np.sqrt(np.diag(expected))
     difference = (errors.fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
