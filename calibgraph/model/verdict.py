@@ -131,10 +131,14 @@ class Doubt:
         return f"{100 * self.probability:.2g}%"
 
     @property
+    def tolerated(self) -> str:
+        """The tolerance with its units."""
+        return f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
+
+    @property
     def sentence(self) -> str:
         """What it is the probability of, without the number."""
-        tolerated = f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
-        return f"off by more than {tolerated} with a probability"
+        return f"off by more than {self.tolerated} with a probability"
 
     @property
     def of_error_bar(self) -> bool:
