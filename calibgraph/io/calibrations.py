@@ -168,6 +168,7 @@ class _Parts(BaseModel):
     prior_share: dict[str, float]
     inputs: dict[str, str]
     versions: dict[str, str]
+    date: str = ""
 
 
 def _require_consistent(
@@ -204,7 +205,7 @@ _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = ("residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap")
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
-    "counts", "timings_s", "terms", "prior_share", "inputs", "versions",
+    "counts", "timings_s", "terms", "prior_share", "inputs", "versions", "date",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 
