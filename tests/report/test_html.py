@@ -174,4 +174,4 @@ def test_a_result_from_driving_is_reported(pair: Rig, tmp_path: Path) -> None:
 def test_the_template_is_part_of_the_package() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "calibgraph*" in setuptools["packages"]["find"]["include"]
-    assert setuptools["package-data"]["calibgraph.report"] == ["*.html.j2"]
+    assert setuptools["package-data"]["calibgraph.report"] == ["*.html.j2", "static/*"]
