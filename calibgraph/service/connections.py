@@ -24,7 +24,7 @@ LEAST_BODY_BYTES = 10_000
 UNREAD_S = 10.0
 """For the rest of a body that was answered before its end: who still sends can read the answer."""
 REFUSED_S, REFUSED_BYTES = 1.0, 2**18
-"""So much more is taken, unread, from who was refused: closing at once would take back the answer."""
+"""So much more is taken, unread, after a refusal: to close at once would take back the answer."""
 WRITE_S = 60.0
 """A client takes some of the answer within this time."""
 

@@ -155,8 +155,10 @@ def test_a_body_that_was_refused_is_not_read_for_ever(place: Place, hasty: None)
 def test_a_slow_but_steady_body_arrives(place: Place, hasty: None) -> None:
     body = b"token=" + b"x" * 3000
     with connect(place) as connection:
-        head = b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: %d\r\n\r\n"
-        connection.sendall(head % len(body))
+        connection.sendall(
+            b"POST /sign-in HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
+            b"Content-Length: %d\r\n\r\n" % len(body)
+        )
         for start in range(0, len(body), 1000):
             connection.sendall(body[start : start + 1000])
             time.sleep(SHORT_S / 10)
