@@ -26,6 +26,7 @@ class JobTask:
         memory_bytes: that it may allocate.
         fetch_bytes: of remote recordings.
         unpacked_bytes: of uploaded archives.
+        free_bytes: of the disk, that stay free.
         timeout_s: after which it is ended.
     """
 
@@ -35,6 +36,7 @@ class JobTask:
     memory_bytes: int
     fetch_bytes: int
     unpacked_bytes: int
+    free_bytes: int
     timeout_s: float
 
 

@@ -226,10 +226,11 @@ class JobTable:
             for id in ids:
                 connection.execute(jobs.delete().where(jobs.c.id == id))
 
-    def ids(self) -> set[str]:
-        """Ids of all jobs."""
+    def states(self) -> dict[str, JobState]:
+        """The states of all jobs, by their ids."""
         with self._engine.connect() as connection:
-            return set(connection.execute(select(jobs.c.id)).scalars())
+            rows = connection.execute(select(jobs.c.id, jobs.c.state))
+            return {id: state for id, state in rows}
 
     def _change(self, where: ColumnElement[bool], values: dict[str, Any]) -> int:
         with self._engine.begin() as connection:

@@ -29,7 +29,6 @@ from calibgraph.service.routes_jobs import find_job
 from calibgraph.service.routes_trackers import find_tracker
 from calibgraph.service.state import Service, State
 from calibgraph.service.tracker_request import TrackerRequest
-from calibgraph.service.uploads import read_whole
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -160,9 +159,9 @@ def sign_in_page(request: Request) -> Response:
 
 
 @router.post("/sign-in")
-async def sign_in(request: Request) -> Response:
+async def sign_in(request: Request, state: State) -> Response:
     """Keep a token in the browser, where no script can read it."""
-    body = await read_whole(request.stream(), _MOST_FORM_BYTES)
+    body = await state.memory.read(request, "", _MOST_FORM_BYTES)
     fields = parse_qs(body.decode("utf-8", errors="replace"))
     secret = fields.get("token", [""])[0].strip()
     gate: Gate = request.app.state.gate

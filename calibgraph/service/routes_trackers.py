@@ -23,7 +23,6 @@ from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
 from calibgraph.service.tracker_request import ARROW, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
-from calibgraph.service.uploads import read_whole
 from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")
@@ -138,7 +137,7 @@ async def create_tracker(request: Request, state: State, caller: Submitter) -> R
     """Begin to track a rig."""
     if not request.headers.get("content-type", "").startswith("application/json"):
         raise Problem(415, "send application/json")
-    content = parse_json(await read_whole(request.stream(), MAX_JSON_BYTES))
+    content = parse_json(await state.memory.read(request, caller.tenant, MAX_JSON_BYTES))
     if not isinstance(content, dict):
         raise Problem(422, "expected a JSON object")
     body = checked_model(TrackerBody, content, "tracker")
@@ -183,7 +182,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
-    body = await read_whole(request.stream(), state.settings.frames_bytes)
+    body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
     asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
     answer = await state.trackers.answer(id, asked)
     state.metrics.frames.inc(len(answer["updates"]))

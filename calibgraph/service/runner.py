@@ -17,8 +17,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.bell import progress_of
 from calibgraph.service.folders import DataFolder
-from calibgraph.service.job_task import RESULT, WORK, JobOutcome, JobTask
-from calibgraph.service.jobs import MOST_STARTS, JobRecord, JobTable
+from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobTask
+from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
 from calibgraph.service.settings import Settings
@@ -115,14 +115,16 @@ class Runner:
 
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
-        changed = self._table.cancel(id)
+        if not self._table.cancel(id):
+            return False
         with self._taking:
-            for slot in self._slots:
-                if changed and slot.job == id:
-                    slot.child.kill()
-        if changed:
-            self._ring(id)
-        return changed
+            running = [slot for slot in self._slots if slot.job == id]
+            for slot in running:
+                slot.child.kill()
+        if not running:
+            self._discard_input(id)
+        self._ring(id)
+        return True
 
     def begin_stop(self) -> None:
         """Start no more jobs."""
@@ -197,11 +199,13 @@ class Runner:
             self._table.finish(
                 record.id, "failed", error_kind=outcome.error_kind, error=outcome.error
             )
+        if outcome is not None:
+            self._deaths.pop(record.id, None)
+        if outcome is not None or self._is_finished(record.id):
+            self._discard_input(record.id)
         with self._taking:
             slot.job = None
         self._steps.pop(record.id, None)
-        if outcome is not None:
-            self._deaths.pop(record.id, None)
         state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
         self._metrics.jobs.labels(record.kind, state).inc()
         self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
@@ -242,6 +246,7 @@ class Runner:
             memory_bytes=settings.job_memory_bytes,
             fetch_bytes=settings.fetch_bytes,
             unpacked_bytes=settings.upload_bytes,
+            free_bytes=settings.free_bytes,
             timeout_s=settings.job_timeout_s,
         )
 
@@ -260,6 +265,15 @@ class Runner:
         folder = self._folder.of_job(id)
         shutil.rmtree(folder / RESULT, ignore_errors=True)
         (folder / WORK).rename(folder / RESULT)
+
+    def _is_finished(self, id: str) -> bool:
+        record = self._table.get(id)
+        return record is None or record.is_finished
+
+    def _discard_input(self, id: str) -> None:
+        """Remove all of a finished job that is not its result."""
+        for name in (INPUT, WORK):
+            remove_folder(self._folder.of_job(id) / name)
 
     def _expire(self) -> None:
         """A thread: remove the jobs whose results have been kept for long enough."""
@@ -280,11 +294,13 @@ class Runner:
             remove_folder(self._folder.of_job(id))
 
     def _remove_leftovers(self) -> None:
-        """Remove the folders of jobs that were not acknowledged, or are forgotten."""
-        known = self._table.ids()
+        """Remove the folders of jobs that are not known, and the input of those that ended."""
+        states = self._table.states()
         for folder in self._folder.jobs.iterdir():
-            if folder.name not in known:
+            if folder.name not in states:
                 remove_folder(folder)
+            elif states[folder.name] in FINISHED:
+                self._discard_input(folder.name)
 
 
 _MOST_DEATHS = min(5, MOST_STARTS)

@@ -17,6 +17,9 @@ Seconds = Annotated[float, Field(gt=0)]
 MAX_JSON_BYTES = 8 * MB
 """Of a request's body that is JSON."""
 
+MAX_BODIES_BYTES = 512 * MB
+"""Of bodies that arrive at the same time and are kept in memory."""
+
 
 class Settings(BaseModel):
     """Settings of a server.

@@ -16,8 +16,9 @@ from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root, open_roots
 from calibgraph.service.problems import Problem
+from calibgraph.service.room import Room
 from calibgraph.service.runner import Runner
-from calibgraph.service.settings import Settings
+from calibgraph.service.settings import MAX_BODIES_BYTES, Settings
 from calibgraph.service.tracker_table import TrackerTable
 from calibgraph.service.trackers import Trackers
 
@@ -38,6 +39,7 @@ class Service:
         trackers: the processes that hold them.
         roots: from which jobs may read.
         metrics: numbers for Prometheus.
+        disk, memory: room for uploads, and for bodies that are not written to disk.
         bell: wakes requests that wait.
         is_stopping: whether the server was told to stop.
     """
@@ -52,7 +54,13 @@ class Service:
     roots: tuple[Root, ...]
     metrics: Metrics
     bell: Bell
+    disk: Room = field(init=False)
+    memory: Room = field(init=False)
     is_stopping: bool = field(default=False)
+
+    def __post_init__(self) -> None:
+        self.disk = Room(self.folder.free_bytes, self.settings.free_bytes, 507)
+        self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
 
     def start(self) -> None:
         """Begin to run jobs, in the event loop."""

@@ -34,7 +34,7 @@ from calibgraph.service.requests import (
 )
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service
-from calibgraph.service.uploads import FormReader, Upload, read_whole
+from calibgraph.service.uploads import FormReader, Upload
 
 SETTINGS = "settings"
 _MOST_KEY = 255
@@ -66,7 +66,7 @@ async def submit(
     arriving = service.folder.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
-        job, digest = await _read(service, request, kind, arriving / INPUT)
+        job, digest = await _read(service, request, caller, kind, arriving / INPUT)
         return await run_in_threadpool(_keep, service, arriving, caller.tenant, job, digest, key)
     except OtherRequestError:
         raise Problem(422, "this Idempotency-Key was given with another request") from None
@@ -93,19 +93,20 @@ def _require_place_in_queue(service: Service) -> None:
         )
 
 
-async def _read(service: Service, request: Request, kind: JobKind, folder: Path) -> tuple[Job, str]:
+async def _read(
+    service: Service, request: Request, caller: Caller, kind: JobKind, folder: Path
+) -> tuple[Job, str]:
     """The job that a request asks for, its uploads in a folder; and the digest of all."""
-    content_type = request.headers.get("content-type", "")
-    media = content_type.partition(";")[0].strip().lower()
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
         allowed = {name: 1 for name in ALLOWED[kind]} | (
             {RECORDING: MAX_RECORDINGS} if RECORDING in ALLOWED[kind] else {}
         )
-        reader = FormReader(folder, allowed, service.settings.upload_bytes)
-        upload = await reader.read(content_type, request.stream())
+        with service.disk.hold(request, caller.tenant, service.settings.upload_bytes) as arrive:
+            upload = await FormReader(folder, allowed).read(request, arrive)
         job, digest = _job_of_form(upload, kind), f"{kind} {upload.digest}"
     elif media == "application/json":
-        body = await read_whole(request.stream(), MAX_JSON_BYTES)
+        body = await service.memory.read(request, caller.tenant, MAX_JSON_BYTES)
         job = job_of(_checked(REQUESTS[kind], parse_json(body)), kind)
         digest = f"{kind} {job.model_dump_json()}"
     else:
