@@ -17,6 +17,7 @@ from calibgraph.report.worked_point import matrix_text
 
 Array = NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class Pictures:
     """A cloud on an image of one camera, as data URIs.

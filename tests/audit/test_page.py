@@ -147,4 +147,3 @@ def test_a_browser_shows_it_without_errors_and_without_a_network(tmp_path: Path)
 def test_the_template_is_part_of_the_package() -> None:
     content = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert content["tool"]["setuptools"]["package-data"]["calibgraph.audit"] == ["page.html.j2"]
-
