@@ -148,6 +148,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         stage1_T_camera_lidar=solution.T_hat,
         weaknesses={n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras},
         prior_share=evidence.prior_shares,
+        error_sources=evidence.error_sources,
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,

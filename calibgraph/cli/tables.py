@@ -66,6 +66,8 @@ def print_summary(console: Console, summary: Summary) -> None:
         print_plain(console, "What to do:")
     for action in summary.actions:
         print_plain(console, f"  {action}")
+    if summary.error_bar:
+        print_plain(console, summary.error_bar)
     if summary.others:
         print_plain(console, f"{len(summary.others)} more: see {_DETAILS}")
 

@@ -257,6 +257,7 @@ class Calibration:
             },
             "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
             "prior_share": self.prior_share,
+            "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},

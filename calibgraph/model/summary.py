@@ -13,7 +13,7 @@ from typing import Any
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.threshold import in_unit
-from calibgraph.model.verdict import Check, Status, Verdict, rig_verdict
+from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
 
 MOST = 3
 """Reasons and actions that are shown; the others are folded."""
@@ -51,6 +51,8 @@ class Summary:
         doubt: how probable it is that which cameras are off, in one sentence; empty for a PASS.
         reasons: at most three, each of another cause, the worst first.
         actions: what to do, at most three sentences, each once.
+        error_bar: the largest error bar beside the tolerance, and the shares of its sources; empty
+            if there is none.
         others: the other findings, the worst first, then the weaknesses.
     """
 
@@ -59,6 +61,7 @@ class Summary:
     doubt: str
     reasons: tuple[Reason, ...]
     actions: tuple[str, ...]
+    error_bar: str
     others: tuple[Reason, ...]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -84,13 +87,14 @@ def summarize(
         weaknesses: sentences per camera.
         sources: of the error bar, per camera.
     """
-    of_rig = rig_verdict(verdicts)
+    of_rig, known = rig_verdict(verdicts), sources or {}
+    tolerance = TOLERANCE if of_rig.doubt is None else of_rig.doubt.tolerance
     findings = [*_unsure(verdicts), *_findings(verdicts)]
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
         by_cause.setdefault(finding.cause, []).append(finding)
     grouped = [_with_all_cameras(each) for each in by_cause.values()]
-    shown = grouped[:MOST]
+    shown = [_with_action_for(reason, known, tolerance) for reason in grouped[:MOST]]
     folded = [reason for each in by_cause.values() for reason in each[1:]] + grouped[MOST:]
     actions = dict.fromkeys(reason.action for reason in shown if reason.action)
     return Summary(
@@ -99,8 +103,28 @@ def summarize(
         _doubt(verdicts),
         tuple(shown),
         tuple(actions)[:MOST],
+        _error_bar(known, tolerance),
         (*sorted(folded, key=_rank), *_group_sentences(weaknesses or {})),
     )
+
+
+def _with_action_for(
+    reason: Reason, sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]
+) -> Reason:
+    """With what would shrink the largest error bar of its cameras, if that is the reason."""
+    known = [sources[name] for name in reason.cameras if name in sources]
+    if CAUSES[reason.cause].action or not known:
+        return reason
+    largest = max(known, key=lambda one: one.over_tolerance(tolerance))
+    return replace(reason, action=largest.action(tolerance))
+
+
+def _error_bar(sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]) -> str:
+    """The camera whose error bar is largest beside the tolerance, in one sentence."""
+    if not sources:
+        return ""
+    name = max(sources, key=lambda one: sources[one].over_tolerance(tolerance))
+    return f"error bar of {name} {sources[name].describe(tolerance)}"
 
 
 def _rank(reason: Reason) -> tuple[int, int]:

@@ -131,6 +131,11 @@ class Doubt:
         return f"{100 * self.probability:.2g}%"
 
     @property
+    def tolerance(self) -> tuple[float, float]:
+        """Rotation [deg] and distance [cm]."""
+        return self.tolerance_deg, self.tolerance_cm
+
+    @property
     def tolerated(self) -> str:
         """The tolerance with its units."""
         return f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
@@ -147,10 +152,10 @@ class Doubt:
 
     @property
     def advice(self) -> str:
-        """What to do if the data cannot tell more; empty if something seems wrong."""
+        """That the data cannot tell more; empty if something seems wrong."""
         if not self.of_error_bar:
             return ""
-        return ": the data cannot tell, by the error bar; record more frames, at more places"
+        return ": cannot tell, by the error bar"
 
 
 @dataclass(frozen=True)

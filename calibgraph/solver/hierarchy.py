@@ -61,6 +61,7 @@ class Components:
         bend_size: variance of the bends before, over the usual one.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
+        scatter_at_place: (P, N, 6, 6) the part of it that the scatter of the frames shows.
         robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
             infinite: none.
     """
@@ -75,6 +76,7 @@ class Components:
     bend_weight: Array
     pairs: Array
     at_place: Array
+    scatter_at_place: Array
     bend_size: float = 1.0
     robust_scale: float = np.inf
 
