@@ -119,8 +119,8 @@ CAUSES: dict[str, Cause] = {
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
-         "common_error": "State the error that all frames share: common_error in the config, or in "
-         "the table's metadata.",
+         "common_error": "State the error that all frames share, --common-deg and --common-cm (0 "
+         "if none), or systematic_rotation_rad and systematic_translation_m in the metadata.",
          "start": "Keep driving: the camera starts after enough frames with matches.",
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from calibgraph.model.verdict import Check, Status, grade
+import numpy as np
+
+from calibgraph.model.verdict import TOLERANCE, Check, Status, grade
 
 Direction = Literal["at most", "at least"]
 
@@ -26,7 +28,8 @@ class Threshold:
         unit: of the values; "share" is printed in percent.
         question: what the check answers, in words.
         reason: why these limits: what they mean, or the data that they were read from.
-        advice: what to do if it is not PASS.
+        advice: the meaning if it is not PASS; for what to do, see ``model.causes``.
+        of_tolerance: whether the limits are for the usual tolerance, and follow another one.
     """
 
     key: str
@@ -38,6 +41,19 @@ class Threshold:
     question: str
     reason: str
     advice: str = ""
+    of_tolerance: bool = False
+
+    def at(self, tolerance: tuple[float, float]) -> Threshold:
+        """The row for a tolerance [deg, cm].
+
+        A tolerance below the usual one moves the limit of PASS alone: an error of that size is too
+        large for the user, but no sign of a wrong result.
+        """
+        if not self.of_tolerance:
+            return self
+        ratio = dict(zip(("deg", "cm"), np.divide(tolerance, TOLERANCE), strict=True))[self.unit]
+        fail = self.fail * max(float(ratio), 1.0)
+        return replace(self, warn=self.warn * float(ratio), fail=fail)
 
     def grade(self, value: float) -> Status:
         """PASS, WARN or FAIL of a value; NaN fails."""

@@ -14,8 +14,11 @@ PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
 """Probabilities that a result is off by more than the tolerance, where verdicts are cut."""
 TOLERANCE = (0.5, 10.0)
 """Rotation [deg] and distance [cm] that users tolerate if they state nothing else."""
+COMMON_ERROR = "common_error"
+"""Kind of the check that a table states the error that its frames share."""
 ABOUT_THE_DATA = frozenset(
     {
+        COMMON_ERROR,
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split

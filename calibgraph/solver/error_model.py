@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.error_components import error_components
+from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
@@ -214,7 +214,7 @@ def error_model(
     cameras = tuple(T_camera_lidar)
     whole, share = np.square(findings.rigid_sigmas), findings.camera_share
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = usual.matchers["unknown"]
+        unknown = usual.matchers[UNKNOWN]
         whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])

@@ -378,6 +378,8 @@ class Evidence:
             converged=solution.optimum.converged,
             terms=solution.terms,
             held=camera in solution.held,
+            scatter_only=not self.findings.states_common_error,
+            tolerance=solution.config.tolerance,
         )
 
 
