@@ -12,7 +12,7 @@ from typing import Any
 
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.threshold import in_unit
+from calibgraph.model.threshold import beside, in_unit
 from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
 
 MOST = 3
@@ -165,8 +165,7 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     alike: dict[tuple[str, ...], dict[str, Check]] = {}
     for camera, verdict in verdicts.items():
         for check in verdict.checks:
-            measured = check.value is not None and check.warn is not None
-            key = (check.name, check.unit, "" if measured else _NUMBER.sub("", check.text))
+            key = (check.name, check.unit, "" if check.is_graded else _NUMBER.sub("", check.text))
             if check.status != "PASS":
                 alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
@@ -194,7 +193,7 @@ def _sentence(checks: Mapping[str, Check]) -> str:
     """The same check of several cameras in one sentence, with the meaning of the first."""
     first = next(iter(checks.values()))
     texts = [check.text for check in checks.values()]
-    if len(set(texts)) == 1 or first.warn is None:
+    if len(set(texts)) == 1 or not first.is_graded:
         return _merge_numbers(texts)
     meaning = first.text.removeprefix(first.name).partition(": ")[2]
     text = f"{first.name}: {_values(checks)}"
@@ -208,7 +207,7 @@ def _values(checks: Mapping[str, Check]) -> str:
         of_status = {name: check for name, check in checks.items() if check.status == status}
         for check in list(of_status.values())[:1]:
             limit = (check.fail if status == "FAIL" else check.warn) or 0.0
-            found = [f"{n} {in_unit(c.value or 0.0, c.unit)}" for n, c in of_status.items()]
+            found = [f"{n} {beside(c.value or 0.0, limit, c.unit)}" for n, c in of_status.items()]
             parts.append(f"{', '.join(found)} ({status}: limit {in_unit(limit, check.unit)})")
     return "; ".join(parts)
 

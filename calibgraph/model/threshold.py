@@ -117,8 +117,7 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
     kind: str,
 ) -> Check:
     limit = fail if status == "FAIL" else warn
-    digits = 3 if status == "PASS" or in_unit(value, unit) != in_unit(limit, unit) else 9
-    text = f"{name} {in_unit(value, unit, digits)}"
+    text = f"{name} {beside(value, limit, unit)}"
     if status != "PASS":
         text += f" is {side} {in_unit(limit, unit)}"
         text += f": {advice}" if advice else ""
@@ -139,7 +138,27 @@ def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
 
 
 def in_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit, for display."""
-    if unit == "share":
-        return f"{100 * value:.{digits}g}%"
-    return f"{value:.{digits}g} {unit}".rstrip()
+    """A number with its unit, for display; large ones without an exponent."""
+    scaled, sign = (100 * value, "%") if unit == "share" else (value, f" {unit}".rstrip())
+    if 10**digits <= abs(scaled) < math.inf:
+        return f"{scaled:.0f}{sign}"
+    return f"{scaled:.{digits}g}{sign}"
+
+
+def beside(value: float, limit: float, unit: str) -> str:
+    """A number with its unit, in three digits that tell it from a limit beyond which it lies.
+
+    Where these would be the same, the number is rounded away from the limit.
+
+    Args:
+        value: of the number.
+        limit: that it is printed beside.
+        unit: of both.
+    """
+    text = in_unit(value, unit)
+    if value == limit or text != in_unit(limit, unit):
+        return text
+    scaled = 100 * limit if unit == "share" else limit
+    step = 10.0 ** min(math.floor(math.log10(abs(scaled))) - 2, 0)
+    away = round(scaled / step) + (1 if value > limit else -1)
+    return in_unit(away * step / (100 if unit == "share" else 1), unit)

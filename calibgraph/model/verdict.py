@@ -66,6 +66,15 @@ class Check:
         return self.status == "FAIL" and self.warn is None
 
     @property
+    def is_graded(self) -> bool:
+        """Whether the status is the one that the limits give the value."""
+        if self.value is None or self.warn is None or self.fail is None:
+            return False
+        if self.warn <= self.fail:
+            return self.status == grade(not self.value <= self.warn, not self.value <= self.fail)
+        return self.status == grade(not self.value >= self.warn, not self.value >= self.fail)
+
+    @property
     def severity(self) -> float:
         """How bad it is: 0 to 1 is PASS, 1 to 2 WARN, 2 to 3 FAIL, without steps at the limits."""
         low = float(_ORDER.index(self.status))
@@ -207,11 +216,6 @@ class Verdict:
             return True
         beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
         return bool(beyond) and beyond <= ABOUT_THE_DATA
-
-    @property
-    def label(self) -> str:
-        """The status for people: CANNOT TELL in place of such a WARN."""
-        return "CANNOT TELL" if self.cannot_tell else self.status
 
     @property
     def reasons(self) -> tuple[str, ...]:

@@ -21,12 +21,16 @@ Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
-    "CANNOT TELL": "With care: nothing seems wrong, but these data do not determine it well enough "
-    "for the tolerance. Record more frames, at more places; the reasons name what is missing.",
     "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
     "and look at the pictures.",
     "FAIL": "No. Do not use this result; the reasons below name what to correct.",
 }
+
+
+_UNSURE = (
+    "With care: nothing seems wrong, but the data cannot tell more; the reasons name what is "
+    "missing."
+)
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -63,7 +67,7 @@ def report_html(result: Calibration) -> str:
     return load_template("page.html.j2").render(
         result=result,
         cameras=cameras,
-        usable=_CAN_I_USE_IT[result.verdict.label],
+        usable=_UNSURE if summary.cannot_tell else _CAN_I_USE_IT[summary.status],
         accuracy=_accuracy(result),
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
         reasons=(*summary.reasons, *summary.others),

@@ -87,8 +87,8 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     for times in TIMES:
         more = replace(parts, bend_information=times * parts.bend_information)
         shared = jacobian.T @ more.shared_information @ jacobian
-        covariance = np.linalg.inv(times * of_places + shared + known)
-        found[times] = np.diag(covariance)[:cameras]
+        columns = np.linalg.solve(times * of_places + shared + known, np.eye(free, cameras))
+        found[times] = np.diag(columns)
     return found
 
 

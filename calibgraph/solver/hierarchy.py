@@ -61,9 +61,10 @@ class Components:
         bend_size: variance of the bends before, over the usual one.
         pairs: (6, 6) of all that pairs show of a camera.
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
-        scatter_at_place: (P, N, 6, 6) the part of it that the scatter of the frames shows.
         robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
             infinite: none.
+        scatter_at_place: (P, N, 6, 6) the part of ``at_place`` that the scatter of the frames
+            shows; 0: none.
     """
 
     cloud: Array
@@ -76,9 +77,9 @@ class Components:
     bend_weight: Array
     pairs: Array
     at_place: Array
-    scatter_at_place: Array
     bend_size: float = 1.0
     robust_scale: float = np.inf
+    scatter_at_place: Array | float = 0.0
 
     @property
     def all_bends(self) -> Array:

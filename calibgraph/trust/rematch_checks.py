@@ -17,9 +17,10 @@ REMATCH_DEG, REMATCH_M = 0.5, 0.08
 
 def last_round_checks(evidence: RunEvidence) -> Checks:
     """How far the last of several rounds of matching still moved the cameras."""
-    rounds, tolerance = evidence.run.rounds, evidence.run.solution.config.tolerance
+    rounds = evidence.run.rounds
     if len(rounds) == 1:
         return {}
+    tolerance = evidence.run.solution.config.tolerance
     return {
         name: [
             threshold("last_round_rotation", tolerance).check(moved["moved_deg"]),

@@ -128,9 +128,8 @@ def halves_checks(estimate: Estimate) -> list[Check]:
     if estimate.terms in ("stage1", "priors"):
         text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
         return [Check("terms", "WARN", text)]
-    rotation, translation = (
-        threshold(key, estimate.tolerance) for key in ("halves_rotation", "halves_translation")
-    )
+    rotation = threshold("halves_rotation", estimate.tolerance)
+    translation = threshold("halves_translation", estimate.tolerance)
     if estimate.halves is None:
         text = "the frames cannot be split into halves to check against each other"
         return [Check(rotation.name, "WARN", text)]
