@@ -93,7 +93,7 @@ def common_error_checks(estimate: Estimate) -> list[Check]:
         "scatter only: the table states no error that its frames share, so that the true error may "
         "be many times the error bar"
     )
-    return [Check(COMMON_ERROR, "WARN", text)]
+    return [Check("common error", "WARN", text, kind=COMMON_ERROR)]
 
 
 def relative_pose_checks(estimate: Estimate) -> list[Check]:

@@ -23,8 +23,8 @@ def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> No
     assert (code, err) == (0, "")
     content = json.loads(out)
     assert set(content) == {
-        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "cameras", "lidar",
-        "timings_s",
+        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording", "cameras",
+        "lidar", "timings_s",
     }  # fmt: skip
     assert content["status"] == "OK"
     assert content["wrong"] == []
@@ -46,7 +46,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
     code, out, err = call("check", deployed, SAMPLE)
     assert (code, out) == (1, "")
     lines = err.splitlines()
-    assert lines[0] == "WRONG"
+    assert lines[0] == "WRONG  check: is the deployed calibration still right?"
     assert any(line.startswith("  WRONG left: turned about y (yaw) by +") for line in lines)
     assert sum(line.startswith("  OK front_") for line in lines) == 2
     assert deployed.read_bytes() == before
@@ -56,7 +56,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
 def test_one_frame_exits_with_3(call: Call) -> None:
     code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0")
     assert code == 3
-    assert err.startswith("CANNOT TELL\n")
+    assert err.startswith("CANNOT TELL  check: is the deployed calibration still right?\n")
     assert "record" in err
 
 

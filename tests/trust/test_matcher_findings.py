@@ -9,7 +9,6 @@ import pytest
 import calibgraph
 from calibgraph import Correspondences, Rig
 
-
 STATED = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
 
 
