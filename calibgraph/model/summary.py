@@ -18,6 +18,8 @@ from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verd
 MOST = 3
 """Reasons and actions that are shown; the others are folded."""
 
+_CANNOT_TELL = "cannot tell: "
+_OF_DATA = ("error bar", "data")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")
 
@@ -94,6 +96,8 @@ def summarize(
     for finding in sorted(findings, key=_rank):
         by_cause.setdefault(finding.cause, []).append(finding)
     grouped = [_with_all_cameras(each) for each in by_cause.values()]
+    if of_rig.cannot_tell:
+        grouped = _unsure_first(grouped)
     shown = [_with_action_for(reason, known, tolerance) for reason in grouped[:MOST]]
     folded = [reason for each in by_cause.values() for reason in each[1:]] + grouped[MOST:]
     actions = dict.fromkeys(reason.action for reason in shown if reason.action)
@@ -132,6 +136,13 @@ def _rank(reason: Reason) -> tuple[int, int]:
     return _WORST_FIRST.index(reason.status), list(CAUSES).index(reason.cause)
 
 
+def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
+    """Those of how much the data determine before others, and the first named as such."""
+    first, *others = sorted(reasons, key=lambda reason: reason.cause not in _OF_DATA)
+    text = f"{_CANNOT_TELL}{first.text.removeprefix(_CANNOT_TELL)}"
+    return [replace(first, text=text), *others]
+
+
 def _with_all_cameras(reasons: Sequence[Reason]) -> Reason:
     """The first reason of a cause, with the cameras of all."""
     names = dict.fromkeys(name for reason in reasons for name in reason.cameras)
@@ -146,7 +157,7 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     if not found:
         return []
     tolerated = next(iter(found.values())).tolerated
-    text = f"cannot tell: the error bar is too wide for a tolerance of {tolerated}"
+    text = f"{_CANNOT_TELL}the error bar is too wide for a tolerance of {tolerated}"
     return [Reason("WARN", tuple(found), text, "error bar")]
 
 

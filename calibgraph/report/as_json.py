@@ -31,6 +31,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
             "cannot_tell": result.camera_verdicts[name].cannot_tell,
             "probability_off": _probability(result.camera_verdicts[name]),
             "reasons": list(result.camera_verdicts[name].reasons),
+            "actions": list(result.summary_of(name).actions),
             **_sigmas(result, name),
             "residuals": None if residuals is None else vars(residuals),
             "weaknesses": list(result.weaknesses.get(name, ())),
