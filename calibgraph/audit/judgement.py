@@ -27,6 +27,7 @@ from scipy.special import chdtri, ndtri, stdtrit
 
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
 from calibgraph.model.error_components import UNKNOWN, error_components
+from calibgraph.model.error_sources import MOST_TIMES, ErrorSources
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
@@ -48,9 +49,7 @@ CONFIDENCE = 0.95
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
 _DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
-_RECORD = (
-    "a change as large as the tolerance could go unseen: tolerate {}, or record more frames, {}"
-)
+_UNSEEN = "a change as large as the tolerance could go unseen"
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 
 SEARCHES_FARTHER = (
@@ -166,13 +165,22 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         covariance = covariance + _unstated_error()
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
-    status, reason = judge_axes(deviation, sigma, quantiles, tolerance)
+    least = _least_share(evidence.error_sources.get(name))
+    status, reason = judge_axes(deviation, sigma, quantiles, tolerance, least=least)
     if doubt:
         status, reason = "CANNOT TELL", doubt
     elif status == "WRONG" and len(evidence.cameras) == 1:
         reason += SINGLE_CAMERA
     smallest = detectable(sigma, quantiles.confident)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
+
+
+def _least_share(sources: ErrorSources | None) -> Array | float:
+    """(6,) share of an error bar that remains with any number of frames; 0 if unknown."""
+    if sources is None:
+        return 0.0
+    now = np.array([sources.rotation_deg, sources.translation_cm])
+    return np.repeat(sources.forecast[MOST_TIMES] / now, 3)
 
 
 def _unstated_error() -> Array:
@@ -209,9 +217,22 @@ def _deviation(evidence: Evidence, name: str) -> Array:
 
 
 def judge_axes(
-    deviation: Array, sigma: Array, quantiles: Quantiles, tolerance: Tolerance
+    deviation: Array,
+    sigma: Array,
+    quantiles: Quantiles,
+    tolerance: Tolerance,
+    *,
+    least: Array | float = 0.0,
 ) -> tuple[AuditStatus, str]:
-    """The status of a trusted measurement, and its reason."""
+    """The status of a trusted measurement, and its reason.
+
+    Args:
+        deviation: (6,) of all axes.
+        sigma: (6,) its standard deviations.
+        quantiles: of these.
+        tolerance: on each axis.
+        least: (6,) share of sigma that remains however many frames are recorded.
+    """
     size, significant = np.abs(deviation), np.abs(deviation) > quantiles.significant * sigma
     wrong = significant & (size > tolerance.twist)
     if wrong.any():
@@ -220,32 +241,32 @@ def judge_axes(
     blind = needed > tolerance.twist
     unsure = (size + quantiles.confident * sigma > tolerance.twist) | blind
     if unsure.any():
-        return "CANNOT TELL", _advise(
-            describe_motion(deviation, sigma, unsure, CAMERA_AXES), needed, blind
-        )
+        found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
+        recording_helps = not (least * needed > tolerance.twist).any()
+        advice = _advise(needed, blind, recording_helps=recording_helps)
+        return "CANNOT TELL", f"may be beyond the tolerance: {found}; {advice}"
     if significant.any():
         moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
         return "OK", f"within the tolerance, though significant: {moved}"
     return "OK", "no significant deviation, and all axes are within the tolerance"
 
 
-def _advise(found: str, needed: Array, blind: Mask) -> str:
-    """What was found about the axes that may be beyond the tolerance, and what to do.
+def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
+    """What to do about axes that may be beyond the tolerance.
 
     Args:
-        found: their deviations, in words.
         needed: (6,) the tolerance that these data could confirm, if nothing has changed.
         blind: (6,) which axes need more than the tolerance.
+        recording_helps: whether enough frames would do.
     """
     if not blind.any():
-        advice = "too near to the tolerance to decide: check another recording, of other places"
-    else:
-        degrees, centimetres = np.degrees(needed[:3].max()), 100 * needed[3:].max()
-        enough = f"{degrees:.2g} deg and {centimetres:.2g} cm"
-        near = "where walls, poles or vehicles are within 10 m"
-        all_over = "with walls, poles or vehicles all over the image"
-        advice = _RECORD.format(enough, near if blind[3:].any() else all_over)
-    return f"may be beyond the tolerance: {found}; {advice}"
+        return "too near to the tolerance to decide: check another recording, of other places"
+    enough = f"{np.degrees(needed[:3].max()):.2g} deg and {100 * needed[3:].max():.2g} cm"
+    if not recording_helps:
+        return f"{_UNSEEN}, however many frames are recorded: tolerate {enough}"
+    near, all_over = "are within 10 m", "are all over the image"
+    where = f"where walls, poles or vehicles {near if blind[3:].any() else all_over}"
+    return f"{_UNSEEN}: tolerate {enough}, or record more frames, {where}"
 
 
 def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> LidarAudit | None:

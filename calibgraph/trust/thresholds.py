@@ -86,7 +86,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
               "Are there enough frames?",
               "With fewer, the error bar is mostly what is usual of matches.",
-              "the error bar is mostly a usual one; give more, from several places"),
+              "the error bar is mostly a usual one"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
               "How much of a displaced start does a learned matcher leave?", _CHOSEN,
@@ -162,10 +162,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
               of_tolerance=True),
     Threshold("range_rotation", "largest rotation from the guess over the matcher's range",
               "at most", 1.2, 4.0, "times", "Is the result within what the matcher searches?",
-              _COUNTED, "start again from the result, and see whether it stays"),
+              _COUNTED, "it lies at the edge of the search, or beyond"),
     Threshold("range_translation", "largest translation from the guess over the matcher's range",
               "at most", 1.2, 4.0, "times", "The same.", _COUNTED,
-              "start again from the result, and see whether it stays"),
+              "it lies at the edge of the search, or beyond"),
     Threshold("rematch_rotation", "difference after matching again", "at most", 0.15, 0.5, "deg",
               "Does matching from a displaced start end at the same result?", "As for sigma.",
               "the images do not determine the extrinsic",
@@ -189,8 +189,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "deviations of chance agreement?",
               f"{_RECORDED}: right up to 0.65; one 0.35 deg off 1.0; KITTI 08: right up to 3.5. "
               "Local optima next to the right one 11 to 32.",
-              "an extrinsic nearby fits the images better; calibrate again from the result, check "
-              "the lens"),
+              "an extrinsic nearby fits the images better; the usual cause are the intrinsics"),
     Threshold("own_clouds", "score with the own clouds above that with neighbouring ones",
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?",
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
