@@ -59,7 +59,9 @@ def print_summary(console: Console, summary: Summary) -> None:
     """Print the verdict, at most three reasons, what to do, and how much is folded."""
     status = summary.status
     doubt = f": {summary.doubt}" if summary.doubt else ""
-    console.print(f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False)
+    console.print(
+        f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False, soft_wrap=True
+    )
     for reason in summary.reasons:
         print_plain(console, f"  {reason.status}  {', '.join(reason.cameras)}: {reason.text}")
     if summary.actions:

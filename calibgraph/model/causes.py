@@ -79,13 +79,6 @@ CAUSES: dict[str, Cause] = {
         {"relative_pose": "", "pull_rotation": "", "pull_translation": "",
          "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
     ),
-    "frames": Cause(
-        "frames or places that contradict each other", _FRAMES,
-        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
-         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
-         "disagreeing_frames": "Check whether the camera was moved.",
-         "drift": "Check whether the camera's mount is loose."},
-    ),
     "agreement": Cause(
         "image and cloud that agree too little", _STRUCTURE,
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
@@ -102,6 +95,13 @@ CAUSES: dict[str, Cause] = {
          "failed_frames": "", "restart_rotation": "", "restart_translation": "",
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "recall": _LEARNED},
+    ),
+    "frames": Cause(
+        "frames or places that contradict each other", _FRAMES,
+        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
+         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+         "disagreeing_frames": "Check whether the camera was moved.",
+         "drift": "Check whether the camera's mount is loose."},
     ),
     "solver": Cause(
         "a solve that did not end",

@@ -79,7 +79,7 @@ class ErrorSources:
         least = in_unit(best[0] if bar.unit == "deg" else best[1], bar.unit, 2)
         return (
             "Tolerate more (--tolerance-deg, --tolerance-cm), or give measured relative_poses or "
-            f"priors: what all frames share remains, {least} however many are recorded."
+            f"priors: {least} of common error remain with any number of frames."
         )
 
     def _larger(self, tolerance: tuple[float, float]) -> _Bar:

@@ -98,7 +98,10 @@ def summarize(
     grouped = [_with_all_cameras(each) for each in by_cause.values()]
     if of_rig.cannot_tell:
         grouped = _unsure_first(grouped)
-    shown = [_with_action_for(reason, known, tolerance) for reason in grouped[:MOST]]
+    shown = [*grouped[:MOST]]
+    shown[:1] = [_with_action_for(reason, known, tolerance) for reason in shown[:1]]
+    known = {name: one for name, one in known.items() if verdicts[name].status != "FAIL"}
+    shown[1:] = [_with_action_for(reason, known, tolerance) for reason in shown[1:]]
     folded = [reason for each in by_cause.values() for reason in each[1:]] + grouped[MOST:]
     actions = dict.fromkeys(reason.action for reason in shown if reason.action)
     return Summary(

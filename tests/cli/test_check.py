@@ -12,7 +12,7 @@ from calibgraph.audit import audit_summary
 from calibgraph.cli import remote
 from tests.audit.test_check import motion, with_camera_moved
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE, Call, CommandRun
 
 REFERENCE = SAMPLE / "reference.yaml"
 AXES = ("deviation_deg", "deviation_cm", "sigma_deg", "sigma_cm", "detectable_deg", "detectable_cm")
@@ -58,6 +58,18 @@ def test_one_frame_exits_with_3(call: Call) -> None:
     assert code == 3
     assert err.startswith("CANNOT TELL  check: is the deployed calibration still right?\n")
     assert "record" in err
+
+
+def test_the_recording_that_made_the_result_is_named_in_the_first_line(
+    call: Call, calibrated_sample: CommandRun
+) -> None:
+    code, _, err = call("check", calibrated_sample.folder, SAMPLE, "--frames", "0")
+    assert code == 3
+    assert (
+        "; this recording made it, and errors that it repeats are not seen" in err.splitlines()[0]
+    )
+    _, out, _ = call("check", calibrated_sample.folder, SAMPLE, "--frames", "0", "--json")
+    assert json.loads(out)["same_recording"] is True
 
 
 def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:

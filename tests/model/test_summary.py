@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import calibgraph
 from calibgraph.model.causes import CAUSES, cause_of
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.summary import MOST, summarize
 from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
@@ -97,3 +99,30 @@ def literal_name(node: ast.AST) -> str | None:
         first = node.args[0] if node.args else None
         return first.value if isinstance(first, ast.Constant) else None
     return None
+
+
+WIDE = ErrorSources(
+    rotation_deg=0.3,
+    translation_cm=2.0,
+    rotation={COMMON: 0.9, MATCHES: 0.1},
+    translation={COMMON: 0.9, MATCHES: 0.1},
+    forecast={2: (0.29, 1.9), MOST_TIMES: (0.285, 1.8)},
+)
+
+
+def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
+    unsure = {"left": Verdict((threshold("sigma_rotation").check(0.3),), Doubt(0.001, 0.1))}
+    summary = summarize(unsure, sources={"left": WIDE})
+    assert summary.error_bar == f"error bar of left 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
+    (action,) = summary.actions
+    assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
+    few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
+    assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
+
+
+def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
+    checks = (threshold("residual_spread").check(9.0), threshold("sigma_rotation").check(9.0))
+    summary = summarize({"left": Verdict(checks, Doubt(0.9))}, sources={"left": WIDE})
+    assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
+    assert summary.actions == (CAUSES["matches"].action,)
+    assert summary.error_bar == ""
