@@ -13,6 +13,8 @@ from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
 from calibgraph.cli.options import (
     BootstrapOption,
+    CommonCmOption,
+    CommonDegOption,
     ConfigOption,
     ConfigSeedOption,
     DatasetArgument,
@@ -119,6 +121,8 @@ def solve(
     bootstrap: BootstrapOption = None,
     tolerance_deg: ToleratedDegOption = None,
     tolerance_cm: ToleratedCmOption = None,
+    common_deg: CommonDegOption = None,
+    common_cm: CommonCmOption = None,
     engine: EngineOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -129,7 +133,12 @@ def solve(
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
-        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        given = {
+            "tolerance_deg": tolerance_deg,
+            "tolerance_cm": tolerance_cm,
+            "common_deg": common_deg,
+            "common_cm": common_cm,
+        }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
     if remote.SERVER.get() is not None:

@@ -59,13 +59,17 @@ def print_summary(console: Console, summary: Summary) -> None:
     """Print the verdict, at most three reasons, what to do, and how much is folded."""
     status = summary.status
     doubt = f": {summary.doubt}" if summary.doubt else ""
-    console.print(f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False)
+    console.print(
+        f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False, soft_wrap=True
+    )
     for reason in summary.reasons:
         print_plain(console, f"  {reason.status}  {', '.join(reason.cameras)}: {reason.text}")
     if summary.actions:
         print_plain(console, "What to do:")
     for action in summary.actions:
         print_plain(console, f"  {action}")
+    if summary.error_bar:
+        print_plain(console, summary.error_bar)
     if summary.others:
         print_plain(console, f"{len(summary.others)} more: see {_DETAILS}")
 

@@ -146,9 +146,14 @@ class Calibration:
     @property
     def summary(self) -> Summary:
         """The verdict for people: at most three reasons, what to do, and the rest."""
-        verdicts = {name: self.camera_verdicts[name] for name in self.rig.cameras}
-        weaknesses = {name: self.weaknesses.get(name, ()) for name in self.rig.cameras}
-        return summarize(verdicts, weaknesses, self.error_sources)
+        return self.summary_of(*self.rig.cameras)
+
+    def summary_of(self, *cameras: str) -> Summary:
+        """The same of some of its cameras."""
+        verdicts = {name: self.camera_verdicts[name] for name in cameras}
+        weaknesses = {name: self.weaknesses.get(name, ()) for name in cameras}
+        sources = {n: self.error_sources[n] for n in cameras if n in self.error_sources}
+        return summarize(verdicts, weaknesses, sources)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -260,6 +265,7 @@ class Calibration:
             },
             "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
             "prior_share": self.prior_share,
+            "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},

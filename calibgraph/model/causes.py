@@ -79,13 +79,6 @@ CAUSES: dict[str, Cause] = {
         {"relative_pose": "", "pull_rotation": "", "pull_translation": "",
          "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
     ),
-    "frames": Cause(
-        "frames or places that contradict each other", _FRAMES,
-        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
-         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
-         "disagreeing_frames": "Check whether the camera was moved.",
-         "drift": "Check whether the camera's mount is loose."},
-    ),
     "agreement": Cause(
         "image and cloud that agree too little", _STRUCTURE,
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
@@ -103,6 +96,13 @@ CAUSES: dict[str, Cause] = {
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "recall": _LEARNED},
     ),
+    "frames": Cause(
+        "frames or places that contradict each other", _FRAMES,
+        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
+         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+         "disagreeing_frames": "Check whether the camera was moved.",
+         "drift": "Check whether the camera's mount is loose."},
+    ),
     "solver": Cause(
         "a solve that did not end",
         "Give more matches, spread over the image and over distances.",
@@ -119,8 +119,8 @@ CAUSES: dict[str, Cause] = {
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
-         "common_error": "State the error that all frames share: common_error in the config, or in "
-         "the table's metadata.",
+         "common_error": "State the error that all frames share, --common-deg and --common-cm (0 "
+         "if none), or systematic_rotation_rad and systematic_translation_m in the metadata.",
          "start": "Keep driving: the camera starts after enough frames with matches.",
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),

@@ -12,12 +12,14 @@ from typing import Any
 
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.threshold import in_unit
-from calibgraph.model.verdict import Check, Status, Verdict, rig_verdict
+from calibgraph.model.threshold import beside, in_unit
+from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
 
 MOST = 3
 """Reasons and actions that are shown; the others are folded."""
 
+_CANNOT_TELL = "cannot tell: "
+_OF_DATA = ("error bar", "data")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")
 
@@ -51,6 +53,8 @@ class Summary:
         doubt: how probable it is that which cameras are off, in one sentence; empty for a PASS.
         reasons: at most three, each of another cause, the worst first.
         actions: what to do, at most three sentences, each once.
+        error_bar: the largest error bar beside the tolerance, and the shares of its sources; empty
+            if there is none.
         others: the other findings, the worst first, then the weaknesses.
     """
 
@@ -59,6 +63,7 @@ class Summary:
     doubt: str
     reasons: tuple[Reason, ...]
     actions: tuple[str, ...]
+    error_bar: str
     others: tuple[Reason, ...]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -84,13 +89,19 @@ def summarize(
         weaknesses: sentences per camera.
         sources: of the error bar, per camera.
     """
-    of_rig = rig_verdict(verdicts)
+    of_rig, known = rig_verdict(verdicts), sources or {}
+    tolerance = TOLERANCE if of_rig.doubt is None else of_rig.doubt.tolerance
     findings = [*_unsure(verdicts), *_findings(verdicts)]
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
         by_cause.setdefault(finding.cause, []).append(finding)
     grouped = [_with_all_cameras(each) for each in by_cause.values()]
-    shown = grouped[:MOST]
+    if of_rig.cannot_tell:
+        grouped = _unsure_first(grouped)
+    shown = [*grouped[:MOST]]
+    shown[:1] = [_with_action_for(reason, known, tolerance) for reason in shown[:1]]
+    known = {name: one for name, one in known.items() if verdicts[name].status != "FAIL"}
+    shown[1:] = [_with_action_for(reason, known, tolerance) for reason in shown[1:]]
     folded = [reason for each in by_cause.values() for reason in each[1:]] + grouped[MOST:]
     actions = dict.fromkeys(reason.action for reason in shown if reason.action)
     return Summary(
@@ -99,13 +110,40 @@ def summarize(
         _doubt(verdicts),
         tuple(shown),
         tuple(actions)[:MOST],
+        _error_bar(known, tolerance),
         (*sorted(folded, key=_rank), *_group_sentences(weaknesses or {})),
     )
+
+
+def _with_action_for(
+    reason: Reason, sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]
+) -> Reason:
+    """With what would shrink the largest error bar of its cameras, if that is the reason."""
+    known = [sources[name] for name in reason.cameras if name in sources]
+    if CAUSES[reason.cause].action or not known:
+        return reason
+    largest = max(known, key=lambda one: one.over_tolerance(tolerance))
+    return replace(reason, action=largest.action(tolerance))
+
+
+def _error_bar(sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]) -> str:
+    """The camera whose error bar is largest beside the tolerance, in one sentence."""
+    if not sources:
+        return ""
+    name = max(sources, key=lambda one: sources[one].over_tolerance(tolerance))
+    return f"error bar of {name} {sources[name].describe(tolerance)}"
 
 
 def _rank(reason: Reason) -> tuple[int, int]:
     """Worse ones first, then those that explain the others."""
     return _WORST_FIRST.index(reason.status), list(CAUSES).index(reason.cause)
+
+
+def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
+    """Those of how much the data determine before others, and the first named as such."""
+    first, *others = sorted(reasons, key=lambda reason: reason.cause not in _OF_DATA)
+    text = f"{_CANNOT_TELL}{first.text.removeprefix(_CANNOT_TELL)}"
+    return [replace(first, text=text), *others]
 
 
 def _with_all_cameras(reasons: Sequence[Reason]) -> Reason:
@@ -122,7 +160,7 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     if not found:
         return []
     tolerated = next(iter(found.values())).tolerated
-    text = f"cannot tell: the error bar is too wide for a tolerance of {tolerated}"
+    text = f"{_CANNOT_TELL}the error bar is too wide for a tolerance of {tolerated}"
     return [Reason("WARN", tuple(found), text, "error bar")]
 
 
@@ -141,8 +179,7 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     alike: dict[tuple[str, ...], dict[str, Check]] = {}
     for camera, verdict in verdicts.items():
         for check in verdict.checks:
-            measured = check.value is not None and check.warn is not None
-            key = (check.name, check.unit, "" if measured else _NUMBER.sub("", check.text))
+            key = (check.name, check.unit, "" if check.is_graded else _NUMBER.sub("", check.text))
             if check.status != "PASS":
                 alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
@@ -170,7 +207,7 @@ def _sentence(checks: Mapping[str, Check]) -> str:
     """The same check of several cameras in one sentence, with the meaning of the first."""
     first = next(iter(checks.values()))
     texts = [check.text for check in checks.values()]
-    if len(set(texts)) == 1 or first.warn is None:
+    if len(set(texts)) == 1 or not first.is_graded:
         return _merge_numbers(texts)
     meaning = first.text.removeprefix(first.name).partition(": ")[2]
     text = f"{first.name}: {_values(checks)}"
@@ -184,7 +221,7 @@ def _values(checks: Mapping[str, Check]) -> str:
         of_status = {name: check for name, check in checks.items() if check.status == status}
         for check in list(of_status.values())[:1]:
             limit = (check.fail if status == "FAIL" else check.warn) or 0.0
-            found = [f"{n} {in_unit(c.value or 0.0, c.unit)}" for n, c in of_status.items()]
+            found = [f"{n} {beside(c.value or 0.0, limit, c.unit)}" for n, c in of_status.items()]
             parts.append(f"{', '.join(found)} ({status}: limit {in_unit(limit, check.unit)})")
     return "; ".join(parts)
 

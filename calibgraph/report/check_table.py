@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from calibgraph.model.threshold import Direction, in_unit, is_reachable
+from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
 from calibgraph.model.verdict import Check
 
-_ROUNDED_FROM = 1000  # three digits would need an exponent
 _WORST_FIRST = ("FAIL", "WARN", "PASS")
 
 
@@ -33,25 +31,21 @@ def _severity(check: Check) -> int:
 
 
 def check_row(check: Check) -> CheckRow:
-    """A check with its thresholds; their order gives the side on which values are bad."""
+    """A check with its thresholds; their order gives the side on which values are bad.
+
+    A status that the value does not give, since it depends on more, has none.
+    """
     if check.value is None:
         return CheckRow(check, "", "", "")
-    found = _quantity(check.value, check.unit)
-    if check.warn is None or check.fail is None:
-        return CheckRow(check, found, "", "")
+    if check.warn is None or check.fail is None or not check.is_graded:
+        return CheckRow(check, in_unit(check.value, check.unit), "", "")
     side: Direction = "at least" if check.warn > check.fail else "at most"
     warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
+    found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
     return CheckRow(check, found, warn, fail)
 
 
 def _threshold(side: Direction, limit: float, unit: str) -> str:
     """When a value is bad; empty if no value can be."""
     sign = ">" if side == "at most" else "<"
-    return f"{sign} {_quantity(limit, unit)}" if is_reachable(limit, unit, side) else ""
-
-
-def _quantity(value: float, unit: str) -> str:
-    """A number with its unit; large ones without an exponent."""
-    if unit != "share" and _ROUNDED_FROM <= abs(value) < math.inf:
-        return f"{value:.0f} {unit}".rstrip()
-    return in_unit(value, unit)
+    return f"{sign} {in_unit(limit, unit)}" if is_reachable(limit, unit, side) else ""

@@ -92,6 +92,7 @@ class TrackerState(BaseModel):
         verdict: of the estimate: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
         reasons: of the verdict.
+        summary: the verdict in few words, as ``--json`` prints it: reasons, actions, others.
         cameras: per camera, as in a result.
         events: the last ones.
     """
@@ -100,6 +101,7 @@ class TrackerState(BaseModel):
     verdict: str
     cannot_tell: bool
     reasons: list[str]
+    summary: dict[str, Any] = {}
     cameras: dict[str, Any]
     events: list[dict[str, Any]]
 

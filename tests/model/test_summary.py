@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import calibgraph
 from calibgraph.model.causes import CAUSES, cause_of
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.summary import MOST, summarize
-from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 
@@ -81,7 +83,7 @@ def test_cannot_tell_is_a_reason_and_no_status() -> None:
 
 
 def test_every_kind_of_check_has_a_cause() -> None:
-    named = {kind for kind in (*LENS_KINDS, *(row.key for row in THRESHOLDS))}
+    named = {kind for kind in (*LENS_KINDS, COMMON_ERROR, *(row.key for row in THRESHOLDS))}
     for path in Path(calibgraph.__file__).parent.rglob("*.py"):
         calls = (node for node in ast.walk(ast.parse(path.read_text())))
         named |= {kind for call in calls if (kind := literal_name(call)) is not None}
@@ -92,6 +94,35 @@ def test_every_kind_of_check_has_a_cause() -> None:
 def literal_name(node: ast.AST) -> str | None:
     """The name in a call of Check with a literal one; it is its kind, too."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Check":
+        if any(keyword.arg == "kind" for keyword in node.keywords):
+            return None
         first = node.args[0] if node.args else None
         return first.value if isinstance(first, ast.Constant) else None
     return None
+
+
+WIDE = ErrorSources(
+    rotation_deg=0.3,
+    translation_cm=2.0,
+    rotation={COMMON: 0.9, MATCHES: 0.1},
+    translation={COMMON: 0.9, MATCHES: 0.1},
+    forecast={2: (0.29, 1.9), MOST_TIMES: (0.285, 1.8)},
+)
+
+
+def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
+    unsure = {"left": Verdict((threshold("sigma_rotation").check(0.3),), Doubt(0.001, 0.1))}
+    summary = summarize(unsure, sources={"left": WIDE})
+    assert summary.error_bar == f"error bar of left 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
+    (action,) = summary.actions
+    assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
+    few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
+    assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
+
+
+def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
+    checks = (threshold("residual_spread").check(9.0), threshold("sigma_rotation").check(9.0))
+    summary = summarize({"left": Verdict(checks, Doubt(0.9))}, sources={"left": WIDE})
+    assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
+    assert summary.actions == (CAUSES["matches"].action,)
+    assert summary.error_bar == ""

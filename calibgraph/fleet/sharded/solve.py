@@ -221,4 +221,5 @@ def _judge(
         timings_s=dict(solution.timings_s),
         stage1_T_camera_lidar=solution.T_hat,
         prior_share=whole.prior_shares,
+        error_sources=whole.error_sources,
     )
