@@ -55,10 +55,13 @@ def submit(place: tuple[str, int], token: dict[str, str], small: Problem) -> int
 def test_an_upload_without_room_is_refused_before_it_is_sent_and_others_are_not(
     tmp_path: Path, small: Problem, size: int
 ) -> None:
-    with with_room(tmp_path) as (place, (first, second)):
-        with begin_upload(place, first, b"Content-Length: %d" % size) as connection:
-            assert connection.recv(12) in (b"HTTP/1.1 507", b"HTTP/1.1 413", b"HTTP/1.1 400")
-            assert submit(place, second, small) == 202
+    length = b"Content-Length: %d" % size
+    with (
+        with_room(tmp_path) as (place, (first, second)),
+        begin_upload(place, first, length) as connection,
+    ):
+        assert connection.recv(12) in (b"HTTP/1.1 507", b"HTTP/1.1 413", b"HTTP/1.1 400")
+        assert submit(place, second, small) == 202
 
 
 def test_uploads_that_arrive_keep_their_room_and_leave_some_to_others(
@@ -135,7 +138,7 @@ def size_of(folder: Path) -> int:
 
 def names_of(client: TestClient, at: str) -> set[str]:
     """What lies in the folder of a job."""
-    folder = service_folder(client) / "jobs" / at.rsplit("/")[-1]
+    folder = service_folder(client) / "jobs" / Path(at).name
     return {path.name for path in folder.iterdir()}
 
 
