@@ -214,11 +214,8 @@ _OF_SOME_CAMERAS = (
 )
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
-<<<<<<< HEAD
-    "counts", "timings_s", "terms", "prior_share", "inputs", "versions", "date",
-=======
     "counts", "timings_s", "terms", "prior_share", "error_sources", "inputs", "versions",
->>>>>>> w-verdict
+    "date",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

@@ -23,24 +23,11 @@ from calibgraph.report.reprojection_errors import errors_before_after
 Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
-<<<<<<< HEAD
     ("PASS", False): "Yes. All checks passed.",
     ("WARN", True): "With care: nothing seems wrong, but the data leave too much open.",
     ("WARN", False): "With care: read the reasons, and look at the pictures.",
     ("FAIL", False): "No. Do not use this result.",
-=======
-    "PASS": "Yes. All checks passed.",
-    "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
-    "and look at the pictures.",
-    "FAIL": "No. Do not use this result; the reasons below name what to correct.",
->>>>>>> w-verdict
 }
-
-
-_UNSURE = (
-    "With care: nothing seems wrong, but the data cannot tell more; the reasons name what is "
-    "missing."
-)
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -77,14 +64,10 @@ def report_html(result: Calibration) -> str:
     return load_template("page.html.j2").render(
         result=result,
         cameras=cameras,
-<<<<<<< HEAD
         summary=summary,
         recording=recording_name(result),
         usable=_CAN_I_USE_IT[summary.status, summary.cannot_tell],
         actions=summary.actions or ("Deploy it: see below.",),
-=======
-        usable=_UNSURE if summary.cannot_tell else _CAN_I_USE_IT[summary.status],
->>>>>>> w-verdict
         accuracy=_accuracy(result),
         export_command=_export_command(result),
         export_formats=EXPORT_FORMATS,

@@ -56,7 +56,7 @@ jobs = Table(
     Column("name", String(100)),
     Column("note", Text),
     UniqueConstraint("tenant", "idempotency_key"),
-    Index("jobs_by_state", "state", "number"),
+    Index("jobs_by_state", "state", "tenant", "number"),
     Index("jobs_by_tenant", "tenant", "number"),
 )
 

@@ -180,7 +180,7 @@ class Runner:
     def _take(self, slot: _Slot) -> JobRecord | None:
         with self._taking:
             slot.job = None
-            record = self._table.start_next()
+            record = self._table.start_next(self._settings.jobs_per_tenant)
             slot.job = None if record is None else record.id
         return record
 

@@ -88,14 +88,16 @@ def _require_key(key: str | None) -> None:
 
 def _require_place_unless_known(service: Service, tenant: str, key: str | None) -> None:
     if service.jobs.known(tenant, key) is None:
-        _require_place_in_queue(service)
+        _require_place_in_queue(service, tenant)
 
 
-def _require_place_in_queue(service: Service) -> None:
-    waiting = service.jobs.count("queued")
+def _require_place_in_queue(service: Service, tenant: str) -> None:
+    waiting = service.jobs.count("queued", tenant)
     if waiting >= service.settings.most_queued:
         raise Problem(
-            429, f"{waiting} jobs wait already; try again", {"Retry-After": str(_RETRY_AFTER_S)}
+            429,
+            f"{waiting} of your jobs wait already; try again",
+            {"Retry-After": str(_RETRY_AFTER_S)},
         )
 
 
@@ -176,7 +178,7 @@ def _keep(
     known = service.jobs.known(tenant, key, digest)
     if known is not None:
         return known, True
-    _require_place_in_queue(service)
+    _require_place_in_queue(service, tenant)
     sync_tree(arriving)
     folder = service.folder.of_job(arriving.name)
     service.folder.keep(arriving, folder)

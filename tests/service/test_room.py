@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import httpx
 import pytest
 from starlette.testclient import TestClient
 
+from calibgraph.service import connections
 from calibgraph.service.app import create_app
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, make_tokens, service_folder
@@ -39,7 +40,7 @@ def with_room(folder: Path) -> Iterator[tuple[tuple[str, int], list[dict[str, st
 
 def begin_upload(place: tuple[str, int], token: dict[str, str], how: bytes) -> socket.socket:
     connection = socket.create_connection(place)
-    connection.settimeout(10)
+    connection.settimeout(60)
     bearer = f"Authorization: {token['Authorization']}\r\n".encode()
     head = b"POST /v1/calibrations HTTP/1.1\r\nHost: localhost\r\n" + bearer + HEAD + how
     connection.sendall(head + b"\r\n\r\n")
@@ -48,22 +49,26 @@ def begin_upload(place: tuple[str, int], token: dict[str, str], how: bytes) -> s
 
 def submit(place: tuple[str, int], token: dict[str, str], small: Problem) -> int:
     url = f"http://localhost:{place[1]}/v1/solves"
-    return httpx.post(url, files=small.files, headers=token, timeout=30).status_code
+    return httpx.post(url, files=small.files, headers=token, timeout=60).status_code
 
 
 @pytest.mark.parametrize("size", [1000 * MB, 200 * MB, 10**15, 10**30])
 def test_an_upload_without_room_is_refused_before_it_is_sent_and_others_are_not(
     tmp_path: Path, small: Problem, size: int
 ) -> None:
-    with with_room(tmp_path) as (place, (first, second)):
-        with begin_upload(place, first, b"Content-Length: %d" % size) as connection:
-            assert connection.recv(12) in (b"HTTP/1.1 507", b"HTTP/1.1 413", b"HTTP/1.1 400")
-            assert submit(place, second, small) == 202
+    length = b"Content-Length: %d" % size
+    with (
+        with_room(tmp_path) as (place, (first, second)),
+        begin_upload(place, first, length) as connection,
+    ):
+        assert connection.recv(12) in (b"HTTP/1.1 507", b"HTTP/1.1 413", b"HTTP/1.1 400")
+        assert submit(place, second, small) == 202
 
 
 def test_uploads_that_arrive_keep_their_room_and_leave_some_to_others(
-    tmp_path: Path, small: Problem
+    tmp_path: Path, small: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(connections, "BODY_S", 600.0)
     with with_room(tmp_path) as (place, (first, second)):
         held = begin_upload(place, first, b"Content-Length: %d" % (120 * MB))
         held.sendall(BEGIN)
@@ -78,12 +83,10 @@ def test_a_body_without_a_length_ends_where_its_room_does(tmp_path: Path, small:
         with begin_upload(place, first, b"Transfer-Encoding: chunked") as connection:
             connection.sendall(b"%x\r\n%s\r\n" % (len(BEGIN), BEGIN))
             sent, piece = 0, bytes(MB)
-            try:
+            with suppress(OSError):
                 while sent < ROOM_BYTES:
                     connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece))
                     sent += len(piece)
-            except OSError:
-                pass
             assert connection.recv(12) == b"HTTP/1.1 507"
             assert submit(place, second, small) == 202
         assert not list((tmp_path / "data" / "arriving").iterdir())
@@ -125,17 +128,22 @@ def test_a_bomb_is_refused_before_it_is_unpacked_and_leaves_nothing(
             sizes.append(size_of(service_folder(client) / "jobs"))
         assert job["state"] == "failed"
         assert "unpacked" in job["error"]["detail"]
-        assert max(sizes) < 2 * MB
+        assert max(sizes, default=0) < 2 * MB
         assert size_of(service_folder(client) / "jobs") < 10_000
 
 
 def size_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    """Bytes of the files in a folder, some of which may be gone meanwhile."""
+    size = 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            size += path.stat().st_size if path.is_file() else 0
+    return size
 
 
 def names_of(client: TestClient, at: str) -> set[str]:
     """What lies in the folder of a job."""
-    folder = service_folder(client) / "jobs" / at.rsplit("/")[-1]
+    folder = service_folder(client) / "jobs" / Path(at).name
     return {path.name for path in folder.iterdir()}
 
 
