@@ -70,7 +70,7 @@ def test_the_order_is_verdict_action_picture_deployment_checks(
 ) -> None:
     text = write_page(sample_result, tmp_path)
     places = [text.index(part) for part in (
-        "Can this calibration of 3 cameras", 'class="verdict PASS"', "What to do",
+        "Can this calibration of 3 cameras", '<section class="verdict ', "What to do",
         "front_left before", "calibgraph export . ", "T_camera_lidar of front_left", " checks: ",
     )]  # fmt: skip
     assert places == sorted(places)
@@ -103,7 +103,8 @@ def test_the_title_names_the_recording_and_the_date(
     sample_result: Calibration, tmp_path: Path
 ) -> None:
     title = title_of(write_page(replace(sample_result, date="2026-03-01"), tmp_path))
-    assert title.startswith("PASS - data/sample - 2026-03-01 - calibration of front_left")
+    status = sample_result.verdict.status
+    assert title.startswith(f"{status} - data/sample - 2026-03-01 - calibration of front_left")
 
 
 def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_path: Path) -> None:
