@@ -14,8 +14,8 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.access import COOKIE, Caller, Gate
 from calibgraph.service.api_page import operations, schemas
-from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.forms import form_of
+from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.pages import (
     actions_of,
@@ -135,8 +135,7 @@ async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor
         record, _ = await submit(state, request, caller, kind, None)
     except (Problem, CalibrationError) as error:
         status = error.status if isinstance(error, Problem) else 422
-        content = {"problem": str(error), **form_of(kind)}
-        return await run_in_threadpool(_page, request, "new.html.j2", status, **content)
+        return _page(request, "new.html.j2", status, problem=str(error), **form_of(kind))
     return RedirectResponse(f"/jobs/{record.id}", 303)
 
 
