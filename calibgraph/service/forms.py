@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from calibgraph.service.requests import JobKind
 
@@ -68,6 +69,6 @@ _FIELDS: Mapping[JobKind, tuple[Field, ...]] = {
 }  # fmt: skip
 
 
-def form_of(kind: JobKind) -> dict[str, object]:
+def form_of(kind: JobKind) -> dict[str, Any]:
     """What the template of a new job's page shows."""
     return {"kind": kind, "title": TITLES[kind], "kinds": TITLES.items(), "fields": _FIELDS[kind]}
