@@ -29,6 +29,7 @@ _SWAPPED = "Check whether the images of two cameras, or their extrinsics in the 
 _FROM_RESULT = "Calibrate again with this result as the guess: the matcher then searches around it."
 _STRUCTURE = "Record where image and cloud both have structure: edges, poles, facades at 5 to 40 m."
 _FRAMES = "Look at the frames that disagree: leave out those in which a sensor moved or lagged."
+_SPREAD = "Give more matches, spread over the image and over distances."
 _LEARNED = "Use the matcher structure, or train the network on recordings of this kind."
 
 # fmt: off
@@ -92,7 +93,7 @@ CAUSES: dict[str, Cause] = {
         "wrong correspondences",
         "Look at the residuals of the matches in the report: too many are wrong.",
         {"residual_spread": "", "inlier_share": "", "competing_solution": "", "held_out": "",
-         "failed_frames": "", "restart_rotation": "", "restart_translation": "",
+         "failed_frames": "", "restart_rotation": _SPREAD, "restart_translation": _SPREAD,
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "recall": _LEARNED},
     ),
@@ -105,7 +106,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "solver": Cause(
         "a solve that did not end",
-        "Give more matches, spread over the image and over distances.",
+        _SPREAD,
         {"convergence": "", "terms": "Solve with the terms full: they have an error bar.",
          "time limit": "Raise --time-limit-s, or take fewer --frames."},
     ),

@@ -91,7 +91,7 @@ def summarize(
     """
     of_rig, known = rig_verdict(verdicts), sources or {}
     tolerance = TOLERANCE if of_rig.doubt is None else of_rig.doubt.tolerance
-    findings = [*_unsure(verdicts), *_findings(verdicts)]
+    findings = [*_unsure(verdicts), *_findings(verdicts)] or _nearest(verdicts)
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
         by_cause.setdefault(finding.cause, []).append(finding)
@@ -184,6 +184,18 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
                 alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
     return [_reason(each) for each in severest]
+
+
+def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
+    """Of cameras that may be off though all their checks are PASS, the check nearest its limit."""
+    doubtful = {n: v for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+    checks = [(name, check) for name, verdict in doubtful.items() for check in verdict.checks]
+    if not checks:
+        return []
+    name, check = max(checks, key=lambda item: item[1].severity)
+    kind, status = check.kind or check.name, rig_verdict(doubtful).status
+    text = f"no check is beyond its limit; nearest to it is {check.text}"
+    return [Reason(status, (name,), text, cause_of(kind), action_of(kind))]
 
 
 def _reason(checks: Mapping[str, Check]) -> Reason:

@@ -126,3 +126,14 @@ def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
     assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
     assert summary.actions == (CAUSES["matches"].action,)
     assert summary.error_bar == ""
+
+
+def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> None:
+    checks = (threshold("residual_spread").check(0.24), threshold("time_offset").check(0.01))
+    summary = summarize({"left": Verdict(checks, Doubt(0.02))})
+    (reason,) = summary.reasons
+    assert (reason.status, reason.cause) == ("WARN", "matches")
+    assert reason.text == (
+        "no check is beyond its limit; nearest to it is residual spread 0.24 deg"
+    )
+    assert summary.actions == (CAUSES["matches"].action,)
