@@ -23,7 +23,6 @@ from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
-from .fleet.sharded.solve import solve_sharded as solve_sharded
 from .guessing.guess import CameraGuess as CameraGuess
 from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
