@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,70 +81,88 @@ def require_same(saved: Calibration, again: Calibration) -> None:
     assert again.counts == saved.counts
 
 
-def dataset(rig: Rig) -> Dataset:
-    return calibgraph.load_dataset(SAMPLE, rig)
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The sample's frames as two recordings, the second mirrored: another place."""
+    made = []
+    for part, stems in enumerate((("000000", "000001", "000002"), ("000003", "000004", "000005"))):
+        folder = tmp_path_factory.mktemp(f"part{part}")
+        (folder / "lidar").mkdir()
+        for stem in stems:
+            cloud = np.load(SAMPLE / "lidar" / f"{stem}.npy")
+            np.save(folder / "lidar" / f"{stem}.npy", cloud * [1, 1 - 2 * part, 1, 1])
+            for images in (SAMPLE / "cameras").iterdir():
+                (image,) = images.glob(f"{stem}.*")
+                (folder / "cameras" / images.name).mkdir(parents=True, exist_ok=True)
+                shutil.copy(image, folder / "cameras" / images.name)
+        made.append(folder)
+    return made
+
+
+def load(folders: Sequence[Path], rig: Rig) -> Dataset:
+    return calibgraph.load_dataset(folders, rig)
 
 
 def some_cameras(rig: Rig, *names: str) -> Rig:
     return Rig(cameras={name: rig.cameras[name] for name in names})
 
 
-def one_camera(guess: Rig, truth: Rig, folder: Path) -> Calibration:
+def one_camera(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
     names = ("front_left",)
     alone = some_cameras(guess, *names)
-    return calibgraph.calibrate(dataset(alone), alone, table_of(some_cameras(truth, *names)))
+    return calibgraph.calibrate(load(data, alone), alone, table_of(some_cameras(truth, *names)))
 
 
-def no_overlap(guess: Rig, truth: Rig, folder: Path) -> Calibration:
+def no_overlap(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
     names = ("front_left", "left")
     two = some_cameras(guess, *names)
-    return calibgraph.calibrate(dataset(two), two, table_of(some_cameras(truth, *names)))
+    return calibgraph.calibrate(load(data, two), two, table_of(some_cameras(truth, *names)))
 
 
-def overlap(guess: Rig, truth: Rig, folder: Path) -> Calibration:
-    return calibgraph.calibrate(dataset(guess), guess, table_of(truth))
+def overlap(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    return calibgraph.calibrate(load(data, guess), guess, table_of(truth))
 
 
-def relative_pose(guess: Rig, truth: Rig, folder: Path) -> Calibration:
+def relative_pose(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
     T = truth.T_camera_lidar
     known = RelativePose(
         a="front_left", b="left", T_a_b=relative_transform(T["front_left"], T["left"]),
         rotation_sigma_rad=1e-3, translation_sigma_m=2e-3,
     )  # fmt: skip
     tied = guess.model_copy(update={"relative_poses": (known,)})
-    return calibgraph.calibrate(dataset(tied), tied, table_of(truth))
+    return calibgraph.calibrate(load(data, tied), tied, table_of(truth))
 
 
-def excluded_camera(guess: Rig, truth: Rig, folder: Path) -> Calibration:
+def excluded_camera(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
     """The images of one show noise, and few of its correspondences agree."""
     table = table_of(truth)
     own = np.flatnonzero(table.camera_index == table.cameras.index("left"))
     pixels = table.pixels_px.copy()
     pixels[own] = pixels[np.roll(own, 37)]
-    data = with_noise_images(dataset(guess), "left", folder)
+    noise = with_noise_images(load(data, guess), "left", folder)
     kept = np.setdiff1d(np.arange(len(table)), own[7:])
-    return calibgraph.calibrate(data, guess, replace(table, pixels_px=pixels).select(kept))
+    return calibgraph.calibrate(noise, guess, replace(table, pixels_px=pixels).select(kept))
 
 
-def no_time(guess: Rig, truth: Rig, folder: Path) -> Calibration:
-    return calibgraph.calibrate(dataset(guess), guess, table_of(truth), time_limit_s=1e-9)
+def no_time(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    return calibgraph.calibrate(load(data, guess), guess, table_of(truth), time_limit_s=1e-9)
 
 
-Make = Callable[[Rig, Rig, Path], Calibration]
+Make = Callable[[Rig, Rig, Sequence[Path], Path], Calibration]
 
 
 @pytest.mark.parametrize(
     "make", [one_camera, no_overlap, overlap, relative_pose, excluded_camera, no_time]
 )
 def test_the_saved_table_solved_again_gives_the_saved_result(
-    make: Make, guess: Rig, truth: Rig, tmp_path: Path
+    make: Make, guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path
 ) -> None:
-    made = make(guess, truth, tmp_path)
+    made = make(guess, truth, recordings, tmp_path)
     made.save(tmp_path / "result")
     saved = calibgraph.load_calibration(tmp_path / "result")
     require_same(saved, made)
     require_same(saved, solve_again(saved))
-    assert saved.counts["front_left"]["places"] >= 1
+    assert saved.counts["front_left"]["places"] == 2
     for name, sigmas in ((n, saved.sigmas(n)) for n in saved.rig.cameras):
         assert (sigmas is None) == (make is excluded_camera and name == "left")
 
@@ -182,9 +201,9 @@ def test_a_folder_of_tables_is_solved_as_one(guess: Rig, truth: Rig, tmp_path: P
 
 
 def test_the_commands_solve_what_calibrate_saved(
-    guess: Rig, truth: Rig, tmp_path: Path, call: Call
+    guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
 ) -> None:
-    made = overlap(guess, truth, tmp_path)
+    made = overlap(guess, truth, recordings, tmp_path)
     made.save(tmp_path / "result")
     given = (tmp_path / "result", tmp_path / "result" / "correspondences.parquet")
     matches = ("--camera-matches", tmp_path / "result" / "camera_matches.parquet")
