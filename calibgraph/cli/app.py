@@ -18,7 +18,7 @@ import typer
 
 from calibgraph.cli import outputs, remote
 from calibgraph.cli.bag import bag
-from calibgraph.cli.benchmark import bench, paper, tune
+from calibgraph.cli.benchmark import bench, paper
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
@@ -103,7 +103,6 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     simulate: outputs.nothing,
     weights: outputs.weights,
     train: outputs.training,
-    tune: outputs.settings,
     track: outputs.result,
     pick: outputs.picked,
     fleet: outputs.nothing,

@@ -142,9 +142,7 @@ def solve(
         return
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
-        result = solve(
-            load_rig(rig), correspondences, settings, checked_terms, camera_matches=seen
-        )
+        result = solve(load_rig(rig), correspondences, settings, checked_terms, camera_matches=seen)
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
         written = write_result(result, out)

@@ -25,6 +25,7 @@ from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
 
+
 @dataclass(frozen=True, eq=False)
 class Start:
     """Where a matcher's rounds begin.

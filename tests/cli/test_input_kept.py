@@ -94,8 +94,6 @@ def test_named_files_of_others_are_not_replaced(
         ("export", ("export", simulated, "--format", "ros2", "--out", simulated / "notes.html")),
         ("import", ("import", simulated / "rig.yaml", "--out", simulated / "settings.yaml")),
         ("bench paper", ("bench", "paper", "kitti", "--out", simulated)),
-        ("tune", ("tune", "kitti", "--out", simulated / "settings.yaml")),
-        ("tune", ("tune", "kitti", "--out", simulated / "rig.yaml")),
     ]
     before = files_in(simulated)
     for command, arguments in cases:
