@@ -106,7 +106,7 @@ def solve_without_failing(
             return solve_joint(rig, table, config, terms)
         except CorrespondenceError as error:
             excluded = config.excluded_cameras
-            if error.camera is None or error.camera in excluded:
+            if error.camera not in rig.cameras or error.camera in excluded:
                 raise
             config = config.changed(excluded_cameras=(*excluded, error.camera))
 
