@@ -202,7 +202,7 @@ def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Seq
 def _nothing_known(name: str) -> RigError:
     return RigError(
         f"camera {name!r}: nothing says where it is; describe it with --mount {name}=WORDS "
-        f"({GRAMMAR}), add a URDF or a sensor kit, or give --data to search over all headings",
+        f"({GRAMMAR}), add a URDF or a sensor kit, or give --dataset to search over all headings",
         camera=name,
     )
 
