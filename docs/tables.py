@@ -104,6 +104,9 @@ def with_generated_parts(page: str) -> str:
     return PART.sub(part, page)
 
 
+_ROLE = re.compile(r":(?:func|class|meth|mod):")  # docstrings are written for Sphinx
+
+
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A Markdown table."""
     head = list(header)
