@@ -25,7 +25,10 @@ from calibgraph.yaml_text import yaml_text
 
 _HEAD = """{mark}
 # Replace every {fill_in}; then: calibgraph doctor {folder}
+# Found are {clouds} clouds in lidar, and images of {cameras}.
 #
+# lidar           its name, which export uses as its frame
+# cameras         by name, as the folders in cameras/; remove those that you do not calibrate
 # intrinsics_px   focal lengths and principal point [px] of the images as recorded, for exactly
 #                 this width and height; pixel (0, 0) is the centre of the top-left pixel
 # model           pinhole (OpenCV, ROS plumb_bob), fisheye (Kannala-Brandt, ROS equidistant),
@@ -40,6 +43,7 @@ _HEAD = """{mark}
 #                              rear  [[0,1,0,0], [0,0,-1,0], [-1,0,0,0], [0,0,0,1]]
 #                 calibgraph init {folder} --mount "NAME=front, 0.4 m ahead"
 #                 writes it from words (with --force, in place of this file)
+# relative_poses  optional: measured poses between cameras, with sigmas; see docs/files.md
 """
 
 
@@ -87,14 +91,17 @@ def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "
             folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
             f"the clouds in lidar, found are the folders {beside}"
         )  # fmt: skip
-    files_by_stem(folder / "lidar", CLOUD_SUFFIXES)
+    clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
     for name in mountings.keys() - sources.keys():
         raise ValueError(f"--mount {name}=...: no such camera; found are {', '.join(sources)}")
     cameras = {
         name: _camera(name, _size(source), mountings.get(name), forward)
         for name, source in sources.items()
     }
-    head = _HEAD.format(mark=yaml_mark("init"), fill_in=FILL_IN, folder=folder)
+    head = _HEAD.format(
+        mark=yaml_mark("init"), fill_in=FILL_IN, folder=folder, clouds=clouds,
+        cameras=", ".join(cameras),
+    )  # fmt: skip
     return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})
 
 

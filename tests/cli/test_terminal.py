@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.main import get_command
 
+from calibgraph.cli import terminal
 from calibgraph.cli.app import app
 from calibgraph.cli.former_options import FORMER, with_present_options
 from calibgraph.cli.terminal import LINE_EVERY_S, progress_lines
@@ -22,6 +26,19 @@ def test_lines_of_progress_have_time_stage_and_steps_and_are_not_too_many() -> N
         progress("round 1 of 3: front", step, 1000)
     assert lines[0] == "    5 s  round 1 of 3: front, 100 of 1000"
     assert len(lines) == 9
+
+
+def test_a_terminal_shows_a_bar_with_the_time_that_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        terminal, "terminal", lambda: Console(file=screen, force_terminal=True, width=100)
+    )
+    with terminal.progress_bar() as progress:
+        progress("round 1 of 3: front", 1, 4)
+    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", screen.getvalue())
+    assert re.search(r"round 1 of 3: front.* 0:00:00 left -:--:--", shown)
 
 
 def test_short_work_prints_no_progress(call: Call, tmp_path: Path) -> None:
