@@ -26,6 +26,7 @@ from .fleet.run import run_fleet as run_fleet
 from .guessing.guess import CameraGuess as CameraGuess
 from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
+from .guessing.template import write_rig_template as write_rig_template
 from .io.arrays import dataset_from_arrays as dataset_from_arrays
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag
