@@ -130,9 +130,10 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         model: by which their probability of being off is computed.
     """
     solution, cameras = evidence.solution, evidence.cameras
-    tolerance = solution.config.tolerance_deg, solution.config.tolerance_cm
     verdicts = {
-        name: judge(checks.get(name, ()), evidence.covariance_of(name), tolerance, model)
+        name: judge(
+            checks.get(name, ()), evidence.covariance_of(name), solution.config.tolerance, model
+        )
         for name in cameras
     }
     result = Calibration(
@@ -149,6 +150,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         stage1_T_camera_lidar=solution.T_hat,
         weaknesses={n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras},
         prior_share=evidence.prior_shares,
+        error_sources=evidence.error_sources,
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,

@@ -123,10 +123,10 @@ def calibrated_sample(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
     folder = tmp_path_factory.mktemp("sample")
     truth = load_rig(SAMPLE / "reference.yaml")
     table = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=0.1))
-    table.save(folder / "table.csv")
+    table.save(folder / "table.parquet")
     result = folder / "result"
     return run_command(
-        "calibrate", SAMPLE, "--matcher", folder / "table.csv", "--out", result, folder=result
+        "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result
     )
 
 

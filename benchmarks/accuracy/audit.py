@@ -24,6 +24,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.audit_data import ONE_RIG, RECORDINGS, Sources, ring
@@ -31,7 +32,7 @@ from benchmarks.accuracy.audit_tables import report
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.tables import ROOT, add_record_option
 from calibgraph import Audit, CalibrationError, CameraAudit, Rig, check
-from calibgraph.audit.judgement import detectable
+from calibgraph.audit.judgement import tail_of_axis
 from calibgraph.audit.result import by_unit
 
 Array = NDArray[np.float64]
@@ -180,19 +181,25 @@ def stated_by(records: list[Record]) -> Iterator[tuple[tuple[str, str], Array]]:
 
 def to_record(audit: Audit) -> Record:
     """Per camera what was found, and what is WRONG."""
+    tail = tail_of_axis(len(audit.cameras))
     return {
         "wrong": list(audit.wrong),
-        "cameras": {name: _camera(camera) for name, camera in audit.cameras.items()},
+        "cameras": {name: _camera(camera, tail) for name, camera in audit.cameras.items()},
         "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.motion),
     }
 
 
-def _camera(camera: CameraAudit) -> Record:
-    """What an audit states of a camera, with the limits that it compares deviations with."""
+def _camera(camera: CameraAudit, tail: float) -> Record:
+    """What an audit states of a camera, with the limits of a significant deviation.
+
+    Args:
+        camera: its audit.
+        tail: probability of a larger deviation by chance, to either side.
+    """
     found = {"status": camera.status, "reason": camera.reason, "trusted": _is_trusted(camera)}
     if camera.deviation is None or camera.sigma is None or camera.detectable is None:
         return found
-    limit = camera.detectable - detectable(camera.sigma, 0.0)
+    limit = float(-ndtri(tail)) * camera.sigma
     return {
         **found,
         "significant": (np.abs(camera.deviation) > limit).tolist(),

@@ -25,6 +25,7 @@ from calibgraph.audit.result import LidarAudit
 from calibgraph.audit.trend import fit_slope
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
+from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.solver.covariance import PSEUDO_FRAMES
 
 Array = NDArray[np.float64]
@@ -34,8 +35,11 @@ FALSE_ALARM_RATE = 0.01
 
 _LATEST_DAY = 1e9  # a number of seconds would still be one, twice that of the present
 
-_FAILED = "its verdict is FAIL, so that nothing is known of its error; calibrate it again"
-_NO_ERROR_BAR = "it has no error bar; calibrate it from more frames, at more places"
+_FAILED = "its verdict is FAIL, so that nothing is known of its error: do what its report advises"
+_NO_ERROR_BAR = "it has no error bar: its matches do not determine the camera"
+_SCATTER_ONLY = (
+    "its error bar is of the scatter alone: solve it again with --common-deg, --common-cm"
+)
 _ALONE = "no other result has an error bar of this camera that holds; give more results"
 
 
@@ -116,6 +120,8 @@ def _why_unusable(result: Calibration, name: str) -> str:
     covariance = result.covariance[name]
     if covariance is None or np.linalg.eigvalsh(covariance)[0] <= 0:
         return _NO_ERROR_BAR
+    if any(check.kind == COMMON_ERROR for check in result.camera_verdicts[name].checks):
+        return _SCATTER_ONLY
     return ""
 
 

@@ -1,6 +1,6 @@
 """From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
 
-Three statements about the deviation d of an axis with standard deviation sigma:
+Four statements about the deviation d of an axis with standard deviation sigma:
 
 * it is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has a
   significant axis;
@@ -10,8 +10,10 @@ Three statements about the deviation d of an axis with standard deviation sigma:
 Both are quantiles of Student's t: sigma is itself estimated, from the scatter of few frames. The
 part of it that is stated, for the error that all frames share, has no such doubt.
 
-WRONG: an axis is significant and beyond the tolerance. OK: all axes are certainly within. Else the
-data cannot tell.
+* these data would show a change as large as the tolerance: the smallest detectable one is below.
+
+WRONG: an axis is significant and beyond the tolerance. OK: all axes are certainly within, and their
+smallest detectable changes are below the tolerance. Else the data cannot tell.
 """
 
 from __future__ import annotations
@@ -24,10 +26,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, ndtri, stdtrit
 
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
+from calibgraph.model.error_components import UNKNOWN, error_components
+from calibgraph.model.error_sources import MOST_TIMES, ErrorSources
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,7 +41,7 @@ FALSE_ALARM_RATE = 1e-3
 """Probability of a significant axis on a rig, of all its cameras, that has not changed."""
 
 POWER = 0.9
-"""Probability with which the smallest detectable change is significant."""
+"""Probability with which the smallest detectable change is told from none."""
 
 CONFIDENCE = 0.95
 """Probability that an axis that counts as within the tolerance is."""
@@ -44,10 +49,7 @@ CONFIDENCE = 0.95
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
 _DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
-_RECORD = (
-    "too uncertain for this tolerance: record more frames, at more places, {}, or give a tolerance "
-    "above the sigmas"
-)
+_UNSEEN = "a change as large as the tolerance could go unseen"
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 
 SEARCHES_FARTHER = (
@@ -132,11 +134,11 @@ def tail_of_axis(cameras: int) -> float:
 
 
 def detectable(sigma: Array, quantile: float | Array) -> Array:
-    """(6,) the smallest change per axis that is significant with probability POWER.
+    """(6,) the smallest change per axis that is beyond a quantile with probability POWER.
 
     Args:
         sigma: (6,) standard deviations.
-        quantile: how many of them are significant, per axis or of all.
+        quantile: how many of them count, per axis or of all.
     """
     smallest: Array = (quantile + float(ndtri(POWER))) * sigma
     return smallest
@@ -159,15 +161,35 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
     if has_too_few_frames(evidence, name):
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
+    if not evidence.findings.states_common_error:
+        covariance = covariance + _unstated_error()
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
-    status, reason = judge_axes(deviation, sigma, quantiles, tolerance)
+    least = _least_share(evidence.error_sources.get(name))
+    status, reason = judge_axes(deviation, sigma, quantiles, tolerance, least=least)
     if doubt:
         status, reason = "CANNOT TELL", doubt
     elif status == "WRONG" and len(evidence.cameras) == 1:
         reason += SINGLE_CAMERA
-    smallest = detectable(sigma, quantiles.significant)
+    smallest = detectable(sigma, quantiles.confident)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
+
+
+def _least_share(sources: ErrorSources | None) -> Array | float:
+    """(6,) share of an error bar that remains with any number of frames; 0 if unknown."""
+    if sources is None:
+        return 0.0
+    now = np.array([sources.rotation_deg, sources.translation_cm])
+    return np.repeat(sources.forecast[MOST_TIMES] / now, 3)
+
+
+def _unstated_error() -> Array:
+    """(6, 6) of the error that all frames share by a matcher that does not state it."""
+    usual = error_components().matchers[UNKNOWN]
+    sigmas = pose_sigmas(
+        rotation_rad=usual.systematic_rotation_rad, translation_m=usual.systematic_translation_m
+    )
+    return np.asarray(np.diag(sigmas**2))
 
 
 def has_too_few_frames(evidence: Evidence, name: str) -> bool:
@@ -195,41 +217,56 @@ def _deviation(evidence: Evidence, name: str) -> Array:
 
 
 def judge_axes(
-    deviation: Array, sigma: Array, quantiles: Quantiles, tolerance: Tolerance
+    deviation: Array,
+    sigma: Array,
+    quantiles: Quantiles,
+    tolerance: Tolerance,
+    *,
+    least: Array | float = 0.0,
 ) -> tuple[AuditStatus, str]:
-    """The status of a trusted measurement, and its reason."""
+    """The status of a trusted measurement, and its reason.
+
+    Args:
+        deviation: (6,) of all axes.
+        sigma: (6,) its standard deviations.
+        quantiles: of these.
+        tolerance: on each axis.
+        least: (6,) share of sigma that remains however many frames are recorded.
+    """
     size, significant = np.abs(deviation), np.abs(deviation) > quantiles.significant * sigma
     wrong = significant & (size > tolerance.twist)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    reach = quantiles.confident * sigma
-    unsure = size + reach > tolerance.twist
+    needed = detectable(sigma, quantiles.confident)
+    blind = needed > tolerance.twist
+    unsure = (size + quantiles.confident * sigma > tolerance.twist) | blind
     if unsure.any():
-        blind = unsure & (reach > tolerance.twist)
-        return "CANNOT TELL", _advise(deviation, sigma, unsure, blind)
+        found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
+        recording_helps = not (least * needed > tolerance.twist).any()
+        advice = _advise(needed, blind, recording_helps=recording_helps)
+        return "CANNOT TELL", f"may be beyond the tolerance: {found}; {advice}"
     if significant.any():
         moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
         return "OK", f"within the tolerance, though significant: {moved}"
     return "OK", "no significant deviation, and all axes are within the tolerance"
 
 
-def _advise(deviation: Array, sigma: Array, unsure: Mask, blind: Mask) -> str:
-    """What was found about the axes that may be beyond the tolerance, and what to record.
+def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
+    """What to do about axes that may be beyond the tolerance.
 
     Args:
-        deviation: (6,) of all axes.
-        sigma: (6,) its standard deviations.
-        unsure: (6,) which may be beyond the tolerance.
-        blind: (6,) which would be unsure without any deviation.
+        needed: (6,) the tolerance that these data could confirm, if nothing has changed.
+        blind: (6,) which axes need more than the tolerance.
+        recording_helps: whether enough frames would do.
     """
-    found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
     if not blind.any():
-        advice = "too near to the tolerance to decide: check another recording, of other places"
-    elif blind[3:].any():
-        advice = _RECORD.format("where walls, poles or vehicles are within 10 m")
-    else:
-        advice = _RECORD.format("with walls, poles or vehicles all over the image")
-    return f"may be beyond the tolerance: {found}; {advice}"
+        return "too near to the tolerance to decide: check another recording, of other places"
+    enough = f"{np.degrees(needed[:3].max()):.2g} deg and {100 * needed[3:].max():.2g} cm"
+    if not recording_helps:
+        return f"{_UNSEEN}, however many frames are recorded: tolerate {enough}"
+    near, all_over = "are within 10 m", "are all over the image"
+    where = f"where walls, poles or vehicles {near if blind[3:].any() else all_over}"
+    return f"{_UNSEEN}: tolerate {enough}, or record more frames, {where}"
 
 
 def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> LidarAudit | None:

@@ -29,7 +29,8 @@ class CameraAudit:
         deviation: (6,) xi in T_deployed_now = exp(xi), the pose of the camera now in its frame as
             deployed: rotation [rad], translation [m]; None if nothing was measured.
         sigma: (6,) standard deviations of ``deviation``; None without an error bar.
-        detectable: (6,) smallest change per axis that these data show; None without an error bar.
+        detectable: (6,) smallest change per axis that these data tell from none, with 90 %
+            probability at 95 % confidence; None without an error bar.
         z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
     """
 
@@ -77,6 +78,8 @@ class Audit:
         deployed: the rig that was compared; None if only the numbers are known.
         shown: the frame that a page shows, in the middle of the recording; None if unknown.
         recording: the sources of the frames.
+        same_recording: whether the deployed calibration was made from these very frames, so that
+            errors that they repeat cannot be seen.
     """
 
     cameras: Mapping[str, CameraAudit]
@@ -89,6 +92,7 @@ class Audit:
     deployed: Rig | None = None
     shown: Frame | None = None
     recording: tuple[str, ...] = ()
+    same_recording: bool = False
 
     def of_recording(self, deployed: Rig, data: Dataset) -> Audit:
         """The audit with what its page shows besides its numbers.
@@ -129,6 +133,7 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
         "tolerance_deg": audit.tolerance_deg,
         "tolerance_cm": audit.tolerance_cm,
         "frames": audit.frames,
+        "same_recording": audit.same_recording,
         "cameras": {name: _camera_summary(camera) for name, camera in audit.cameras.items()},
         "lidar": None if audit.lidar is None else lidar_summary(audit.lidar),
         "timings_s": dict(audit.timings_s),
@@ -189,6 +194,7 @@ def audit_of(summary: Mapping[str, Any]) -> Audit:
         tolerance_deg=summary["tolerance_deg"],
         tolerance_cm=summary["tolerance_cm"],
         frames=summary["frames"],
+        same_recording=summary.get("same_recording", False),
         timings_s=summary["timings_s"],
     )
 

@@ -13,12 +13,16 @@ from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
 from calibgraph.cli.terminal import print_plain
 
+_QUESTION = "check: is the deployed calibration still right?"
+_SAME = "; this recording made it, and errors that it repeats are not seen: check another one"
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red"}
 
 
 def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
     """Print the status with its reasons, the deviations per axis, and what was written."""
-    console.print(f"[bold {_COLOURS[audit.status]}]{audit.status}[/]", highlight=False)
+    same = _SAME if audit.same_recording else ""
+    status = f"[bold {_COLOURS[audit.status]}]{audit.status}[/]"
+    console.print(f"{status}  {_QUESTION}{same}", highlight=False, soft_wrap=True)
     if audit.lidar is not None:
         print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
     for name, camera in audit.cameras.items():
@@ -26,9 +30,9 @@ def print_audit(console: Console, audit: Audit, page: Path | None = None) -> Non
     console.print(audit_table(audit))
     console.print(
         "deviation: motion of the camera from where it is deployed, about and along its own axes; "
-        "sigma: its standard deviation; detectable: what would have been seen with 90 % "
-        "probability, at one false alarm in 1000 rigs; changed intrinsics, and distances in the "
-        "clouds that are all too long or too short, look like a motion"
+        "sigma: its standard deviation; detectable: the smallest change that is told from none, "
+        "with 90 % probability at 95 % confidence; changed intrinsics, and distances in the clouds "
+        "that are all too long or too short, look like a motion"
     )
     time = f"{sum(audit.timings_s.values()):.1f} s"
     text = f"tolerance {audit.tolerance_deg:g} deg, {audit.tolerance_cm:g} cm per axis"

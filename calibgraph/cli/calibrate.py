@@ -14,6 +14,8 @@ from calibgraph.cli.matching_options import MatchingOptions, with_matching_optio
 from calibgraph.cli.options import (
     BootstrapOption,
     CameraMatchesOption,
+    CommonCmOption,
+    CommonDegOption,
     ConfigOption,
     ConfigSeedOption,
     DatasetArgument,
@@ -120,6 +122,8 @@ def solve(
     bootstrap: BootstrapOption = None,
     tolerance_deg: ToleratedDegOption = None,
     tolerance_cm: ToleratedCmOption = None,
+    common_deg: CommonDegOption = None,
+    common_cm: CommonCmOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
@@ -131,7 +135,12 @@ def solve(
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
-        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        given = {
+            "tolerance_deg": tolerance_deg,
+            "tolerance_cm": tolerance_cm,
+            "common_deg": common_deg,
+            "common_cm": common_cm,
+        }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
         if camera_matches is not None and remote.SERVER.get() is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -41,6 +42,7 @@ def check(
     """
     from calibgraph.audit import check
     from calibgraph.audit.judgement import Tolerance
+    from calibgraph.audit.provenance import is_made_from
     from calibgraph.audit.result import audit_of
     from calibgraph.io.rigs import load_rig
 
@@ -62,6 +64,7 @@ def check(
                 seed=seed,
                 progress=progress,
             )
+    audit = replace(audit, same_recording=is_made_from(rig, data))
     if page is not None:
         from calibgraph.audit.page import write_audit_report
 

@@ -12,12 +12,14 @@ from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty
 from calibgraph.cli.terminal import print_plain
 
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "CHANGED": "red"}
+_QUESTION = "drift: does one of the results deviate from the others?"
 _LETTERS = 13  # of a result's name in a table; reasons have all of it
 
 
 def print_drift(console: Console, drift: Drift) -> None:
     """Print the status with its reasons, the deviations and what would have been detected."""
-    console.print(f"[bold {_COLOURS[drift.status]}]{drift.status}[/]", highlight=False)
+    status = f"[bold {_COLOURS[drift.status]}]{drift.status}[/]"
+    console.print(f"{status}  {_QUESTION}", highlight=False, soft_wrap=True)
     for line in _reasons(drift):
         print_plain(console, f"  {line}")
     console.print(_deviation_table(drift))

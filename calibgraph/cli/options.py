@@ -199,6 +199,19 @@ ToleratedCmOption = Annotated[
     float | None,
     typer.Option(metavar="CM", help="Distance by which a PASS may be off; by default 10."),
 ]
+CommonDegOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEG",
+        min=0,
+        help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the table "
+        "states)",
+    ),
+]
+CommonCmOption = Annotated[
+    float | None,
+    typer.Option(metavar="CM", min=0, help="Likewise, of the position."),
+]
 _MAX_SEED = 2**31 - 1
 SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
 ConfigSeedOption = Annotated[

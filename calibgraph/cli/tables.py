@@ -19,13 +19,13 @@ from calibgraph.model.calibration import (
     degrees_and_centimetres,
 )
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
-from calibgraph.report.check_table import group_reasons
+from calibgraph.model.summary import Summary
 
 if TYPE_CHECKING:
     from calibgraph.evaluation.paper import Report, Row
     from calibgraph.matching.cmrnext.training.validation import Validation
 
-MAX_REASONS = 16  # the worst come first
+_DETAILS = "report.html or calibration.yaml"
 CAMERA_AXES_COLUMNS = (
     "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
 )  # fmt: skip
@@ -34,19 +34,11 @@ _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 def print_result(console: Console, result: Calibration, written: list[Path]) -> None:
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
-    status = result.verdict.status
-    cannot_tell = ": these data cannot tell" if result.verdict.cannot_tell else ""
-    console.print(f"[bold {_COLOURS[status]}]{status}[/]{cannot_tell}", highlight=False)
-    reasons = group_reasons(result.camera_verdicts, result.weaknesses)
-    for reason in reasons[:MAX_REASONS]:
-        print_plain(console, f"  {reason.status:5}{reason.cameras}: {reason.text}")
-    if len(reasons) > MAX_REASONS:
-        more = len(reasons) - MAX_REASONS
-        print_plain(console, f"  and {more} more: see camera_verdicts in calibration.yaml")
+    print_summary(console, result.summary)
     console.print(result_table(result))
     config = result.config
     console.print(
-        "?: the data cannot tell; off: probability of an error over "
+        "off: probability of an error over "
         f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm; moved: from the "
         "guess; median: error of all matches, in pixels; inliers, matches: within the gate"
     )
@@ -60,6 +52,25 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
         print_plain(console, f"  {path}")
+
+
+def print_summary(console: Console, summary: Summary) -> None:
+    """Print the verdict, at most three reasons, what to do, and how much is folded."""
+    status = summary.status
+    doubt = f": {summary.doubt}" if summary.doubt else ""
+    console.print(
+        f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False, soft_wrap=True
+    )
+    for reason in summary.reasons:
+        print_plain(console, f"  {reason.status}  {', '.join(reason.cameras)}: {reason.text}")
+    if summary.actions:
+        print_plain(console, "What to do:")
+    for action in summary.actions:
+        print_plain(console, f"  {action}")
+    if summary.error_bar:
+        print_plain(console, summary.error_bar)
+    if summary.others:
+        print_plain(console, f"{len(summary.others)} more: see {_DETAILS}")
 
 
 def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:
@@ -96,7 +107,7 @@ def result_table(result: Calibration) -> Table:
         verdict = result.camera_verdicts[name]
         table.add_row(
             escape(name),
-            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]{' ?' if verdict.cannot_tell else ''}",
+            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
             "-" if verdict.doubt is None else verdict.doubt.percent,
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",

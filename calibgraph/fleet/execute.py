@@ -121,7 +121,8 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
             verdict=verdict.status,
             cannot_tell=verdict.cannot_tell,
             probability_off=None if verdict.doubt is None else verdict.doubt.probability,
-            reasons=tuple(verdict.reasons),
+            reasons=tuple(reason.text for reason in result.summary_of(name).reasons),
+            actions=result.summary_of(name).actions,
             T_camera_lidar=tuple(result.T_camera_lidar[name].ravel().tolist()),
             covariance=None if (c := covariance[name]) is None else tuple(c.ravel().tolist()),
         )

@@ -38,6 +38,7 @@ SCHEMA = pa.schema(
         ("cannot_tell", pa.bool_()),
         ("probability_off", pa.float64()),
         ("reasons", pa.list_(pa.string())),
+        ("actions", pa.list_(pa.string())),
         ("T_camera_lidar", pa.list_(pa.float64(), 16)),
         ("covariance", pa.list_(pa.float64(), 36)),
         ("error_kind", pa.string()),

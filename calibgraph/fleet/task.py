@@ -63,9 +63,10 @@ class CameraResult:
         verdict: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
         probability_off: that it is off by more than the tolerance.
-        reasons: of the verdict.
+        reasons: of the verdict, at most three.
         T_camera_lidar: 16 numbers by rows.
         covariance: 36 numbers by rows; None without an error bar.
+        actions: what to do, at most three sentences.
     """
 
     camera: str
@@ -75,6 +76,7 @@ class CameraResult:
     reasons: tuple[str, ...]
     T_camera_lidar: tuple[float, ...]
     covariance: tuple[float, ...] | None
+    actions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config, Terms
+from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
@@ -166,6 +167,7 @@ class _Parts(BaseModel):
     timings_s: dict[str, float]
     terms: Terms
     prior_share: dict[str, float]
+    error_sources: dict[str, ErrorSources] = {}
     inputs: dict[str, str]
     versions: dict[str, str]
 
@@ -201,10 +203,17 @@ def _require_consistent(
 
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
-_OF_SOME_CAMERAS = ("residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap")
+_OF_SOME_CAMERAS = (
+    "residuals",
+    "stage1_T_camera_lidar",
+    "weaknesses",
+    "prior_share",
+    "bootstrap",
+    "error_sources",
+)
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
-    "counts", "timings_s", "terms", "prior_share", "inputs", "versions",
+    "counts", "timings_s", "terms", "prior_share", "error_sources", "inputs", "versions",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

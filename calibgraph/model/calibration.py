@@ -18,6 +18,7 @@ from calibgraph.files import sha256, write_yaml
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.geometry import invert, relative_covariance, relative_transform
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
@@ -28,6 +29,7 @@ from calibgraph.model.result_files import (
     outputs_of_calibration,
 )
 from calibgraph.model.rig import Rig
+from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
 from calibgraph.outputs import require_free
 
@@ -97,6 +99,7 @@ class Calibration:
         stage1_T_camera_lidar: the pairwise estimates.
         weaknesses: per camera, the least determined directions, in words, the worst first.
         prior_share: per camera, the share of its result that comes from priors, not data (0-1).
+        error_sources: per camera with an error bar, the shares of its sources.
         bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
             frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
@@ -123,6 +126,7 @@ class Calibration:
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
     weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
     prior_share: dict[str, float] = field(default_factory=dict)
+    error_sources: dict[str, ErrorSources] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
@@ -135,6 +139,18 @@ class Calibration:
     def verdict(self) -> Verdict:
         """Of the rig: the worst of its cameras, with the checks of all."""
         return rig_verdict(self.camera_verdicts)
+
+    @property
+    def summary(self) -> Summary:
+        """The verdict for people: at most three reasons, what to do, and the rest."""
+        return self.summary_of(*self.rig.cameras)
+
+    def summary_of(self, *cameras: str) -> Summary:
+        """The same of some of its cameras."""
+        verdicts = {name: self.camera_verdicts[name] for name in cameras}
+        weaknesses = {name: self.weaknesses.get(name, ()) for name in cameras}
+        sources = {n: self.error_sources[n] for n in cameras if n in self.error_sources}
+        return summarize(verdicts, weaknesses, sources)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -239,12 +255,14 @@ class Calibration:
         return {
             "format": CALIBRATION_FORMAT,
             "verdict": _verdict_mapping(self.verdict),
+            "summary": self.summary.to_mapping(),
             "camera_verdicts": {
                 name: {**_verdict_mapping(verdict), "checks": [vars(c) for c in verdict.checks]}
                 for name, verdict in self.camera_verdicts.items()
             },
             "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
             "prior_share": self.prior_share,
+            "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},

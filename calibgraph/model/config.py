@@ -76,6 +76,8 @@ class Config(StrictNumbers):
             relative poses or common features, else it stays where the rig has it and FAILs.
         tolerance_deg: rotation by which a result may be off: the verdict is about more.
         tolerance_cm: distance by which a camera may be off: the verdict is about more.
+        common_deg, common_cm: standard deviation per camera axis of the error that all frames of a
+            table share, if the table does not state it; 0 if they share none.
         bootstrap: how many times to solve again with frames drawn with replacement, as a check
             of the covariance; 0 for none.
         seed: of everything random.
@@ -103,9 +105,16 @@ class Config(StrictNumbers):
     excluded_cameras: tuple[str, ...] = ()
     tolerance_deg: Annotated[float, Field(gt=0, le=180)] = TOLERANCE[0]
     tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
+    common_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
     seed: Seed = 0
     tracking: Tracking = Tracking()
+
+    @property
+    def tolerance(self) -> tuple[float, float]:
+        """Rotation [deg] and distance [cm] by which a result may be off."""
+        return self.tolerance_deg, self.tolerance_cm
 
     def changed(self, **settings: Any) -> Config:
         """A checked copy with some settings changed.

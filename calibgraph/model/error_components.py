@@ -15,6 +15,9 @@ import numpy as np
 
 FORMAT = "calibgraph-error-components/1"
 
+UNKNOWN = "unknown"
+"""Stands for the matcher of a table that states nothing."""
+
 
 @dataclass(frozen=True)
 class MatcherComponents:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.model.error_components import UNKNOWN, error_components
 
 _PER_CAMERA = {
     "z_score": "contrast",  # the key on disk is older than the name
@@ -31,6 +32,7 @@ _NUMBERS = {
     "place_translation_m": 100.0,
     "place_variance": 1e6,
 }
+_COMMON = {"systematic_rotation_rad", "systematic_translation_m"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class MatcherFindings:
         range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
             if unknown.
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
-            error that all its frames share.
+            common error, which all its frames share; None if it is not stated.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
         elevation_rad: standard deviation of an offset of all beams' elevations; this and the next
             two, which bend the cloud, are part of the error that all frames share.
@@ -68,8 +70,8 @@ class MatcherFindings:
     stage1: str = "pnp"
     range_rotation_deg: float | None = None
     range_translation_m: float | None = None
-    systematic_rotation_rad: float = 0.0
-    systematic_translation_m: float = 0.0
+    systematic_rotation_rad: float | None = None
+    systematic_translation_m: float | None = None
     camera_share: float = 0.5
     elevation_rad: float = 0.0
     elevation_stretch: float = 0.0
@@ -82,6 +84,8 @@ class MatcherFindings:
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:
         """Read the keys of a table's metadata that are findings; others are left alone.
 
+        Without a common error, one that is usual of its ``matcher`` is taken, if it is a known one.
+
         Raises:
             CorrespondenceError: if a value is not a number in its range.
         """
@@ -93,6 +97,8 @@ class MatcherFindings:
                 values[key] = _number(key, metadata[key], largest)
         if STAGE1 in metadata:
             values[STAGE1] = _source(metadata[STAGE1])
+        if not _COMMON & values.keys():
+            values = _usual_of(metadata.get("matcher")) | values
         return MatcherFindings(**values)
 
     def to_metadata(self) -> dict[str, Any]:
@@ -108,26 +114,35 @@ class MatcherFindings:
 
     @property
     def systematic_sigmas(self) -> tuple[float, float]:
-        """Rotation [rad] and translation [m] that all frames share, per axis."""
-        return self.systematic_rotation_rad, self.systematic_translation_m
+        """Rotation [rad] and translation [m] that all frames share, per axis; 0 if not stated."""
+        return self.systematic_rotation_rad or 0.0, self.systematic_translation_m or 0.0
+
+    @property
+    def states_common_error(self) -> bool:
+        """Whether it is known how large the error is that all frames share."""
+        return (self.systematic_rotation_rad, self.systematic_translation_m) != (None, None)
 
     @property
     def rigid_sigmas(self) -> tuple[float, float]:
         """Of these what is left besides the bends, which displace a camera by about as much."""
-        parts = (
-            (self.systematic_rotation_rad, self.elevation_rad),
-            (
-                self.systematic_translation_m,
-                self.scan_motion_m / (4 * math.pi),
-            ),
+        bends = self.elevation_rad, self.scan_motion_m / (4 * math.pi)
+        rotation, translation = (
+            math.sqrt(max(whole**2 - bend**2, 0.0))
+            for whole, bend in zip(self.systematic_sigmas, bends, strict=True)
         )
-        rotation, translation = (math.sqrt(max(a**2 - b**2, 0.0)) for a, b in parts)
         return rotation, translation
 
     @property
     def bend_sigmas(self) -> tuple[float, float, float]:
         """Of what bends the cloud: offset of elevations [rad], their stretch, motion [m]."""
         return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
+
+
+def _usual_of(matcher: object) -> dict[str, float]:
+    """The sizes of a known matcher's errors; none of another one, whose tables have to state it."""
+    known = error_components().matchers
+    named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
+    return vars(known[str(matcher)]) if named else {}
 
 
 def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:

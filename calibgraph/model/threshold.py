@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from calibgraph.model.verdict import Check, Status, grade
+import numpy as np
+
+from calibgraph.model.verdict import TOLERANCE, Check, Status, grade
 
 Direction = Literal["at most", "at least"]
 
@@ -26,7 +28,8 @@ class Threshold:
         unit: of the values; "share" is printed in percent.
         question: what the check answers, in words.
         reason: why these limits: what they mean, or the data that they were read from.
-        advice: what to do if it is not PASS.
+        advice: the meaning if it is not PASS; for what to do, see ``model.causes``.
+        of_tolerance: whether the limits are for the usual tolerance, and follow another one.
     """
 
     key: str
@@ -38,6 +41,19 @@ class Threshold:
     question: str
     reason: str
     advice: str = ""
+    of_tolerance: bool = False
+
+    def at(self, tolerance: tuple[float, float]) -> Threshold:
+        """The row for a tolerance [deg, cm].
+
+        A tolerance below the usual one moves the limit of PASS alone: an error of that size is too
+        large for the user, but no sign of a wrong result.
+        """
+        if not self.of_tolerance:
+            return self
+        ratio = dict(zip(("deg", "cm"), np.divide(tolerance, TOLERANCE), strict=True))[self.unit]
+        fail = self.fail * max(float(ratio), 1.0)
+        return replace(self, warn=self.warn * float(ratio), fail=fail)
 
     def grade(self, value: float) -> Status:
         """PASS, WARN or FAIL of a value; NaN fails."""
@@ -101,8 +117,7 @@ def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
     kind: str,
 ) -> Check:
     limit = fail if status == "FAIL" else warn
-    digits = 3 if status == "PASS" or in_unit(value, unit) != in_unit(limit, unit) else 9
-    text = f"{name} {in_unit(value, unit, digits)}"
+    text = f"{name} {beside(value, limit, unit)}"
     if status != "PASS":
         text += f" is {side} {in_unit(limit, unit)}"
         text += f": {advice}" if advice else ""
@@ -123,7 +138,27 @@ def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
 
 
 def in_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit, for display."""
-    if unit == "share":
-        return f"{100 * value:.{digits}g}%"
-    return f"{value:.{digits}g} {unit}".rstrip()
+    """A number with its unit, for display; large ones without an exponent."""
+    scaled, sign = (100 * value, "%") if unit == "share" else (value, f" {unit}".rstrip())
+    if 10**digits <= abs(scaled) < math.inf:
+        return f"{scaled:.0f}{sign}"
+    return f"{scaled:.{digits}g}{sign}"
+
+
+def beside(value: float, limit: float, unit: str) -> str:
+    """A number with its unit, in three digits that tell it from a limit beyond which it lies.
+
+    Where these would be the same, the number is rounded away from the limit.
+
+    Args:
+        value: of the number.
+        limit: that it is printed beside.
+        unit: of both.
+    """
+    text = in_unit(value, unit)
+    if value == limit or text != in_unit(limit, unit):
+        return text
+    scaled = 100 * limit if unit == "share" else limit
+    step = 10.0 ** min(math.floor(math.log10(abs(scaled))) - 2, 0)
+    away = round(scaled / step) + (1 if value > limit else -1)
+    return in_unit(away * step / (100 if unit == "share" else 1), unit)

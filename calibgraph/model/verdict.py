@@ -14,8 +14,11 @@ PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
 """Probabilities that a result is off by more than the tolerance, where verdicts are cut."""
 TOLERANCE = (0.5, 10.0)
 """Rotation [deg] and distance [cm] that users tolerate if they state nothing else."""
+COMMON_ERROR = "common_error"
+"""Kind of the check that a table states the error that its frames share."""
 ABOUT_THE_DATA = frozenset(
     {
+        COMMON_ERROR,
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split
@@ -61,6 +64,15 @@ class Check:
     def decisive(self) -> bool:
         """Whether it is a FAIL without limits: nothing was measured, or something did not work."""
         return self.status == "FAIL" and self.warn is None
+
+    @property
+    def is_graded(self) -> bool:
+        """Whether the status is the one that the limits give the value."""
+        if self.value is None or self.warn is None or self.fail is None:
+            return False
+        if self.warn <= self.fail:
+            return self.status == grade(not self.value <= self.warn, not self.value <= self.fail)
+        return self.status == grade(not self.value >= self.warn, not self.value >= self.fail)
 
     @property
     def severity(self) -> float:
@@ -131,10 +143,19 @@ class Doubt:
         return f"{100 * self.probability:.2g}%"
 
     @property
+    def tolerance(self) -> tuple[float, float]:
+        """Rotation [deg] and distance [cm]."""
+        return self.tolerance_deg, self.tolerance_cm
+
+    @property
+    def tolerated(self) -> str:
+        """The tolerance with its units."""
+        return f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
+
+    @property
     def sentence(self) -> str:
         """What it is the probability of, without the number."""
-        tolerated = f"{self.tolerance_deg:g} deg or {self.tolerance_cm:g} cm"
-        return f"off by more than {tolerated} with a probability"
+        return f"off by more than {self.tolerated} with a probability"
 
     @property
     def of_error_bar(self) -> bool:
@@ -143,10 +164,10 @@ class Doubt:
 
     @property
     def advice(self) -> str:
-        """What to do if the data cannot tell more; empty if something seems wrong."""
+        """That the data cannot tell more; empty if something seems wrong."""
         if not self.of_error_bar:
             return ""
-        return ": the data cannot tell, by the error bar; record more frames, at more places"
+        return ": cannot tell, by the error bar"
 
 
 @dataclass(frozen=True)
@@ -195,11 +216,6 @@ class Verdict:
             return True
         beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
         return bool(beyond) and beyond <= ABOUT_THE_DATA
-
-    @property
-    def label(self) -> str:
-        """The status for people: CANNOT TELL in place of such a WARN."""
-        return "CANNOT TELL" if self.cannot_tell else self.status
 
     @property
     def reasons(self) -> tuple[str, ...]:

@@ -31,10 +31,12 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
             "cannot_tell": result.camera_verdicts[name].cannot_tell,
             "probability_off": _probability(result.camera_verdicts[name]),
             "reasons": list(result.camera_verdicts[name].reasons),
+            "actions": list(result.summary_of(name).actions),
             **_sigmas(result, name),
             "residuals": None if residuals is None else vars(residuals),
             "weaknesses": list(result.weaknesses.get(name, ())),
             "prior_share": result.prior_share.get(name),
+            "error_sources": _sources(result, name),
             "counts": result.counts[name],
         }
     return {
@@ -42,6 +44,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "cannot_tell": result.verdict.cannot_tell,
         "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
+        "summary": result.summary.to_mapping(),
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,
@@ -51,6 +54,11 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
 
 def _probability(verdict: Verdict) -> float | None:
     return None if verdict.doubt is None else verdict.doubt.probability
+
+
+def _sources(result: Calibration, name: str) -> dict[str, Any] | None:
+    sources = result.error_sources.get(name)
+    return None if sources is None else vars(sources)
 
 
 def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | None]:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.report.camera_section import camera_section
-from calibgraph.report.check_table import group_reasons
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.reprojection_errors import errors_before_after
@@ -22,12 +21,16 @@ Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
     "PASS": "Yes. All checks passed.",
-    "CANNOT TELL": "With care: nothing seems wrong, but these data do not determine it well enough "
-    "for the tolerance. Record more frames, at more places; the reasons name what is missing.",
     "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
     "and look at the pictures.",
     "FAIL": "No. Do not use this result; the reasons below name what to correct.",
 }
+
+
+_UNSURE = (
+    "With care: nothing seems wrong, but the data cannot tell more; the reasons name what is "
+    "missing."
+)
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -60,15 +63,14 @@ def report_html(result: Calibration) -> str:
         camera_section(result, name, index, overlays.get(name), errors.get(name))
         for index, name in enumerate(result.rig.cameras)
     ]
-    verdicts = {name: result.camera_verdicts[name] for name in result.rig.cameras}
-    weaknesses = {name: result.weaknesses.get(name, ()) for name in result.rig.cameras}
+    summary = result.summary
     return load_template("page.html.j2").render(
         result=result,
         cameras=cameras,
-        usable=_CAN_I_USE_IT[result.verdict.label],
+        usable=_UNSURE if summary.cannot_tell else _CAN_I_USE_IT[summary.status],
         accuracy=_accuracy(result),
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
-        reasons=group_reasons(verdicts, weaknesses),
+        reasons=(*summary.reasons, *summary.others),
         between=pair_sections(result),
         match_scale=match_scale(),
         overlays_left_out=overlays_left_out,

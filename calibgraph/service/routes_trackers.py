@@ -93,6 +93,7 @@ class TrackerState(BaseModel):
         verdict: of the estimate: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
         reasons: of the verdict.
+        summary: the verdict in few words, as ``--json`` prints it: reasons, actions, others.
         cameras: per camera, as in a result.
         events: the last ones.
     """
@@ -101,6 +102,7 @@ class TrackerState(BaseModel):
     verdict: str
     cannot_tell: bool
     reasons: list[str]
+    summary: dict[str, Any] = {}
     cameras: dict[str, Any]
     events: list[dict[str, Any]]
 

@@ -234,6 +234,7 @@ def _state(tracker: _Open) -> dict[str, Any]:
         "verdict": summary["verdict"],
         "cannot_tell": summary["cannot_tell"],
         "reasons": summary["reasons"],
+        "summary": finite(summary["summary"]),
         "cameras": finite(summary["cameras"]),
         "events": _events(tracker.folder),
     }

@@ -88,8 +88,15 @@ class SimulatedMatcher:
             pixels_px=pixels,
             points_lidar_m=(points_camera - T[:3, 3]) @ T[:3, :3],
             confidence=self._confidence(rng, outlier, sizes * (_STUCK_SIZE if stuck else 1.0)),
-            metadata={"matcher": "simulated", "errors": asdict(errors)},
+            metadata={"matcher": "simulated", "errors": asdict(errors), **self._common_error},
         )
+
+    @property
+    def _common_error(self) -> dict[str, float]:
+        """That frames share none, where it is so; else it is not stated, as of other matchers."""
+        if self.errors.bias_px or self.bias_twist.any():
+            return {}
+        return {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
 
     def _project(self, points_camera: Array, *, stuck: bool) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) pixels at the displaced pose; (n,) which are off the image."""

@@ -49,6 +49,7 @@ class Sizes:
             pairs=self.shared * usual.pairs,
             cloud_at_place=self.cloud * usual.cloud_at_place,
             at_place=self.cameras * usual.at_place,
+            scatter_at_place=self.cameras * usual.scatter_at_place,
         )
 
     def is_near(self, other: Sizes) -> bool:

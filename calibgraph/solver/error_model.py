@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.error_components import error_components
+from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
@@ -214,11 +214,12 @@ def error_model(
     cameras = tuple(T_camera_lidar)
     whole, share = np.square(findings.rigid_sigmas), findings.camera_share
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = usual.matchers["unknown"]
+        unknown = usual.matchers[UNKNOWN]
         whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
+    scatter_at_place = at_place.copy()
     usual_bends = np.asarray(findings.bend_sigmas)
     blocks, bends = {}, np.zeros((len(cameras), 6, len(usual_bends)))
     shape = len(places), len(cameras), len(usual_bends)
@@ -227,6 +228,7 @@ def error_model(
         placed = PlacedBlock.of(block, scales[name], places)
         within = within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
         at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
+        scatter_at_place[:, cameras.index(name)] = within.at_place(0.0)
         blocks[name] = placed.with_variance(within.least)
         if usual_bends.any():
             pose = to_T_lidar_camera(T_camera_lidar[name])
@@ -253,6 +255,7 @@ def error_model(
         bend_weight=np.ones(shape[:2]),
         pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
+        scatter_at_place=scatter_at_place,
         robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
     )
     graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))

@@ -63,6 +63,8 @@ class Components:
         at_place: (P, N, 6, 6) of a camera's matches at one place besides.
         robust_scale: distance [sigmas] at which the loss of a place bends (Geman and McClure's);
             infinite: none.
+        scatter_at_place: (P, N, 6, 6) the part of ``at_place`` that the scatter of the frames
+            shows; 0: none.
     """
 
     cloud: Array
@@ -77,6 +79,7 @@ class Components:
     at_place: Array
     bend_size: float = 1.0
     robust_scale: float = np.inf
+    scatter_at_place: Array | float = 0.0
 
     @property
     def all_bends(self) -> Array:

@@ -16,6 +16,7 @@ from calibgraph.model.correspondences import Correspondences, concatenate, rows_
 from calibgraph.model.rig import Rig
 from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
 from calibgraph.solver.repeats import number_repeats
+from calibgraph.solver.shared_error import with_common_error
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,8 @@ def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) ->
     frame, in whatever order the rows are. A CSV file is read whole.
 
     Raises:
-        CorrespondenceError: if the table names a camera that the rig does not have.
+        CorrespondenceError: if the table names a camera that the rig does not have, or states
+            another common error than the settings.
         FileError: as of :func:`calibgraph.load_correspondences`.
     """
     parts = [table] if isinstance(table, Correspondences) else parts_of_table(Path(table))
@@ -61,7 +63,8 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
     merged_rows = 0
     for part in parts:
-        best, passed = _filter(rig, part.without_cameras(config.excluded_cameras), config)
+        usable = with_common_error(part.without_cameras(config.excluded_cameras), config)
+        best, passed = _filter(rig, usable, config)
         counts[:3] += passed
         kept.append(best)
         if sum(map(len, kept)) > 2 * merged_rows + _MERGED_ROWS:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
@@ -17,6 +21,28 @@ from calibgraph.solver.pair_refinement import PairFit, pair_sigmas
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
+
+
+def with_common_error(table: Correspondences, config: Config) -> Correspondences:
+    """The table with the common error of the settings in its metadata, if they have one.
+
+    Raises:
+        CorrespondenceError: if the table states another one.
+    """
+    if (config.common_deg, config.common_cm) == (None, None):
+        return table
+    rotation_rad, translation_m = np.radians(config.common_deg or 0), (config.common_cm or 0) / 100
+    wanted, found = (float(rotation_rad), translation_m), table.findings
+    if not found.states_common_error:
+        keys = ("systematic_rotation_rad", "systematic_translation_m")
+        return replace(table, metadata={**table.metadata, **dict(zip(keys, wanted, strict=True))})
+    if found.systematic_sigmas != wanted:
+        rotation_rad, translation_m = found.systematic_sigmas
+        raise CorrespondenceError(
+            f"the table states that its frames share {np.degrees(rotation_rad):.3g} deg and "
+            f"{100 * translation_m:.3g} cm; leave common_deg and common_cm out"
+        )
+    return table
 
 
 def shared_scatter(

@@ -89,6 +89,8 @@ def _verdict(
         pull=None,
         converged=True,
         terms="full",
+        scatter_only=not state.findings.states_common_error,
+        tolerance=state.config.tolerance,
     )
     return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
 

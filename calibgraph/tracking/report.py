@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calibgraph.model.summary import summarize
 from calibgraph.report.as_json import finite
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.update import Update
@@ -35,6 +36,7 @@ def _camera(update: Update, name: str) -> dict[str, Any]:
         "verdict": verdict.status,
         "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
+        "actions": list(summarize({name: verdict}).actions),
         "used": update.used.get(name, 0),
         "left_out": name in update.left_out,
     }

@@ -7,7 +7,10 @@ A line holds a frame::
 
 Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``; ``point_index``.
 Optional beside ``frame``: ``stamp_ns``; ``place``, where the vehicle is, a name or a number; and
-``metadata``.
+``metadata``, as of a table. A line with ``metadata`` alone is a header, and holds for the lines
+after it, as here for the error that all frames share::
+
+    {"metadata": {"systematic_rotation_rad": 0.001, "systematic_translation_m": 0.01}}
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from __future__ import annotations
 import json
 import re
 import reprlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Self
 
@@ -33,6 +36,7 @@ from pydantic import (
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
 from calibgraph.model.correspondences import Correspondences, as_confidence, concatenate
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.table_columns import COORDINATES, INFORMATION
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
 from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
@@ -116,6 +120,14 @@ class CameraColumns(BaseModel):
         return np.stack([np.array(getattr(self, key), np.float64) for key in keys], axis=1)
 
 
+class HeaderLine(BaseModel):
+    """A line that holds for those after it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    metadata: Metadata
+
+
 class FrameLine(BaseModel):
     """One line: the correspondences of one frame."""
 
@@ -127,8 +139,11 @@ class FrameLine(BaseModel):
     place: PlaceName | None = None
     metadata: Metadata = {}
 
-    def to_frame(self) -> StreamFrame:
+    def to_frame(self, header: Mapping[str, Any]) -> StreamFrame:
         """The frame with the correspondences of all its cameras.
+
+        Args:
+            header: metadata of all frames, which its own replaces key by key.
 
         Raises:
             CorrespondenceError: if a value is out of its range.
@@ -139,7 +154,7 @@ class FrameLine(BaseModel):
         ]
         if not any("point_index" in columns.given for columns in self.cameras.values()):
             tables = [replace(table, point_index=None) for table in tables]
-        table = concatenate([_empty_table(self.metadata), *tables])
+        table = concatenate([_empty_table({**header, **self.metadata}), *tables])
         return StreamFrame(self.frame, stamp_ns, with_place(table, self.place))
 
 
@@ -150,13 +165,18 @@ def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
         chunks: the bytes, cut anywhere.
         where: the name of their source in messages.
     """
+    header: dict[str, Any] = {}
     for number, line in enumerate(_lines(chunks), start=1):
         place = f"{where}, line {number}"
         if line is None:
             found = f"is longer than {MAX_LINE_BYTES} bytes"
             yield refused(place, f"{found}; send one frame a line, or fewer correspondences")
         elif line.strip():
-            yield _parse(line, place)
+            parsed = _parse(line, place, header)
+            if isinstance(parsed, dict):
+                header = parsed
+            else:
+                yield parsed
 
 
 def _lines(chunks: Iterable[bytes]) -> Iterator[bytes | None]:
@@ -178,9 +198,15 @@ def _lines(chunks: Iterable[bytes]) -> Iterator[bytes | None]:
         yield bytes(kept)
 
 
-def _parse(line: bytes, where: str) -> Item:
+def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[str, Any]:
+    """A frame, why it is none, or the metadata of a header."""
     try:
-        return FrameLine.model_validate(_json(line)).to_frame()
+        content = _json(line)
+        if isinstance(content, dict) and content.keys() == {"metadata"}:
+            metadata = HeaderLine.model_validate(content).metadata
+            MatcherFindings.from_metadata(metadata)
+            return metadata
+        return FrameLine.model_validate(content).to_frame(header)
     except ValidationError as error:
         found = re.sub(" or instance of [A-Za-z]+", "", describe(error))
         return refused(where, found.replace("valid dictionary", "JSON object"))

@@ -17,6 +17,7 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
     add_to_totals,
     count_absent,
@@ -131,6 +132,7 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
+        table = with_common_error(table, self._state.config)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         blocks = self._blocks_by_camera(new := without_repeats(self._state, table))

@@ -73,7 +73,7 @@ def restart_checks(evidence: Evidence) -> Checks:
     ends = _ends_from(solution, displaced)
     starts = f"{RESTART_DEG:g} deg, {RESTART_M * 100:g} cm off"
     name = f"solving again from starts {starts}: largest difference"
-    checks = {}
+    checks, tolerance = {}, solution.config.tolerance
     for camera in evidence.fitted_blocks:
         differences = [
             (180.0, np.inf) if end is None else pose_difference(end[camera], T_camera_lidar[camera])
@@ -81,8 +81,8 @@ def restart_checks(evidence: Evidence) -> Checks:
         ]
         degrees, centimetres = np.max(differences, axis=0)
         checks[camera] = [
-            threshold("restart_rotation").check(degrees, name=name),
-            threshold("restart_translation").check(centimetres, name=name),
+            threshold("restart_rotation", tolerance).check(degrees, name=name),
+            threshold("restart_translation", tolerance).check(centimetres, name=name),
         ]
     return checks
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
 from calibgraph.model.rig import Camera
+from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.conflicts import Conflict
 
 Array = NDArray[np.float64]
@@ -34,6 +35,8 @@ class Estimate:
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
         held: whether nothing determines it.
+        scatter_only: whether it is unknown how large the error is that all frames share.
+        tolerance: of the user: rotation [deg] and distance [cm].
     """
 
     camera: Camera
@@ -48,6 +51,8 @@ class Estimate:
     converged: bool
     terms: Terms
     held: bool = False
+    scatter_only: bool = False
+    tolerance: tuple[float, float] = TOLERANCE
 
     @property
     def sigmas(self) -> Array | None:

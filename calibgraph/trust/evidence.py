@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
+from calibgraph.model.error_sources import COMMON, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference, relative_transform
 from calibgraph.model.rig import Rig
@@ -22,6 +23,11 @@ from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
 from calibgraph.solver.error_model import ErrorFit, fit_alone, fit_errors
+from calibgraph.solver.error_shares import (
+    predict_variances,
+    sources_of_error,
+    variances_by_source,
+)
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
@@ -146,6 +152,36 @@ class Evidence:
         )
 
     @cached_property
+    def error_sources(self) -> dict[str, ErrorSources]:
+        """Per camera with an error bar, the shares of its sources."""
+        if self.joint_covariance is None:
+            return {}
+        total, held = np.diag(self.joint_covariance), self.solution.held
+        if self.errors is None:
+            parts = self._sandwich_parts
+            fixed = parts[COMMON] + parts[PAIRS]
+            forecast = {times: fixed + (total - fixed) / times for times in TIMES}
+        else:
+            parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
+        return {
+            name: sources_of_error(total, parts, forecast, number)
+            for number, name in enumerate(self.cameras)
+            if name not in held
+        }
+
+    @property
+    def _sandwich_parts(self) -> dict[str, Array]:
+        """Per source but the matches, (6 N,) variances, with the paper's presets."""
+        inliers, T_camera_lidar = self.solution.inliers, self.solution.T_camera_lidar
+        no_places = replace(self.findings, place_variance=0.0)
+        every, common = (
+            self.error_over_usual * np.diag(self._shared(inliers, self.curvature, findings))
+            for findings in (self.findings, no_places)
+        )
+        between = np.diag(error_between(T_camera_lidar, inliers.pairs))
+        return {COMMON: common, PLACES: every - common, PAIRS: between}
+
+    @cached_property
     def errors(self) -> ErrorFit | None:
         """The error model of the solution; None with the paper's presets.
 
@@ -187,7 +223,9 @@ class Evidence:
         held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
         return np.diag(np.tile(held, len(self.cameras)))
 
-    def _shared(self, inliers: Objective, curvature: Curvature) -> Array:
+    def _shared(
+        self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
+    ) -> Array:
         """(6 N, 6 N) covariance of a solution by the error that all frames share, if as usual."""
         places = self.solution.correspondences.places
         repeats = {
@@ -195,7 +233,7 @@ class Evidence:
             for name, block in inliers.blocks.items()
         }
         T_camera_lidar = {name: self.solution.T_camera_lidar[name] for name in inliers.cameras}
-        scatter = shared_scatter(self.findings, T_camera_lidar, curvature, repeats)
+        scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
         return curvature.sandwich(scatter)
 
     def scatter_of(self, camera: str) -> Array | None:
@@ -339,6 +377,8 @@ class Evidence:
             converged=solution.optimum.converged,
             terms=solution.terms,
             held=camera in solution.held,
+            scatter_only=not self.findings.states_common_error,
+            tolerance=solution.config.tolerance,
         )
 
 

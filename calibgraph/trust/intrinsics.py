@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.rig import Camera
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.augmented_fit import AugmentedFit, linearize_block
 from calibgraph.solver.camera_block import CameraBlock
@@ -45,14 +45,20 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     def of_camera(name: str) -> list[Check]:
         block = evidence.fitted_blocks[name]
         of_place = findings.place_variance * places.frames_per_place(block.frame_numbers)
-        return check_intrinsics(cameras[name], block, solution.scales[name], of_place)
+        scale, tolerance = solution.scales[name], solution.config.tolerance
+        return check_intrinsics(cameras[name], block, scale, of_place, tolerance=tolerance)
 
     names = [*evidence.fitted_blocks]
     return dict(zip(names, map_on_cores(of_camera, names), strict=True))
 
 
 def check_intrinsics(
-    camera: Camera, block: CameraBlock, scale: ResidualScale, of_place: float = 0.0
+    camera: Camera,
+    block: CameraBlock,
+    scale: ResidualScale,
+    of_place: float = 0.0,
+    *,
+    tolerance: tuple[float, float] = TOLERANCE,
 ) -> list[Check]:
     """The checks of one camera's intrinsics.
 
@@ -62,6 +68,7 @@ def check_intrinsics(
         scale: of their residuals.
         of_place: variance of what the frames of a place share, over that of all matches, if they
             were independent. It is taken for at least that of a small share of each match.
+        tolerance: of the user [deg, cm].
     """
     some = block.select_evenly(_MAX_MATCHES)
     errors_px, in_front = some.errors_px(camera.T_camera_lidar)
@@ -78,7 +85,7 @@ def check_intrinsics(
     ]
     inside = (errors_px <= scale.gate_px)[in_front].astype(np.float64)
     twists = rows.compensating_twists(_UNKNOWNS["focal length"], inside)
-    return [*checks, _check_sensitivity(twists[:, 0])]
+    return [*checks, _check_sensitivity(twists[:, 0], tolerance)]
 
 
 def fill_displacement_fields(camera: Camera, pixels_px: Array, fields: Array) -> None:
@@ -104,13 +111,14 @@ def _free(name: str, fit: AugmentedFit, camera: Camera) -> LensParameter:
     return LensParameter(name, fit.values, fit.sigmas, unit, fit.twist)
 
 
-def _check_sensitivity(twist: Array) -> Check:
+def _check_sensitivity(twist: Array, tolerance: tuple[float, float]) -> Check:
     """How far a focal length wrong by one percent, easily overlooked, moves the camera.
 
     Args:
         twist: (6,) by which its pose compensates for a unit relative change of the focal length.
+        tolerance: of the user [deg, cm].
     """
-    row = threshold("focal_sensitivity")
+    row = threshold("focal_sensitivity", tolerance)
     if np.isnan(twist).any():
         return row.describe(np.nan, "WARN", "matches within the gate do not determine the camera")
     return row.check(0.01 * 100 * float(np.linalg.norm(twist[3:])))

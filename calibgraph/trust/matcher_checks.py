@@ -8,7 +8,7 @@ import numpy as np
 
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.threshold import Threshold
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
@@ -22,11 +22,17 @@ def matcher_checks(evidence: Evidence) -> Checks:
     """
     findings = evidence.findings
     shared_sigmas = findings.systematic_sigmas if evidence.joint_covariance is None else None
-    return {name: check_findings(findings, name, shared_sigmas) for name in evidence.cameras}
+    tolerance = evidence.solution.config.tolerance
+    return {
+        name: check_findings(findings, name, shared_sigmas, tolerance) for name in evidence.cameras
+    }
 
 
 def check_findings(
-    findings: MatcherFindings, camera: str, shared_sigmas: tuple[float, float] | None = None
+    findings: MatcherFindings,
+    camera: str,
+    shared_sigmas: tuple[float, float] | None = None,
+    tolerance: tuple[float, float] = TOLERANCE,
 ) -> list[Check]:
     """The checks of one camera's matches.
 
@@ -35,13 +41,14 @@ def check_findings(
         camera: whose.
         shared_sigmas: rotation [rad], translation [m] of the error that all its frames share; None
             where the error bar holds it.
+        tolerance: of the user [deg, cm].
     """
     z_score = findings.z_score.get(camera)
     shared = None if shared_sigmas is None else np.repeat(shared_sigmas, 3)
     return [
         *_search_checks(findings, camera),
         *_share_checks(findings, camera),
-        *check_sigmas("error that the matcher's frames share", shared),
+        *check_sigmas("error that the matcher's frames share", shared, tolerance),
         *([] if z_score is None else [threshold("z_score").check(z_score)]),
     ]
 

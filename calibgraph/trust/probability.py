@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
-from calibgraph.model.verdict import Check, Doubt, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 Array = NDArray[np.float64]
@@ -66,10 +66,13 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
 
 
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
-    """The worst of (kind, severity) pairs per kind of check, without those of the lens."""
+    """The worst of (kind, severity) pairs per kind of check.
+
+    Without those of the lens, and without that of what is stated, which is no sign of an error.
+    """
     worst: dict[str, float] = {}
     for kind, severity in checks:
-        if kind not in LENS_KINDS:
+        if kind not in LENS_KINDS and kind != COMMON_ERROR:
             worst[kind] = max(severity, worst.get(kind, 0.0))
     return worst
 

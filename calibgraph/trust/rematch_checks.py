@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.thresholds import threshold
 
@@ -20,10 +20,11 @@ def last_round_checks(evidence: RunEvidence) -> Checks:
     rounds = evidence.run.rounds
     if len(rounds) == 1:
         return {}
+    tolerance = evidence.run.solution.config.tolerance
     return {
         name: [
-            threshold("last_round_rotation").check(moved["moved_deg"]),
-            threshold("last_round_translation").check(moved["moved_cm"]),
+            threshold("last_round_rotation", tolerance).check(moved["moved_deg"]),
+            threshold("last_round_translation", tolerance).check(moved["moved_cm"]),
         ]
         for name, moved in rounds[-1].items()
     }
@@ -57,11 +58,16 @@ def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[C
 
 def rematch_checks(evidence: RunEvidence) -> Checks:
     """Whether matching again from a displaced start ended at the same result."""
-    return compare_ends(evidence.run.rematch)
+    return compare_ends(evidence.run.rematch, evidence.run.solution.config.tolerance)
 
 
-def compare_ends(rematch: Rematch | None) -> Checks:
-    """Per camera, the difference between the two ends; nothing if there is only one."""
+def compare_ends(rematch: Rematch | None, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
+    """Per camera, the difference between the two ends; nothing if there is only one.
+
+    Args:
+        rematch: both ends.
+        tolerance: of the user [deg, cm].
+    """
     if rematch is None:
         return {}
     start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
@@ -73,8 +79,8 @@ def compare_ends(rematch: Rematch | None) -> Checks:
         degrees, centimetres = pose_difference(T, again[name])
         words = f"{start}: difference"
         checks[name] = [
-            threshold("rematch_rotation").check(degrees, name=words),
-            threshold("rematch_translation").check(centimetres, name=words),
+            threshold("rematch_rotation", tolerance).check(degrees, name=words),
+            threshold("rematch_translation", tolerance).check(centimetres, name=words),
         ]
     return checks
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import angle_deg, camera_center
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.trust.estimate import Estimate
@@ -56,17 +56,20 @@ def residual_checks(estimate: Estimate) -> list[Check]:
 def sigma_checks(estimate: Estimate) -> list[Check]:
     """The error bar, and its lower bound if every correspondence were independent."""
     return [
-        *check_sigmas("sigma", estimate.sigmas),
-        *check_sigmas("lower bound of sigma by the data alone", estimate.data_sigmas),
+        *check_sigmas("sigma", estimate.sigmas, estimate.tolerance),
+        *check_sigmas(
+            "lower bound of sigma by the data alone", estimate.data_sigmas, estimate.tolerance
+        ),
     ]
 
 
-def check_sigmas(what: str, sigmas: Array | None) -> list[Check]:
+def check_sigmas(what: str, sigmas: Array | None, tolerance: tuple[float, float]) -> list[Check]:
     """Standard deviations against their limits.
 
     Args:
         what: of what, in words.
         sigmas: (6,) rotation [rad], translation [m]; None if unknown.
+        tolerance: of the user [deg, cm].
     """
     if sigmas is None:
         return []
@@ -75,9 +78,22 @@ def check_sigmas(what: str, sigmas: Array | None) -> list[Check]:
         100 * float(sigmas[3:].max()),
     )
     return [
-        threshold("sigma_rotation").check(rotation_deg, name=f"{what}: rotation"),
-        threshold("sigma_translation").check(translation_cm, name=f"{what}: translation"),
+        threshold("sigma_rotation", tolerance).check(rotation_deg, name=f"{what}: rotation"),
+        threshold("sigma_translation", tolerance).check(
+            translation_cm, name=f"{what}: translation"
+        ),
     ]
+
+
+def common_error_checks(estimate: Estimate) -> list[Check]:
+    """That the error bar lacks the error that all frames share, if nobody has stated it."""
+    if not estimate.scatter_only or estimate.sigmas is None:
+        return []
+    text = (
+        "scatter only: the table states no error that its frames share, so that the true error may "
+        "be many times the error bar"
+    )
+    return [Check("common error", "WARN", text, kind=COMMON_ERROR)]
 
 
 def relative_pose_checks(estimate: Estimate) -> list[Check]:
@@ -102,8 +118,8 @@ def pull_checks(estimate: Estimate) -> list[Check]:
     """How far priors and relative poses pull the camera from its own solution."""
     degrees, centimetres = estimate.pull or (0.0, 0.0)
     return [
-        threshold("pull_rotation").check(degrees),
-        threshold("pull_translation").check(centimetres),
+        threshold("pull_rotation", estimate.tolerance).check(degrees),
+        threshold("pull_translation", estimate.tolerance).check(centimetres),
     ]
 
 
@@ -112,7 +128,8 @@ def halves_checks(estimate: Estimate) -> list[Check]:
     if estimate.terms in ("stage1", "priors"):
         text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
         return [Check("terms", "WARN", text)]
-    rotation, translation = threshold("halves_rotation"), threshold("halves_translation")
+    rotation = threshold("halves_rotation", estimate.tolerance)
+    translation = threshold("halves_translation", estimate.tolerance)
     if estimate.halves is None:
         text = "the frames cannot be split into halves to check against each other"
         return [Check(rotation.name, "WARN", text)]
@@ -140,6 +157,7 @@ def convergence_checks(estimate: Estimate) -> list[Check]:
 ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
     residual_checks,
     sigma_checks,
+    common_error_checks,
     relative_pose_checks,
     pull_checks,
     halves_checks,

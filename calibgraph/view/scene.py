@@ -130,4 +130,4 @@ def _by_distance(points: NDArray[np.floating]) -> Colours:
 def state_verdict(result: Calibration) -> str:
     """The verdict of a result in words, a line per reason."""
     verdict = result.verdict
-    return "\n".join([verdict.label, *verdict.reasons])
+    return "\n".join([verdict.status, *verdict.reasons])

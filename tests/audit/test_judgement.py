@@ -94,3 +94,13 @@ def test_the_smallest_detectable_change_is_significant_with_the_stated_power() -
 def test_a_tolerance_must_be_positive_and_finite(value: float) -> None:
     with pytest.raises(ValueError, match="tolerance_cm must be positive"):
         Tolerance(0.5, value)
+
+
+@pytest.mark.parametrize("times", [0.3, 0.9, 0.99, 1.01, 1.1, 3.0])
+def test_ok_never_stands_beside_a_detectable_change_above_the_tolerance(times: float) -> None:
+    """Not even where the deviation itself is zero."""
+    largest = TOLERANCE.twist / detectable(np.ones(6), KNOWN.confident)
+    status, reason = judge_axes(np.zeros(6), times * largest, KNOWN, TOLERANCE)
+    assert (status == "OK") == (times < 1)
+    if times > 1:  # the tolerance that is enough, or more frames
+        assert f"tolerate {times * 0.5:.2g} deg and {times * 10:.2g} cm, or record" in reason

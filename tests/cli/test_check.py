@@ -12,7 +12,7 @@ from calibgraph.audit import audit_summary
 from calibgraph.cli import remote
 from tests.audit.test_check import motion, with_camera_moved
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE, Call, CommandRun
 
 REFERENCE = SAMPLE / "reference.yaml"
 AXES = ("deviation_deg", "deviation_cm", "sigma_deg", "sigma_cm", "detectable_deg", "detectable_cm")
@@ -23,8 +23,8 @@ def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> No
     assert (code, err) == (0, "")
     content = json.loads(out)
     assert set(content) == {
-        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "cameras", "lidar",
-        "timings_s",
+        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording", "cameras",
+        "lidar", "timings_s",
     }  # fmt: skip
     assert content["status"] == "OK"
     assert content["wrong"] == []
@@ -46,7 +46,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
     code, out, err = call("check", deployed, SAMPLE)
     assert (code, out) == (1, "")
     lines = err.splitlines()
-    assert lines[0] == "WRONG"
+    assert lines[0] == "WRONG  check: is the deployed calibration still right?"
     assert any(line.startswith("  WRONG left: turned about y (yaw) by +") for line in lines)
     assert sum(line.startswith("  OK front_") for line in lines) == 2
     assert deployed.read_bytes() == before
@@ -56,8 +56,20 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
 def test_one_frame_exits_with_3(call: Call) -> None:
     code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0")
     assert code == 3
-    assert err.startswith("CANNOT TELL\n")
+    assert err.startswith("CANNOT TELL  check: is the deployed calibration still right?\n")
     assert "record" in err
+
+
+def test_the_recording_that_made_the_result_is_named_in_the_first_line(
+    call: Call, calibrated_sample: CommandRun
+) -> None:
+    code, _, err = call("check", calibrated_sample.folder, SAMPLE, "--frames", "0")
+    assert code == 3
+    assert (
+        "; this recording made it, and errors that it repeats are not seen" in err.splitlines()[0]
+    )
+    _, out, _ = call("check", calibrated_sample.folder, SAMPLE, "--frames", "0", "--json")
+    assert json.loads(out)["same_recording"] is True
 
 
 def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:

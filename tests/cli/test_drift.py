@@ -55,7 +55,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(call: Call, wee
 def test_a_wide_error_bar_exits_with_3(call: Call, week: Path) -> None:
     code, _, err = call("drift", week / "mon", week / "fog")
     assert code == 3
-    assert err.startswith("CANNOT TELL\n")
+    assert err.startswith("CANNOT TELL  drift: does one of the results deviate from the others?\n")
 
 
 def test_the_picture_is_drawn_and_replaces_only_its_own(

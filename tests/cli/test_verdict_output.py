@@ -44,8 +44,9 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     )  # fmt: skip
     code, _, text = call(*command)
     assert code == 0
-    for words in ("left->right", "left (bootstrap)", "weakest direction", "roll z"):
+    for words in ("left->right", "left (bootstrap)", "error bar of ", "scatter of the matches"):
         assert words in text
+    assert "more: see report.html or calibration.yaml" in text  # the weakest directions
     code, stdout, _ = call(*command, "--json")
     summary = yaml.safe_load(stdout)
     assert len(summary["pairs"]["left->right"]["translation_sigma_cm"]) == 3
@@ -66,16 +67,22 @@ def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(
     command = ("solve", tmp_path / "rig.yaml", tmp_path / "few.parquet", "--out", out)
     code, _, text = call(*command)
     assert code == 0
-    assert text.startswith("WARN: these data cannot tell\n")
-    assert "WARN ?" in text
+    lines = text.splitlines()
+    assert lines[0] == "WARN" or lines[0].startswith("WARN: off by more than 0.5 deg or 10 cm")
+    assert lines[1].startswith("  WARN  left, right: cannot tell: ")
+    assert "What to do:" in lines and "?" not in text and "CANNOT TELL" not in text
     summary = yaml.safe_load(call(*command, "--json")[1])
     assert summary["verdict"] == "WARN"
     assert summary["cannot_tell"] is True
     assert {camera["cannot_tell"] for camera in summary["cameras"].values()} == {True}
-    assert "<title>CANNOT TELL" in (out / "report.html").read_text()
+    assert summary["summary"]["reasons"][0]["text"].startswith("cannot tell: ")
+    assert summary["summary"]["actions"] and summary["cameras"]["left"]["actions"]
+    page = (out / "report.html").read_text()
+    assert "<title>WARN" in page and "cannot tell: " in page and "CANNOT TELL" not in page
     content = yaml.safe_load((out / "calibration.yaml").read_text())
     assert content["verdict"]["status"] == "WARN"
     assert content["verdict"]["cannot_tell"] is True
+    assert content["summary"] == summary["summary"]
     assert content["camera_verdicts"]["left"]["cannot_tell"] is True
 
 
@@ -89,3 +96,40 @@ def test_a_result_of_before_the_distinction_is_read_and_has_it(tmp_path: Path, p
     loaded = calibgraph.load_calibration(tmp_path)
     assert loaded.verdict.cannot_tell
     assert loaded.camera_verdicts["left"].cannot_tell
+
+
+def test_a_fail_shows_three_reasons_and_what_to_do_and_folds_the_rest(
+    call: Call, tmp_path: Path, pair: Rig
+) -> None:
+    pair.save(tmp_path / "rig.yaml")
+    nonsense = simulate_correspondences(pair, errors=MatcherErrors(outlier_share=1.0))
+    nonsense.save(tmp_path / "bad.parquet")
+    code, _, text = call(
+        "solve", tmp_path / "rig.yaml", tmp_path / "bad.parquet", "--out", tmp_path / "out"
+    )
+    assert code == 1
+    before = text[: text.index("Calibration")].splitlines()
+    assert before[0].startswith("FAIL: off by more than 0.5 deg or 10 cm with a probability")
+    at = before.index("What to do:")
+    assert 1 <= len(before[1:at]) <= 3 and all(line.startswith("  FAIL  ") for line in before[1:at])
+    folded = next(n for n, line in enumerate(before) if " more: see report.html" in line)
+    assert 1 <= len([line for line in before[at + 1 : folded] if line.startswith("  ")]) <= 3
+
+
+def test_the_common_error_of_a_table_without_one_is_an_option(
+    call: Call, tmp_path: Path, pair: Rig
+) -> None:
+    pair.save(tmp_path / "rig.yaml")
+    simulate_correspondences(pair, frames=8, matches=100).save(tmp_path / "table.csv")
+    command = ("solve", tmp_path / "rig.yaml", tmp_path / "table.csv", "--out", tmp_path / "out")
+    assert "cannot tell: scatter only: " in call(*command)[2]
+    code, _, text = call(*command, "--common-deg", 0.05, "--common-cm", 1)
+    assert code == 0 and text.startswith("PASS\n")
+    assert "common error of the matcher" in text
+
+
+def test_the_sources_of_an_error_bar_are_kept_in_the_file(tmp_path: Path, pair: Rig) -> None:
+    result = calibgraph.solve(pair, simulate_correspondences(pair, frames=8, matches=100))
+    result.save(tmp_path)
+    assert calibgraph.load_calibration(tmp_path).error_sources == result.error_sources
+    assert result.error_sources.keys() == set(pair.cameras)

@@ -56,8 +56,8 @@ def test_a_failure_is_marked_prominently(pair: Rig, tmp_path: Path) -> None:
     assert title_of(text).startswith("FAIL - do not use")
     assert "No. Do not use this result" in text
     assert 'class="verdict FAIL"' in text
-    for reason in result.camera_verdicts["left"].reasons:
-        assert reason.split(":")[0] in text
+    for reason in result.summary.reasons:
+        assert reason.text.split(":")[0] in text
 
 
 def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_path: Path) -> None:

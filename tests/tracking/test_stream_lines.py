@@ -44,6 +44,21 @@ def test_a_json_line_is_a_frame() -> None:
     assert right_rows.confidence.tolist() == [1]
 
 
+def test_a_line_of_metadata_alone_holds_for_the_frames_after_it() -> None:
+    header = {"metadata": {"systematic_rotation_rad": 0.001, "matcher": "mine"}}
+    lines = [line(1), json.dumps(header).encode(), line(2), line(3, metadata={"matcher": "other"})]
+    first, second, third = of_bytes(b"\n".join(each.strip() for each in lines))
+    assert [type(item) for item in (first, second, third)] == [StreamFrame] * 3
+    assert not first.table.findings.states_common_error
+    assert second.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "mine"}
+    assert third.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "other"}
+
+
+@pytest.mark.parametrize("wrong", [3, {"systematic_rotation_rad": "much"}])
+def test_a_wrong_header_is_refused_at_its_line(wrong: object) -> None:
+    assert "metadata" in refusal(json.dumps({"metadata": wrong}).encode())
+
+
 @pytest.mark.parametrize("cameras", [{}, {"left": camera(0)}])
 def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     (item,) = of_bytes(line(9, cameras=cameras, stamp_ns=5, metadata={"k": 1}))

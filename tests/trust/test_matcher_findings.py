@@ -9,6 +9,8 @@ import pytest
 import calibgraph
 from calibgraph import Correspondences, Rig
 
+STATED = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
+
 
 @pytest.fixture
 def table(pair: Rig) -> Correspondences:
@@ -33,7 +35,7 @@ def table(pair: Rig) -> Correspondences:
 def test_findings_decide_the_verdict_of_their_camera(
     pair: Rig, table: Correspondences, findings: dict[str, float], status: str
 ) -> None:
-    metadata = {key: {"left": value} for key, value in findings.items()}
+    metadata = STATED | {key: {"left": value} for key, value in findings.items()}
     verdicts = calibgraph.solve(pair, replace(table, metadata=metadata)).camera_verdicts
     assert verdicts["left"].status == status
     found = [check for check in verdicts["left"].checks if check.status != "PASS"]

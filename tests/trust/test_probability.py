@@ -115,8 +115,8 @@ def test_a_check_beyond_its_limit_is_a_warning_and_no_more_where_the_probability
 def test_a_wide_error_bar_is_no_fail_but_named() -> None:
     verdict = Verdict((), Doubt(0.01, 0.6))
     assert verdict.status == "WARN"
-    assert "the data cannot tell" in verdict.reasons[0]
-    assert "the data cannot tell" not in Verdict((), Doubt(0.6, 0.01)).reasons[0]
+    assert "cannot tell, by the error bar" in verdict.reasons[0]
+    assert "cannot tell" not in Verdict((), Doubt(0.6, 0.01)).reasons[0]
 
 
 def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:

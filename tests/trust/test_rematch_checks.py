@@ -10,6 +10,7 @@ import pytest
 
 import calibgraph
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
+from calibgraph.model.config import Config
 from calibgraph.rounds import match_in_rounds
 from calibgraph.trust.evidence import RunEvidence
 from calibgraph.trust.rematch_checks import compare_ends, last_round_checks
@@ -112,7 +113,8 @@ def test_the_last_round_is_checked_only_if_there_are_others() -> None:
     moving = {"front": {"matches": 9, "moved_deg": 0.5, "moved_cm": 5.0}}
 
     def statuses(*rounds: object) -> list[str]:
-        evidence = RunEvidence(SimpleNamespace(rounds=rounds), {})
+        solution = SimpleNamespace(config=Config())
+        evidence = RunEvidence(SimpleNamespace(rounds=rounds, solution=solution), {})
         return [check.status for check in last_round_checks(evidence).get("front", ())]
 
     assert statuses(moving) == []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -86,29 +86,36 @@ def export_calibration(
         ValueError: if an argument is wrong.
     """
     _require_known(format, with_base=T_base_lidar is not None)
+    found = _loaded(source) if isinstance(source, (str, Path)) else source
     prepared = prepare_export(
-        _loaded(source) if isinstance(source, (str, Path)) else source,
+        found,
         cameras=cameras,
         lidar_frame=lidar_frame,
         camera_frame=camera_frame,
         T_base_lidar=None if T_base_lidar is None else rigid_transform(T_base_lidar),
     )
-    if not even_if_failed:
-        _require_not_failed(prepared)
+    if isinstance(found, Calibration) and not even_if_failed:
+        _require_not_failed(found, [*prepared.cameras])
     return _write(prepared, Path(path), format)
 
 
-def _require_not_failed(export: RigExport) -> None:
-    """Check the verdict.
+def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
+    """Check the verdicts of the cameras that are to be written.
 
     Raises:
-        CalibrationError: if it is FAIL.
+        CalibrationError: if one is FAIL.
     """
-    if export.verdict == "FAIL":
-        raise CalibrationError(
-            f"the verdict of {', '.join(export.cameras)} is FAIL, nothing was written; see the "
-            "result's report, or export it all the same with --even-if-failed"
-        )
+    failed = [name for name in cameras if result.camera_verdicts[name].status == "FAIL"]
+    if not failed:
+        return
+    good = [name for name in cameras if name not in failed]
+    others = (
+        f"export the others with {' '.join(f'--camera {name}' for name in good)}, " if good else ""
+    )
+    raise CalibrationError(
+        f"the verdict of {', '.join(failed)} is FAIL, nothing was written; see the result's "
+        f"report, {others}or export all the same with --even-if-failed"
+    )
 
 
 def _require_known(format: str, *, with_base: bool) -> None:

@@ -1,0 +1,147 @@
+"""What may be behind each kind of check, and what to do: one table, for every place that shows it.
+
+A check without an action of its own takes that of its cause. Causes stand in the order in which
+they explain each other: a wrong guess makes matches wrong, and not the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What several checks may notice.
+
+    Attributes:
+        title: in words.
+        action: what to do about it, a sentence.
+        kinds: of the checks that notice it, each with an action of its own or an empty one.
+    """
+
+    title: str
+    action: str
+    kinds: Mapping[str, str] = field(default_factory=dict)
+
+
+_SWAPPED = "Check whether the images of two cameras, or their extrinsics in the rig, are swapped."
+_FROM_RESULT = "Calibrate again with this result as the guess: the matcher then searches around it."
+_STRUCTURE = "Record where image and cloud both have structure: edges, poles, facades at 5 to 40 m."
+_FRAMES = "Look at the frames that disagree: leave out those in which a sensor moved or lagged."
+_SPREAD = "Give more matches, spread over the image and over distances."
+_LEARNED = "Use the matcher structure, or train the network on recordings of this kind."
+
+# fmt: off
+CAUSES: dict[str, Cause] = {
+    "guess": Cause(
+        "the guess, or its convention",
+        "Correct the guess: T_camera_lidar maps LiDAR points to x right, y down, z ahead, in "
+        "metres.",
+        {
+            "convention of the guess": "Undo the named error in the guess's T_camera_lidar, and "
+            "calibrate again.",
+            "guess_rotation": "", "guess_translation": "",
+            "guess_length": "Give the translation of T_camera_lidar in metres.",
+            "swapped_cameras": _SWAPPED,
+            "point_distance": "Give the clouds in metres.",
+            "search": "Correct the guess, or widen --search-deg and --search-m; look at the images "
+            "and clouds of this camera with doctor.",
+            "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
+        },
+    ),
+    "time": Cause(
+        "images and clouds of different times",
+        "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
+        {"own_clouds": "", "time_offset": "", "clouds of another time": "", "repeated frames": ""},
+    ),
+    "lens": Cause(
+        "the intrinsics",
+        "Correct the intrinsics: focal lengths, distortion, its model and the image size must "
+        "belong to these images.",
+        {
+            "lens": "",
+            **{f"lens_{name}": "" for name in (
+                "focal_length", "distortion", "principal_point", "aspect_ratio", "skew")},
+            **{name: "" for name in (
+                "focal_length", "distortion", "principal_point", "aspect_ratio", "skew")},
+            "focal_sensitivity": "Verify the focal length: here the position depends on it.",
+        },
+    ),
+    "cameras": Cause(
+        "cameras that contradict each other",
+        "Check the intrinsics and guesses of both cameras, and that their images are of one "
+        "instant and not swapped.",
+        {"pair_agreement": ""},
+    ),
+    "priors": Cause(
+        "priors and relative poses",
+        "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
+        {"relative_pose": "", "pull_rotation": "", "pull_translation": "",
+         "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
+    ),
+    "agreement": Cause(
+        "image and cloud that agree too little", _STRUCTURE,
+        {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
+         "displaced_z_score": "", "frames_best": "", "rematch_rotation": "",
+         "rematch_translation": "", "matching again": "", "last_round_rotation": _FROM_RESULT,
+         "last_round_translation": _FROM_RESULT,
+         "score_gain": "Check the intrinsics and the time stamps: with either wrong, a pose nearby "
+         "fits better."},
+    ),
+    "matches": Cause(
+        "wrong correspondences",
+        "Look at the residuals of the matches in the report: too many are wrong.",
+        {"residual_spread": "", "inlier_share": "", "competing_solution": "", "held_out": "",
+         "failed_frames": "", "restart_rotation": _SPREAD, "restart_translation": _SPREAD,
+         "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
+         "start_dependence": _LEARNED, "recall": _LEARNED},
+    ),
+    "frames": Cause(
+        "frames or places that contradict each other", _FRAMES,
+        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
+         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+         "disagreeing_frames": "Check whether the camera was moved.",
+         "drift": "Check whether the camera's mount is loose."},
+    ),
+    "solver": Cause(
+        "a solve that did not end",
+        _SPREAD,
+        {"convergence": "", "terms": "Solve with the terms full: they have an error bar.",
+         "time limit": "Raise --time-limit-s, or take fewer --frames."},
+    ),
+    "data": Cause(
+        "too little data",
+        "Record more frames.",
+        {"correspondences": "Check that this camera's images are sharp and show what the LiDAR "
+         "measures.",
+         "correspondences_used": "Give at least 50 matches.",
+         "frames": "Record at least 5 frames, 10 s apart.",
+         "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
+         "repeated_frames": "Take frames while the vehicle drives.",
+         "image evidence": _STRUCTURE,
+         "common_error": "State the error that all frames share, --common-deg and --common-cm (0 "
+         "if none), or systematic_rotation_rad and systematic_translation_m in the metadata.",
+         "start": "Keep driving: the camera starts after enough frames with matches.",
+         "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
+    ),
+    "error bar": Cause(
+        "an error bar that is wide beside the tolerance", "",
+        {"sigma_rotation": "", "sigma_translation": ""},
+    ),
+    "other": Cause("a check of another version", ""),
+}
+# fmt: on
+
+_CAUSE_OF = {kind: key for key, cause in CAUSES.items() for kind in cause.kinds}
+
+
+def cause_of(kind: str) -> str:
+    """The key of the cause that a kind of check notices; "other" for one of another version."""
+    return _CAUSE_OF.get(kind, "other")
+
+
+def action_of(kind: str) -> str:
+    """What to do if a check of this kind is not PASS; empty where it depends on the data."""
+    cause = CAUSES[cause_of(kind)]
+    return cause.kinds.get(kind) or cause.action

@@ -1,0 +1,100 @@
+"""What an error bar consists of: the share of each source in its variance, and what shrinks it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from calibgraph.model.threshold import in_unit
+
+MATCHES = "scatter of the matches"
+PLACES = "errors that a place shares"
+COMMON = "common error of the matcher"
+ELEVATION = "LiDAR's elevation offset"
+STRETCH = "LiDAR's elevation scale"
+MOTION = "LiDAR's motion during a scan"
+PAIRS = "images of camera pairs"
+PRIORS = "priors and relative poses"
+
+NEEDED = 0.3
+"""Error bar over tolerance at which 99.5 % of the errors are within: what a PASS needs."""
+
+TIMES = (2, 3, 5, 10, 20, 1000)
+"""As many frames, at as many times more places: for these the error bar is predicted."""
+
+MOST_TIMES = TIMES[-1]
+"""Stands for any number of frames, and is no advice."""
+
+_MENTIONED = 0.05  # share of a source: smaller ones are left out of the sentence
+
+
+@dataclass(frozen=True)
+class ErrorSources:
+    """The sources of one camera's error bar, about its worst axis and along its worst axis.
+
+    Attributes:
+        rotation_deg: standard deviation about the axis where it is largest.
+        translation_cm: the same along an axis.
+        rotation: share of each source in the variance; they add up to 1.
+        translation: likewise.
+        forecast: the error bar [deg, cm] of so many times more frames and places.
+    """
+
+    rotation_deg: float
+    translation_cm: float
+    rotation: Mapping[str, float] = field(default_factory=dict)
+    translation: Mapping[str, float] = field(default_factory=dict)
+    forecast: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+
+    def over_tolerance(self, tolerance: tuple[float, float]) -> float:
+        """The error bar over the tolerance [deg, cm], the larger of rotation and translation."""
+        return max(self.rotation_deg / tolerance[0], self.translation_cm / tolerance[1])
+
+    def describe(self, tolerance: tuple[float, float]) -> str:
+        """The error bar that is larger beside the tolerance [deg, cm], and its sources."""
+        bar = self._larger(tolerance)
+        ordered = sorted(bar.shares.items(), key=lambda item: -item[1])
+        parts = [f"{share:.0%} {name}" for name, share in ordered if share >= _MENTIONED]
+        return f"{in_unit(bar.sigma, bar.unit)}: {', '.join(parts)}"
+
+    def action(self, tolerance: tuple[float, float]) -> str:
+        """What would shrink the error bar enough for a PASS, in one sentence; empty if it is.
+
+        Args:
+            tolerance: rotation [deg] and distance [cm].
+        """
+        bar = self._larger(tolerance)
+        if bar.sigma <= NEEDED * bar.tolerance:
+            return ""
+        enough = (times for times, both in self.forecast.items() if _is_enough(both, tolerance))
+        times = next(enough, MOST_TIMES)
+        if times < MOST_TIMES:
+            places = ", at more places" if bar.shares.get(PLACES, 0.0) > _MENTIONED else ""
+            return f"Record {times} times as many frames{places}."
+        return self._limited(bar)
+
+    def _limited(self, bar: _Bar) -> str:
+        best = self.forecast.get(MOST_TIMES, (self.rotation_deg, self.translation_cm))
+        least = in_unit(best[0] if bar.unit == "deg" else best[1], bar.unit, 2)
+        return (
+            "Tolerate more (--tolerance-deg, --tolerance-cm), or give measured relative_poses or "
+            f"priors: {least} of common error remain with any number of frames."
+        )
+
+    def _larger(self, tolerance: tuple[float, float]) -> _Bar:
+        """That of rotation or translation, by which is larger beside its tolerance."""
+        rotation = _Bar(self.rotation_deg, "deg", self.rotation, tolerance[0])
+        translation = _Bar(self.translation_cm, "cm", self.translation, tolerance[1])
+        return max(rotation, translation, key=lambda bar: bar.sigma / bar.tolerance)
+
+
+class _Bar(NamedTuple):
+    sigma: float
+    unit: str
+    shares: Mapping[str, float]
+    tolerance: float
+
+
+def _is_enough(error_bar: tuple[float, float], tolerance: tuple[float, float]) -> bool:
+    return all(one <= NEEDED * most for one, most in zip(error_bar, tolerance, strict=True))

@@ -1,0 +1,31 @@
+"""A check with the recording that made the calibration is named as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibgraph import load_dataset, load_rig
+from calibgraph.audit.provenance import is_made_from
+from tests.conftest import SAMPLE, CommandRun
+
+
+def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    result, rig = calibrated_sample.folder, load_rig(SAMPLE / "rig.yaml")
+    assert is_made_from(result, load_dataset(SAMPLE, rig))
+    other = tmp_path / "other"
+    for source in SAMPLE.rglob("*"):
+        if source.is_file():
+            copy = other / source.relative_to(SAMPLE)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(source.read_bytes())
+    assert is_made_from(result / "calibration.yaml", load_dataset(other, rig))
+    for cloud in load_dataset(other, rig).frames:  # the same names, other clouds
+        cloud.cloud_path.write_bytes(cloud.cloud_path.read_bytes()[:-32])
+    assert not is_made_from(result, load_dataset(other, rig))
+
+
+def test_a_rig_names_no_recording() -> None:
+    rig = load_rig(SAMPLE / "rig.yaml")
+    assert not is_made_from(SAMPLE / "rig.yaml", load_dataset(SAMPLE, rig))

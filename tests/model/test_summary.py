@@ -1,0 +1,139 @@
+"""A verdict in few words: reasons by cause, what to do, the rest folded."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import calibgraph
+from calibgraph.model.causes import CAUSES, cause_of
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, ErrorSources
+from calibgraph.model.summary import MOST, summarize
+from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
+from calibgraph.trust.lens_parameter import LENS_KINDS
+from calibgraph.trust.thresholds import THRESHOLDS, threshold
+
+FAILED = Check("convergence", "FAIL", "the optimizer did not converge")
+
+
+def of_kinds(*kinds: str) -> Verdict:
+    """One WARN of each kind."""
+    return Verdict(tuple(Check(kind, "WARN", f"{kind} is odd", kind=kind) for kind in kinds))
+
+
+def test_a_pass_has_no_reasons_and_nothing_to_do() -> None:
+    summary = summarize({"left": Verdict((threshold("frames").check(9),), Doubt(0.001))})
+    assert summary.status == "PASS"
+    assert (summary.doubt, summary.reasons, summary.actions, summary.others) == ("", (), (), ())
+
+
+def test_a_check_that_fails_and_warns_is_one_reason_the_worst_camera_first() -> None:
+    verdicts = {"left": of_z_score(14.0), "right": of_z_score(5.0)}
+    (reason,) = summarize(verdicts).reasons
+    assert (reason.status, reason.cameras) == ("FAIL", ("right", "left"))
+    assert reason.text.startswith(
+        "z-score of image and cloud: right 5 (FAIL: limit 8); left 14 (WARN: limit 15): "
+    )
+
+
+def of_z_score(value: float) -> Verdict:
+    """One check."""
+    return Verdict((threshold("z_score").check(value),))
+
+
+def test_sentences_that_differ_in_a_number_are_one_reason() -> None:
+    def missed(value: float) -> Verdict:
+        return Verdict((Check("search", "FAIL", f"not found (best {value}): give 6 more", value),))
+
+    (reason,) = summarize({"left": missed(3.1), "right": missed(2.9)}).reasons
+    assert (reason.cameras, reason.text) == (
+        ("left", "right"), "not found (best 3.1, 2.9): give 6 more"
+    )  # fmt: skip
+
+
+def test_checks_of_one_cause_are_one_reason_of_all_their_cameras() -> None:
+    summary = summarize({"left": of_kinds("own_clouds"), "right": of_kinds("time_offset")})
+    (reason,) = summary.reasons
+    assert (reason.cause, reason.cameras) == ("time", ("left", "right"))
+    assert [other.text for other in summary.others] == ["time_offset is odd"]
+    assert summary.actions == (CAUSES["time"].action,)
+
+
+def test_of_many_causes_the_worst_three_are_shown_and_the_others_folded() -> None:
+    verdict = of_kinds("residual_spread", "frames", "lens", "own_clouds", "guess_rotation")
+    summary = summarize({"left": Verdict((*verdict.checks, FAILED))}, {"left": ("loose height",)})
+    assert [reason.cause for reason in summary.reasons] == ["solver", "guess", "time"]
+    assert len(summary.actions) == MOST
+    assert [o.cause for o in summary.others] == ["lens", "matches", "data", ""]
+    assert summary.others[-1].text == "loose height"
+
+
+def test_an_action_is_stated_once() -> None:
+    summary = summarize({"left": of_kinds("start_dependence"), "right": of_kinds("recall")})
+    assert len(summary.actions) == 1
+
+
+def test_cannot_tell_is_a_reason_and_no_status() -> None:
+    summary = summarize({"left": Verdict((), Doubt(0.001, 0.3))})
+    assert (summary.status, summary.cannot_tell) == ("WARN", True)
+    (reason,) = summary.reasons
+    assert reason.text.startswith("cannot tell: ") and "0.5 deg or 10 cm" in reason.text
+    assert summary.doubt == "off by more than 0.5 deg or 10 cm with a probability: left 30%"
+
+
+def test_every_kind_of_check_has_a_cause() -> None:
+    named = {kind for kind in (*LENS_KINDS, COMMON_ERROR, *(row.key for row in THRESHOLDS))}
+    for path in Path(calibgraph.__file__).parent.rglob("*.py"):
+        calls = (node for node in ast.walk(ast.parse(path.read_text())))
+        named |= {kind for call in calls if (kind := literal_name(call)) is not None}
+    assert len(named) > len(THRESHOLDS) + len(LENS_KINDS)  # checks without a row were found
+    assert {kind for kind in named if cause_of(kind) == "other"} == set()
+
+
+def literal_name(node: ast.AST) -> str | None:
+    """The name in a call of Check with a literal one; it is its kind, too."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Check":
+        if any(keyword.arg == "kind" for keyword in node.keywords):
+            return None
+        first = node.args[0] if node.args else None
+        return first.value if isinstance(first, ast.Constant) else None
+    return None
+
+
+WIDE = ErrorSources(
+    rotation_deg=0.3,
+    translation_cm=2.0,
+    rotation={COMMON: 0.9, MATCHES: 0.1},
+    translation={COMMON: 0.9, MATCHES: 0.1},
+    forecast={2: (0.29, 1.9), MOST_TIMES: (0.285, 1.8)},
+)
+
+
+def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
+    unsure = {"left": Verdict((threshold("sigma_rotation").check(0.3),), Doubt(0.001, 0.1))}
+    summary = summarize(unsure, sources={"left": WIDE})
+    assert summary.error_bar == f"error bar of left 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
+    (action,) = summary.actions
+    assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
+    few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
+    assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
+
+
+def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
+    checks = (threshold("residual_spread").check(9.0), threshold("sigma_rotation").check(9.0))
+    summary = summarize({"left": Verdict(checks, Doubt(0.9))}, sources={"left": WIDE})
+    assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
+    assert summary.actions == (CAUSES["matches"].action,)
+    assert summary.error_bar == ""
+
+
+def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> None:
+    checks = (threshold("residual_spread").check(0.24), threshold("time_offset").check(0.01))
+    summary = summarize({"left": Verdict(checks, Doubt(0.02))})
+    (reason,) = summary.reasons
+    assert (reason.status, reason.cause) == ("WARN", "matches")
+    assert reason.text == (
+        "no check is beyond its limit; nearest to it is residual spread 0.24 deg"
+    )
+    assert summary.actions == (CAUSES["matches"].action,)

@@ -1,0 +1,107 @@
+"""The shares of an error bar's sources, and the error bar that more frames would have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.model.config import Config, preset
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, PLACES
+from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.error_shares import variances_by_source
+from calibgraph.solver.hierarchy_poses import shared_edges
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.evidence import Evidence
+
+SHARED_RAD, SHARED_M = np.radians(0.09), 0.02
+STATED: dict[str, Any] = {
+    "systematic_rotation_rad": float(SHARED_RAD),
+    "systematic_translation_m": SHARED_M,
+    "camera_share": 0.4,
+}
+OF_A_SENSOR = STATED | {
+    "systematic_rotation_rad": float(np.radians(0.15)),
+    "elevation_rad": float(np.radians(0.12)),
+    "place_variance": 6.0,
+    "place_rotation_rad": 3e-4,
+    "place_translation_m": 0.006,
+}
+A_PLACE = 3  # frames
+
+
+def table(rig: Rig, places: int, stated: dict[str, Any]) -> Correspondences:
+    """Matches of a pixel of noise, of several places."""
+    frames = A_PLACE * places
+    found = simulate_correspondences(rig, frames=frames, errors=MatcherErrors(), seed=3)
+    lists = np.arange(frames).reshape(places, -1).tolist()
+    return replace(found, metadata={**stated, "places": lists})
+
+
+def evidence(rig: Rig, found: Correspondences, config: Config | None = None) -> Evidence:
+    return Evidence(solve_joint(rig, found, config or Config()), rig)
+
+
+@pytest.mark.parametrize("config", [Config(), preset("kitti")])
+def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config: Config) -> None:
+    found = evidence(pair, table(pair, 2, STATED), config).error_sources["left"]
+    assert sum(found.rotation.values()) == pytest.approx(1.0)
+    # The cloud turns about the LiDAR, as far as the camera.
+    expected = (np.degrees(SHARED_RAD) / found.rotation_deg) ** 2
+    assert found.rotation[COMMON] == pytest.approx(expected, rel=0.01)
+    assert found.rotation[COMMON] > 0.5 > found.rotation[MATCHES] > 0
+
+
+def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
+    """The part that is left to the matches is the one that their own equations give."""
+    errors = evidence(pair, table(pair, 3, OF_A_SENSOR)).errors
+    assert errors is not None
+    parts = variances_by_source(errors)
+    matches = np.diag(errors.fit.covariance) - sum(parts.values())
+    assert matches == pytest.approx(of_matches(errors), rel=1e-6)
+
+
+def of_matches(errors: ErrorFit) -> np.ndarray:
+    """(6 N,) variances by the data, by the scatter within places, and by what shows bends."""
+    model, fit, parts = errors.model, errors.fit, errors.model.components
+    free, data = len(fit.shared_covariance), fit.equations.data
+    moved = fit.shared_covariance[: 6 * len(model.cameras)]
+    no_scatter = replace(parts, scatter_at_place=0 * parts.at_place)
+    with_scatter = replace(errors, model=replace(model, components=no_scatter))
+    variances = variances_by_source(with_scatter)[PLACES] - variances_by_source(errors)[PLACES]
+    for place, hessian in enumerate(fit.equations.data.placed.transpose(0, 1, 3, 2, 4)):
+        own = -moved @ fit.place_slope[place].T
+        size = own.shape[1]
+        variances += np.einsum("ij,jk,ik->i", own, hessian.reshape(size, size), own)
+    assert not data.across.any() and not data.shared.any()  # no pairs of cameras
+    edges = shared_edges(model, fit.poses)
+    by_edge = moved @ edges.jacobian[:, :free].T @ edges.information
+    by_bend = by_edge[:, 6:] @ parts.all_bends @ parts.bend_covariance
+    shown = np.einsum("pn,pnij->ij", parts.bend_weight, parts.bend_information)
+    return np.asarray(variances + np.einsum("ij,jk,ik->i", by_bend, shown, by_bend))
+
+
+def test_the_error_bar_of_more_frames_is_as_predicted(pair: Rig) -> None:
+    few = evidence(pair, table(pair, 5, OF_A_SENSOR)).error_sources
+    many = evidence(pair, table(pair, 25, OF_A_SENSOR)).error_sources
+    for name, before in few.items():
+        after = many[name].rotation_deg, many[name].translation_cm
+        assert before.rotation_deg > after[0] and before.translation_cm > after[1]
+        # Scatter of 15 frames, so of 12 degrees of freedom: sigmas to 20 %, of a part.
+        assert before.forecast[5] == pytest.approx(after, rel=0.2)
+
+
+def test_recording_is_advised_only_where_it_shrinks_the_error_bar_enough(pair: Rig) -> None:
+    found = evidence(pair, table(pair, 2, OF_A_SENSOR)).error_sources["left"]
+    assert found.describe((0.5, 10.0)).startswith(f"{found.rotation_deg:.3g} deg: ")
+    assert f"{found.rotation[COMMON]:.0%} {COMMON}" in found.describe((0.5, 10.0))
+    best_deg = found.forecast[MOST_TIMES][0]
+    wide = found.rotation_deg / 0.3
+    assert found.action((1.01 * wide, 100.0)) == ""
+    assert found.action((0.97 * wide, 100.0)).startswith("Record 2 times as many frames")
+    limited = found.action((0.9 * best_deg / 0.3, 100.0))
+    assert "Record" not in limited and limited.startswith("Tolerate more")
+    assert f"{best_deg:.2g} deg" in limited
