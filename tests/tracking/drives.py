@@ -59,7 +59,8 @@ def content_of(table: Correspondences) -> dict[str, Any]:
         columns = (*own.pixels_px.T, *own.points_lidar_m.T, own.confidence.astype(float))
         keys = ("u_px", "v_px", "x_m", "y_m", "z_m", "confidence")
         cameras[name] = {k: c.tolist() for k, c in zip(keys, columns, strict=True)}
-    return {"frame": int(table.frame[0]), "cameras": cameras}
+    metadata = table.findings.to_metadata()
+    return {"frame": int(table.frame[0]), "cameras": cameras, "metadata": metadata}
 
 
 def as_lines(tables: Sequence[Correspondences]) -> bytes:

@@ -76,6 +76,9 @@ def test_every_source_gives_the_same_lines(
         elif kind == "csv":
             source = source.with_suffix(".csv")
             whole.save(source)
+            config = tmp_path / "config.yaml"  # since a CSV file states nothing
+            config.write_text("common_deg: 0\ncommon_cm: 0\n")
+            out = (*out, "--config", config)
         else:
             source = source.with_suffix(".parquet")
             rows = np.lexsort((whole.frame, whole.camera_index))
