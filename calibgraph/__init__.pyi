@@ -23,10 +23,10 @@ from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
-from .fleet.sharded.solve import solve_sharded as solve_sharded
 from .guessing.guess import CameraGuess as CameraGuess
 from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
+from .guessing.template import write_rig_template as write_rig_template
 from .io.arrays import dataset_from_arrays as dataset_from_arrays
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag

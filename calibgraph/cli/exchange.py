@@ -141,12 +141,15 @@ def import_(
     lidar_frame: LidarFrameOption = None,
     camera_frame: CameraFrameOption = None,
     size: SizeOption = None,
-    relative_sigma_deg: Annotated[
-        float, typer.Option(min=0.001, help="Of relative poses (T_cn_cnm1): 1 sigma per axis.")
+    tie_deg: Annotated[
+        float,
+        typer.Option(
+            min=0.001, metavar="DEG", help="Sigma per axis of relative poses (Kalibr's T_cn_cnm1)."
+        ),
     ] = 0.1,
-    relative_sigma_cm: Annotated[
-        float, typer.Option(min=0.001, help="Likewise, of their translation.")
-    ] = 0.5,
+    tie_m: Annotated[
+        float, typer.Option(min=1e-5, metavar="M", help="The sigma in translation, per axis.")
+    ] = 0.005,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
     from calibgraph.io.formats.rig_import import import_rig
@@ -162,8 +165,8 @@ def import_(
             lidar_frame=lidar_frame,
             camera_frames=parse_names("--camera-frame", camera_frame),
             size_px=None if size is None else parse_size(size),
-            relative_sigma_deg=relative_sigma_deg,
-            relative_sigma_cm=relative_sigma_cm,
+            relative_sigma_deg=tie_deg,
+            relative_sigma_cm=100.0 * tie_m,
         )
     rig.save(out, first_line=yaml_mark("import"))
     for sentence in describe_rig(rig):

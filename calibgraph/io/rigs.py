@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from calibgraph.errors import FileError
@@ -15,6 +16,8 @@ from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Rig
 
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
+FILL_IN = "FILL_IN"
+"""Stands for a value that the user of ``calibgraph init`` writes."""
 
 
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
@@ -43,7 +46,32 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
         return rig_of_calibration(content, path)
     if "format" not in content:
         raise FileError(path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`")
+    _require_filled(content, path)
     return checked_model(Rig, content, path)
+
+
+def _require_filled(content: object, path: Path) -> None:
+    """Refuse a rig file in which a placeholder is left.
+
+    Raises:
+        FileError: with the first key that holds one.
+    """
+    keys = list(_placeholders(content, ""))
+    if keys:
+        others = f", and {len(keys) - 1} more keys" if keys[1:] else ""
+        raise FileError(path, f"{keys[0]} is still {FILL_IN}{others}; write the values of your rig")
+
+
+def _placeholders(content: object, key: str) -> Iterator[str]:
+    """The keys whose value is a placeholder."""
+    if isinstance(content, dict):
+        for name, value in content.items():
+            yield from _placeholders(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(content, list):
+        for index, value in enumerate(content):
+            yield from _placeholders(value, f"{key}.{index}")
+    elif content == FILL_IN:
+        yield key
 
 
 def rig_file(path: Path | str) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.io.correspondence_tables import parts_of_file
+from calibgraph.io.correspondence_tables import parts_of_table
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.rig import Rig
@@ -43,15 +43,15 @@ class Preprocessed:
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
     """Depth filter, confidence filter, best match per grid cell, cap per camera and frame.
 
-    The table may be a file larger than memory, which is read in parts: memory is needed for one row
-    group of it and for what the grid keeps, at most one match of each cell, camera and frame, in
-    whatever order the rows are. A CSV file is read whole.
+    The table may be a file or a folder larger than memory, which is read in parts: memory is needed
+    for one row group of it and for what the grid keeps, at most one match of each cell, camera and
+    frame, in whatever order the rows are. A CSV file is read whole.
 
     Raises:
         CorrespondenceError: if the table names a camera that the rig does not have.
         FileError: as of :func:`calibgraph.load_correspondences`.
     """
-    parts = [table] if isinstance(table, Correspondences) else parts_of_file(Path(table))
+    parts = [table] if isinstance(table, Correspondences) else parts_of_table(Path(table))
     return preprocess_parts(rig, parts, config)
 
 
@@ -61,7 +61,7 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
     merged_rows = 0
     for part in parts:
-        best, passed = _filter(rig, part, config)
+        best, passed = _filter(rig, part.without_cameras(config.excluded_cameras), config)
         counts[:3] += passed
         kept.append(best)
         if sum(map(len, kept)) > 2 * merged_rows + _MERGED_ROWS:

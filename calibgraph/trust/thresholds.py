@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 
-_COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."
+_COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
 

@@ -153,8 +153,8 @@ def test_a_camchain_becomes_a_rig_that_evaluate_takes(call: Call, tmp_path: Path
 def test_defaults_on_the_command_line_are_the_librarys() -> None:
     """They are written twice, so that --help imports nothing heavy."""
     of_import = inspect.signature(import_).parameters
-    assert of_import["relative_sigma_deg"].default == RELATIVE_SIGMA_DEG
-    assert of_import["relative_sigma_cm"].default == RELATIVE_SIGMA_CM
+    assert of_import["tie_deg"].default == RELATIVE_SIGMA_DEG
+    assert of_import["tie_m"].default == RELATIVE_SIGMA_CM / 100
     assert inspect.signature(export).parameters["camera_frame"].default == CAMERA_FRAME
 
 
