@@ -5,7 +5,18 @@ Every message is one line: what is wrong, where, what was found and what to do.
 
 from __future__ import annotations
 
+import tokenize
 from pathlib import Path
+
+_WORDS: dict[type[Exception] | tuple[type[Exception], ...], str] = {
+    MemoryError: "it needs more memory than there is",
+    RecursionError: "it is nested too deeply",
+    OverflowError: "a number in it is too large",
+    (SyntaxError, tokenize.TokenError): "its header cannot be read",
+    (LookupError, AttributeError, TypeError, AssertionError): "a part of it is missing or damaged",
+    EOFError: "it ends too early",
+}
+"""What errors of libraries mean where a file is read: their own texts are about code."""
 
 MAX_MESSAGE = 2000
 """Characters of a message: it may quote a file, and a quote may be long."""
@@ -28,6 +39,14 @@ def _one_line(message: str) -> str:
     if len(text) > MAX_MESSAGE:
         text = f"{text[:MAX_MESSAGE]}..."
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def in_words(error: BaseException) -> str:
+    """Why a file cannot be read, for people, by the error of a library."""
+    for kinds, words in _WORDS.items():
+        if isinstance(error, kinds):
+            return words
+    return getattr(error, "strerror", None) or str(error) or "it is damaged"
 
 
 class FileError(CalibrationError):

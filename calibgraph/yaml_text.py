@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import yaml
 
 from calibgraph.errors import FileError
 
-MAX_YAML_VALUES = 1_000_000
+MAX_YAML_VALUES = 500_000  # a value takes some 350 bytes while it is read
 MAX_YAML_DEPTH = 200  # of brackets: the parser in C ends the process at some ten thousand
 
 
@@ -20,12 +21,16 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
     Raises:
         FileError: if it is not YAML, not a mapping, or too deep or large when written out.
     """
+    separators = sum(map(text.count, _SEPARATORS))
+    if separators > MAX_YAML_VALUES:
+        why = f"holds some {separators} values, expected up to {MAX_YAML_VALUES}; is it a table?"
+        raise FileError(path, why)
     if _bracket_depth(text) > MAX_YAML_DEPTH:
         raise FileError(path, _TOO_DEEP)
     try:
         content = yaml.load(text, Loader=_Loader)
         expanded = _expanded_size(content, {})
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, IndexError) as error:
         why = str(error).replace('in "<unicode string>", ', "")
         raise FileError(path, f"is not valid YAML: {why}") from error
     except RecursionError:
@@ -41,15 +46,18 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
     return content
 
 
+_SEPARATORS = (",", "\n", ": ", "- ", "? ", "[", "{")
+"""One of these is before every value but the first."""
+
 _TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
 
 
 def _bracket_depth(text: str) -> int:
     """Depth to which brackets are nested; those in quotes count too."""
     data = np.frombuffer(text.encode(), np.uint8)
-    opened = np.isin(data, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
-    closed = np.isin(data, np.frombuffer(b"]}", np.uint8)).astype(np.int64)
-    return int(np.cumsum(opened - closed).max(initial=0))
+    opened = np.isin(data, np.frombuffer(b"[{", np.uint8)).astype(np.int8)
+    closed = np.isin(data, np.frombuffer(b"]}", np.uint8)).astype(np.int8)
+    return int(np.cumsum(opened - closed, dtype=np.int32).max(initial=0))
 
 
 def _expanded_size(value: Any, sizes: dict[int, int]) -> int:
@@ -107,14 +115,31 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
             )
 
 
+class UnusualInt(int):
+    """A whole number that other programs may take for another one, or for a text.
+
+    Attributes:
+        text: as it is written: ``0x10``, ``0b10``, ``010`` (8 to YAML 1.1), ``1_000``.
+    """
+
+    text = ""
+
+
 def _construct_number(loader: Any, node: yaml.ScalarNode) -> Any:
     """An int or float; ``10:40``, to YAML 1.1 a number of base 60, is a text, as to YAML 1.2."""
     if ":" in node.value:
         return loader.construct_yaml_str(node)
-    if node.tag.endswith(":int"):
-        return loader.construct_yaml_int(node)
-    return loader.construct_yaml_float(node)
+    if not node.tag.endswith(":int"):
+        return loader.construct_yaml_float(node)
+    number = loader.construct_yaml_int(node)
+    if not _UNUSUAL.match(node.value):
+        return number
+    unusual = UnusualInt(number)
+    unusual.text = node.value
+    return unusual
 
+
+_UNUSUAL = re.compile(r"[-+]?0.|.*_")
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _construct_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _construct_number)
@@ -139,6 +164,7 @@ _Dumper.add_representer(list, _represent_sequence)
 _Dumper.add_representer(tuple, _represent_sequence)
 _Dumper.add_representer(np.ndarray, lambda dumper, data: _represent_sequence(dumper, data.tolist()))
 _Dumper.add_multi_representer(np.floating, lambda dumper, data: dumper.represent_float(float(data)))
+_Dumper.add_multi_representer(UnusualInt, lambda dumper, data: dumper.represent_int(int(data)))
 _Dumper.add_multi_representer(
     np.signedinteger, lambda dumper, data: dumper.represent_int(int(data))
 )

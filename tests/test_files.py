@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import re
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,8 @@ from calibgraph import (
 )
 from calibgraph.files import read_yaml, write_atomically, write_yaml
 from calibgraph.model.config import load_config
-from calibgraph.yaml_text import parse_yaml
+from calibgraph.yaml_text import parse_yaml, yaml_text
+from tests.conftest import SAMPLE
 from tests.model.test_rig import written
 
 
@@ -39,6 +42,7 @@ def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
     [
         ("a: 2020-13-45", "not valid YAML"),
         ("a: !!int abc", "not valid YAML"),
+        ("a: !!int ''", "not valid YAML"),
         ("a: " + "9" * 5000, "not valid YAML"),
         ("format: 0x" + "f" * 5000, "too many digits"),
         ("[" * 20_000, "not valid YAML|too deeply"),
@@ -142,6 +146,40 @@ def test_an_input_that_cannot_be_read_meanwhile_keeps_its_name(tmp_path: Path) -
     with pytest.raises(FileNotFoundError) as caught:
         write_atomically(tmp_path / "copy", lambda _: (tmp_path / "gone").read_bytes() and None)
     assert caught.value.filename == str(tmp_path / "gone")
+
+
+@pytest.mark.parametrize("number", ["0x10", "-0x10", "0b11", "0640", "1_000"])
+def test_numbers_that_programs_read_differently_are_refused_as_values(
+    number: str, tmp_path: Path
+) -> None:
+    path, text = tmp_path / "rig.yaml", (SAMPLE / "rig.yaml").read_text()
+    for pattern in (r"(fx: )[0-9.]+", r"(width_px: )[0-9]+", r"(distortion: \[)"):
+        changed, count = re.subn(pattern, rf"\g<1>{number}", text, count=1)
+        path.write_text(changed)
+        with pytest.raises(FileError, match=f"expected a decimal number, found {number}$"):
+            load_rig(path)
+        assert count == 1
+
+
+def test_numbers_of_another_base_elsewhere_do_no_harm() -> None:
+    content = parse_yaml("serial: 0x10\nlist: [007]\n", "some.yaml")
+    assert parse_yaml(yaml_text(content), "some.yaml") == content == {"serial": 16, "list": [7]}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: [" + "1," * 2_500_000 + "1]", "a:\n" + "- 1\n" * 1_000_000, "b: 1\n" * 600_000,
+     "{" + "a: 1, " * 600_000 + "}", "a: " + "- " * 600_000],
+    ids=["flow", "block", "keys", "mapping", "lists in lists"],
+)  # fmt: skip
+def test_a_file_of_millions_of_values_is_refused_before_they_are_made(text: str) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileError, match="expected up to 500000; is it a table"):
+            parse_yaml(text, "rig.yaml")
+        assert tracemalloc.get_traced_memory()[1] < 10 * len(text)
+    finally:
+        tracemalloc.stop()
 
 
 def test_numbers_of_base_60_are_texts() -> None:

@@ -1,6 +1,12 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tomllib
+from pathlib import Path
+
+import pytest
 
 from tests.conftest import ROOT
 
@@ -22,3 +28,14 @@ def test_every_file_of_the_packages_is_installed() -> None:
     }
     assert held - installed == set()
     assert len(held) > 5
+
+
+@pytest.mark.parametrize("name", ["factors", "numpy", "typer", "yaml"])
+def test_modules_in_the_working_folder_are_not_imported(name: str, tmp_path: Path) -> None:
+    (tmp_path / f"{name}.py").write_text("raise SystemExit('imported')")
+    done = subprocess.run(
+        [sys.executable, "-m", "calibgraph", "doctor", str(ROOT / "data" / "sample")],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+        timeout=120, check=False,
+    )  # fmt: skip
+    assert (done.returncode, "imported" in done.stderr) == (0, False)

@@ -226,7 +226,8 @@ def _crash(error: Exception) -> str:
     from calibgraph.errors import CalibrationError
 
     if isinstance(error, MemoryError):
-        return f"not enough memory ({error}); give fewer frames, or smaller files"
+        why = f" ({error})" if str(error) else ""
+        return f"not enough memory{why}; give fewer frames, or smaller files"
     kind = f"{type(error).__name__}: {CalibrationError(str(error))}"
     return f"internal error ({kind}); please report it with the output of calibgraph --debug"
 

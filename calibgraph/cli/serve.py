@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.errors import CalibrationError
 
+Word = TypeVar("Word", bound=str)
 _GB = 10**9
 
 
@@ -40,7 +42,15 @@ def serve(
     jobs: Annotated[
         int | None, typer.Option(min=0, help="Jobs at once. (default: one per core)")
     ] = None,
-    queue: Annotated[int, typer.Option(min=0, help="Most jobs that wait.")] = 1000,
+    jobs_per_tenant: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Jobs at once of one tenant. (default: all but one, if there are several tenants)",
+        ),
+    ] = None,
+    queue: Annotated[int, typer.Option(min=0, help="Most jobs of a tenant that wait.")] = 1000,
     timeout_s: Annotated[
         float, typer.Option(min=0.001, metavar="SECONDS", help="Longest time of a job.")
     ] = 3600.0,
@@ -62,6 +72,14 @@ def serve(
     tracker_processes: Annotated[
         int, typer.Option(min=0, help="Processes that hold the trackers.")
     ] = 2,
+    trackers: Annotated[int, typer.Option(min=0, help="Most trackers of a tenant.")] = 200,
+    api_docs: Annotated[
+        str,
+        typer.Option(
+            metavar="token|open|off",
+            help="Who may read /docs and /openapi.json: whoever has a token, anyone, no one.",
+        ),
+    ] = "token",
     grace_s: Annotated[
         float, typer.Option(min=0.001, metavar="SECONDS", help="For running jobs, at the end.")
     ] = 10.0,
@@ -77,7 +95,7 @@ def serve(
     from calibgraph.service.app import create_app
     from calibgraph.service.serve import Address, require_certificate, require_safe
     from calibgraph.service.serve import serve as serve_app
-    from calibgraph.service.settings import Settings
+    from calibgraph.service.settings import DOCS, Settings
 
     address = Address(host, port, certificate, key)
     require_safe(address, has_tokens=tokens is not None)
@@ -89,6 +107,7 @@ def serve(
         tokens=tokens,
         hosts=tuple(host_name or ()),
         roots=tuple(root or ()),
+        jobs_per_tenant=jobs_per_tenant,
         most_queued=queue,
         job_timeout_s=timeout_s,
         job_memory_bytes=int(memory_gb * _GB),
@@ -97,6 +116,8 @@ def serve(
         free_bytes=int(free_gb * _GB),
         keep_s=keep_days * 86400,
         tracker_processes=tracker_processes,
+        most_trackers=trackers,
+        api_docs=_one_of(DOCS, "--api-docs", api_docs),
         grace_s=grace_s,
         **counted,
     )
@@ -117,12 +138,19 @@ def token(
     ] = "submit",
 ) -> None:
     """Make a token for the service and print it: the file keeps its hash only."""
-    from calibgraph.errors import CalibrationError
     from calibgraph.service.access import SCOPES, add_token
 
-    for known in SCOPES:
-        if scope == known:
-            print(add_token(file, tenant, known))
-            print_plain(terminal(), f"{file}: a token of {tenant} with scope {scope} was added")
-            return
-    raise CalibrationError(f"--scope {scope}: known are {', '.join(SCOPES)}")
+    print(add_token(file, tenant, _one_of(SCOPES, "--scope", scope)))
+    print_plain(terminal(), f"{file}: a token of {tenant} with scope {scope} was added")
+
+
+def _one_of(known: tuple[Word, ...], option: str, word: str) -> Word:
+    """The word that an option gives.
+
+    Raises:
+        CalibrationError: if it is not known.
+    """
+    for each in known:
+        if word == each:
+            return each
+    raise CalibrationError(f"{option} {word}: known are {', '.join(known)}")

@@ -35,7 +35,8 @@ def execute(task: Task, folder: Path) -> Outcome:
         return Outcome(cameras=cameras, versions=versions_text())
     except MemoryError as error:
         kind: ErrorKind = "out of memory"
-        text = f"not enough memory ({error}); give fewer frames, or a larger --memory-gb"
+        why = f" ({error})" if str(error) else ""
+        text = f"not enough memory{why}; give fewer frames, or a larger --memory-gb"
     except (CalibrationError, ValueError) as error:
         kind, text = "bad input", str(error)
     except (_FetchError, OSError) as error:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import FileError
+from calibgraph.errors import FileError, in_words
 from calibgraph.files import require_file
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
 from calibgraph.io.feather import read_feather
@@ -109,7 +109,7 @@ def _read_npy(path: Path) -> Points:
             array = np.load(file, allow_pickle=False)
     except _UNREADABLE as error:
         raise FileError(
-            path, f"cannot be read as a .npy array ({error!r}); is it complete?"
+            path, f"cannot be read as a .npy array ({in_words(error)}); is it complete?"
         ) from None
     if not isinstance(array, np.ndarray):
         raise FileError(path, "is an archive of arrays, expected one array; write it with np.save")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
 from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
@@ -48,6 +48,12 @@ class Tracking(StrictNumbers):
     walk_translation_m: Annotated[float, Field(gt=0, le=1)] = 5e-5
     step_frames: Annotated[int, Field(ge=2, le=1000)] = 3
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
+
+
+def _not_one(draws: int) -> int:
+    if draws == 1:
+        raise ValueError("one draw has no scatter; give 0 for none, or at least 2")
+    return draws
 
 
 class Config(StrictNumbers):
@@ -107,7 +113,7 @@ class Config(StrictNumbers):
     tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
     common_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
-    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 0
+    bootstrap: Annotated[int, Field(ge=0, le=100_000), AfterValidator(_not_one)] = 0
     seed: Seed = 0
     tracking: Tracking = Tracking()
 

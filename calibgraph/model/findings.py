@@ -18,6 +18,7 @@ _PER_CAMERA = {
     "found": "found",
     "missed": "missed",
 }
+_Z_SCORES = ("contrast", "found", "missed")
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
     "range_rotation_deg": 180.0,
@@ -156,6 +157,10 @@ def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:
             raise CorrespondenceError(
                 f"metadata {key!r} must map camera names to numbers, found {values!r}",
                 camera=camera,
+            )
+        if key in _Z_SCORES and not math.isfinite(_to_float(value)):
+            raise CorrespondenceError(
+                f"metadata {key!r} must be finite, found {_to_float(value)!r}", camera=camera
             )
     return {camera: _to_float(value) for camera, value in values.items()}
 

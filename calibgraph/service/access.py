@@ -125,6 +125,11 @@ class Gate:
         """Whether anyone may call."""
         return self._tokens is None
 
+    @property
+    def tenants(self) -> set[str]:
+        """Whose jobs there may be."""
+        return {ANYONE} if self._tokens is None else {token.tenant for token in self._tokens}
+
     def caller(self, secret: str | None) -> Caller | None:
         """Who calls with a token; None if it is none of ours.
 
@@ -140,7 +145,7 @@ class Gate:
 
 
 _bearer = HTTPBearer(auto_error=False, description="A token of `calibgraph token`.")
-_Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 
 
 def token_of(request: Request, credentials: HTTPAuthorizationCredentials | None) -> str | None:
@@ -156,7 +161,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Caller]]:
     The app's ``state.gate`` is the :class:`Gate`.
     """
 
-    async def check(request: Request, credentials: _Credentials) -> Caller:
+    async def check(request: Request, credentials: Credentials) -> Caller:
         gate: Gate = request.app.state.gate
         caller = gate.caller(token_of(request, credentials))
         if caller is None:

@@ -47,10 +47,11 @@ def create_app(settings: Settings) -> FastAPI:
         description="Joint extrinsic calibration of cameras and a LiDAR.",
         docs_url=None,
         redoc_url=None,
+        openapi_url=None,
         lifespan=_lifespan,
     )
-    app.state.settings = settings
     app.state.gate = Gate(None if settings.tokens is None else load_tokens(settings.tokens))
+    app.state.settings = settings = _with_shares(settings, len(app.state.gate.tenants))
     app.state.metrics = metrics = Metrics()
     app.state.service = open_service(settings, metrics)
     app.add_middleware(Shield, hosts=_hosts(settings), observe=metrics.observe_request)
@@ -61,6 +62,13 @@ def create_app(settings: Settings) -> FastAPI:
     bodies = (*REQUESTS.values(), *SETTINGS_OF.values(), routes_trackers.TrackerBody)
     add_schemas(app, (*bodies, ProblemDetails))
     return app
+
+
+def _with_shares(settings: Settings, tenants: int) -> Settings:
+    """The settings, by which no tenant has all the processes for jobs."""
+    if settings.jobs_per_tenant is not None or tenants <= 1:
+        return settings
+    return settings.model_copy(update={"jobs_per_tenant": max(1, settings.jobs_at_once - 1)})
 
 
 def _hosts(settings: Settings) -> tuple[str, ...]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import zipfile
 from pathlib import Path
-from typing import IO
 
 from calibgraph.errors import FileError
 
 MOST_FILES = 100_000
+MOST_RATIO = 100
+"""Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
+_ANY_RATIO_BYTES = 10**8
+_MOST_NOTES = 20
 _CHUNK = 2**20
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
 _LAYOUT = re.compile(
@@ -17,6 +22,14 @@ _LAYOUT = re.compile(
     rf"|(?:lidar|velodyne|image_[0-9])/{_NAME}|cameras/{_NAME}/{_NAME})"
 )
 """What an archive may hold: a dataset folder, a KITTI odometry sequence, or a ROS 2 bag."""
+
+_DATA = re.compile(r"(?:lidar|velodyne|image_[0-9]|cameras)/")
+"""Folders in which nothing is left out."""
+
+_JUNK = re.compile(
+    r"(?:.*/)?(?:__MACOSX/.*|\.DS_Store|\._[^/]*|Thumbs\.db|desktop\.ini)", re.IGNORECASE
+)
+"""What file managers add."""
 
 _BAGS = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _ZIP = b"PK\x03\x04"
@@ -60,36 +73,69 @@ def table_suffix(path: Path) -> str:
 
 
 def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
-    """Unpack an archive; what it says of its sizes is not believed."""
-    folder.mkdir()
+    """Unpack an archive, if all its names and sizes are as they should be."""
     with zipfile.ZipFile(packed) as archive:
-        members = [member for member in archive.infolist() if not member.is_dir()]
-        if len(members) > MOST_FILES:
-            raise FileError(folder.name, f"{len(members)} files, expected up to {MOST_FILES}")
-        names = [member.filename for member in members]
-        for name in names:
-            if not _LAYOUT.fullmatch(name):
-                raise FileError(
-                    folder.name,
-                    f"holds {ascii(name[:100])}, expected rig.yaml, lidar/STEM.npy, "
-                    "cameras/NAME/STEM.png, or a KITTI sequence or ROS 2 bag, with names of "
-                    "letters, digits, _, - and .",
-                )
-        if len({name.lower() for name in names}) < len(names):
-            raise FileError(folder.name, "holds a name twice")
-        left = most_bytes
-        for member in members:
-            target = folder / member.filename
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(member) as source, target.open("xb") as file:
-                left = _copy(source, file, left, folder.name, most_bytes)
+        files = [m for m in archive.infolist() if not m.is_dir()]
+        if len(files) > MOST_FILES:
+            raise FileError(folder.name, f"{len(files)} files, expected up to {MOST_FILES}")
+        files = [m for m in files if not _JUNK.fullmatch(m.filename)]
+        targets = _targets([m.filename for m in files], folder.name)
+        size = sum(m.file_size for m in files)  # zipfile reads no more than that
+        _require_size(size, packed.stat().st_size, folder.name, most_bytes)
+        folder.mkdir()
+        for name, target in targets.items():
+            path = folder / target
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(name) as source, path.open("xb") as file:
+                shutil.copyfileobj(source, file, _CHUNK)
 
 
-def _copy(source: IO[bytes], target: IO[bytes], left: int, name: str, most_bytes: int) -> int:
-    """Copy a file; the bytes that others may have after it."""
-    while chunk := source.read(_CHUNK):
-        left -= len(chunk)
-        if left < 0:
-            raise FileError(name, f"holds over {most_bytes} bytes when unpacked; send less")
-        target.write(chunk)
-    return left
+def _targets(names: list[str], where: str) -> dict[str, str]:
+    """Where files of an archive belong in the dataset's folder, which may be in other folders."""
+    for name in names:
+        if not name.isprintable() or "\\" in name or {"", ".", ".."} & {*name.split("/")}:
+            raise _unexpected(name, where)
+    top = _top_folder(names)
+    targets = {name: name.removeprefix(top) for name in names}
+    left_out = [target for target in targets.values() if not _LAYOUT.fullmatch(target)]
+    for target in left_out:
+        if _DATA.match(target) or len(left_out) == len(targets):
+            raise _unexpected(target, where)
+    for target in left_out[:_MOST_NOTES]:
+        print(f"{where}: {ascii(target[:100])} is no part of a dataset and is left out")
+    if len(left_out) > _MOST_NOTES:
+        print(f"{where}: {len(left_out)} files are left out in all")
+    kept = {name: target for name, target in targets.items() if _LAYOUT.fullmatch(target)}
+    if len({name.lower() for name in names}) < len(names):
+        raise FileError(where, "holds a name twice")
+    return kept
+
+
+def _top_folder(names: list[str]) -> str:
+    """The folder in an archive that holds the dataset: the one in which most names fit."""
+    shared = os.path.commonpath([f"/{name}" for name in names]) if names else "/"
+    parts = [f"{part}/" for part in shared.split("/") if part]
+    folders = ["".join(parts[:depth]) for depth in range(len(parts) + 1)]
+    fits = [sum(bool(_LAYOUT.fullmatch(n.removeprefix(top))) for n in names) for top in folders]
+    return folders[fits.index(max(fits))]
+
+
+def _require_size(size: int, packed: int, where: str, most_bytes: int) -> None:
+    if size > most_bytes:
+        raise FileError(
+            where, f"holds {size} bytes when unpacked, expected up to {most_bytes}; send less"
+        )
+    if size > max(_ANY_RATIO_BYTES, MOST_RATIO * packed):
+        raise FileError(
+            where,
+            f"{packed} bytes stand for {size} when unpacked, over {MOST_RATIO} times as many; "
+            "send a recording of a sensor",
+        )
+
+
+def _unexpected(name: str, where: str) -> FileError:
+    return FileError(
+        where,
+        f"holds {ascii(name[:100])}, expected rig.yaml, lidar/STEM.npy, cameras/NAME/STEM.png, "
+        "or a KITTI sequence or ROS 2 bag, with names of letters, digits, _, - and .",
+    )

@@ -54,7 +54,7 @@ jobs = Table(
     Column("error_kind", String(16)),
     Column("error", Text),
     UniqueConstraint("tenant", "idempotency_key"),
-    Index("jobs_by_state", "state", "number"),
+    Index("jobs_by_state", "state", "tenant", "number"),
     Index("jobs_by_tenant", "tenant", "number"),
 )
 

@@ -84,8 +84,14 @@ def _found(task: JobTask, name: str) -> Path | None:
     return (
         path
         if path.is_dir() and not _is_partial(path)
-        else open_upload(_restored(path), task.unpacked_bytes)
+        else open_upload(_restored(path), _room(task, task.unpacked_bytes))
     )
+
+
+def _room(task: JobTask, most_bytes: int) -> int:
+    """How much an input may take of the disk, half of which is left to others."""
+    free = shutil.disk_usage(task.folder).free - task.free_bytes
+    return max(0, min(most_bytes, free // 2))
 
 
 def _is_partial(folder: Path) -> bool:
@@ -109,7 +115,7 @@ def _link(task: JobTask, uri: str, name: str) -> Path:
     shutil.rmtree(copies, ignore_errors=True)
     copies.mkdir()
     try:
-        found = fetch(uri, copies, task.fetch_bytes)
+        found = fetch(uri, copies, _room(task, task.fetch_bytes))
     except (CalibrationError, OSError, MemoryError):
         raise
     except Exception as error:  # of any store's client

@@ -26,6 +26,7 @@ class JobTask:
         memory_bytes: that it may allocate.
         fetch_bytes: of remote recordings.
         unpacked_bytes: of uploaded archives.
+        free_bytes: of the disk, that stay free.
         timeout_s: after which it is ended.
     """
 
@@ -35,6 +36,7 @@ class JobTask:
     memory_bytes: int
     fetch_bytes: int
     unpacked_bytes: int
+    free_bytes: int
     timeout_s: float
 
 
@@ -52,3 +54,17 @@ class JobOutcome:
     cannot_tell: bool | None = None
     error_kind: ErrorKind | None = None
     error: str | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a job is.
+
+    Attributes:
+        stage: what it does.
+        done, total: steps of the stage.
+    """
+
+    stage: str
+    done: int
+    total: int

@@ -27,12 +27,18 @@ _SHORT = [c for c in jobs.c if c.name not in ("request", "digest")]
 _ADD = jobs.insert().returning(*_SHORT)
 _BY_ID = select(*_SHORT).where(jobs.c.id == bindparam("id"))
 _COUNT = select(func.count()).select_from(jobs).where(jobs.c.state == bindparam("wanted"))
-_WAITS_LONGEST = (
-    select(jobs.c.id).where(jobs.c.state == "queued").order_by(jobs.c.number).limit(1)
-).scalar_subquery()
-_START_NEXT = (
+_COUNT_OF_TENANT = _COUNT.where(jobs.c.tenant == bindparam("whose"))
+_RUNNING = (
+    select(jobs.c.tenant, func.count()).where(jobs.c.state == "running").group_by(jobs.c.tenant)
+)
+_WAIT_LONGEST = (
+    select(jobs.c.tenant, func.min(jobs.c.number))
+    .where(jobs.c.state == "queued")
+    .group_by(jobs.c.tenant)
+)
+_START = (
     jobs.update()
-    .where((jobs.c.id == _WAITS_LONGEST) & (jobs.c.state == "queued"))
+    .where((jobs.c.number == bindparam("next")) & (jobs.c.state == "queued"))
     .values(state="running", started_s=bindparam("now_s"), starts=jobs.c.starts + 1)
     .returning(*_SHORT)
 )
@@ -99,6 +105,7 @@ class JobTable:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
     def add(self, id: str, tenant: str, job: Job, digest: str, key: str | None) -> JobRecord:
         """Add a job; it is durable when this returns.
@@ -166,16 +173,43 @@ class JobTable:
         with self._engine.connect() as connection:
             return [_record(row) for row in connection.execute(query).mappings()]
 
-    def count(self, state: JobState) -> int:
-        """How many jobs are in a state."""
+    def count(self, state: JobState, tenant: str | None = None) -> int:
+        """How many jobs, of all tenants or of one, are in a state."""
+        query = _COUNT if tenant is None else _COUNT_OF_TENANT
+        values = {"wanted": state} | ({} if tenant is None else {"whose": tenant})
         with self._engine.connect() as connection:
-            return int(connection.execute(_COUNT, {"wanted": state}).scalar_one())
+            return int(connection.execute(query, values).scalar_one())
 
-    def start_next(self) -> JobRecord | None:
-        """Take the job that has waited longest; None if none waits. One thread at a time."""
-        with self._engine.begin() as connection:
-            row = connection.execute(_START_NEXT, {"now_s": time.time()}).mappings().first()
-        return None if row is None else _record(row)
+    def start_next(self, most_running: int | None = None) -> JobRecord | None:
+        """Take the next job; None if there is none. One thread at a time.
+
+        Tenants take turns: first those with the fewest jobs that run, of these the one whose last
+        start is the longest ago. Of a tenant the job that has waited longest is next.
+
+        Args:
+            most_running: jobs of one tenant at the same time.
+        """
+        while (number := self._next(most_running)) is not None:
+            with self._engine.begin() as connection:
+                values = {"next": number, "now_s": time.time()}
+                row = connection.execute(_START, values).mappings().first()
+            if row is not None:  # it was not cancelled meanwhile
+                starts = max(self._last_start.values(), default=0)
+                self._last_start[row["tenant"]] = starts + 1
+                return _record(row)
+        return None
+
+    def _next(self, most_running: int | None) -> int | None:
+        """The number of the next job."""
+        with self._engine.connect() as connection:
+            running = {tenant: count for tenant, count in connection.execute(_RUNNING)}
+            waiting = [(tenant, number) for tenant, number in connection.execute(_WAIT_LONGEST)]
+        turns = [
+            (running.get(tenant, 0), self._last_start.get(tenant, 0), number)
+            for tenant, number in waiting
+            if most_running is None or running.get(tenant, 0) < most_running
+        ]
+        return min(turns)[-1] if turns else None
 
     def finish(
         self,
@@ -226,10 +260,11 @@ class JobTable:
             for id in ids:
                 connection.execute(jobs.delete().where(jobs.c.id == id))
 
-    def ids(self) -> set[str]:
-        """Ids of all jobs."""
+    def states(self) -> dict[str, JobState]:
+        """The states of all jobs, by their ids."""
         with self._engine.connect() as connection:
-            return set(connection.execute(select(jobs.c.id)).scalars())
+            rows = connection.execute(select(jobs.c.id, jobs.c.state))
+            return {id: state for id, state in rows}
 
     def _change(self, where: ColumnElement[bool], values: dict[str, Any]) -> int:
         with self._engine.begin() as connection:

@@ -11,8 +11,8 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from calibgraph.service.answers import utc
+from calibgraph.service.job_task import Step
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.runner import Step
 
 _MARKS = {
     "PASS": "pass", "OK": "pass", "WARN": "warn", "CANNOT TELL": "warn",

@@ -26,10 +26,10 @@ from calibgraph.service.pages import (
 )
 from calibgraph.service.problems import Problem
 from calibgraph.service.routes_jobs import find_job
+from calibgraph.service.routes_service import require_docs
 from calibgraph.service.routes_trackers import find_tracker
 from calibgraph.service.state import Service, State
 from calibgraph.service.tracker_request import TrackerRequest
-from calibgraph.service.uploads import read_whole
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -52,7 +52,9 @@ Visitor = Annotated[Caller, Depends(_visitor)]
 def _page(request: Request, template: str, status: int = 200, **content: object) -> Response:
     gate: Gate = request.app.state.gate
     can_sign_out = not gate.is_open and COOKIE in request.cookies
-    return HTMLResponse(render(template, can_sign_out=can_sign_out, **content), status)
+    has_docs = request.app.state.settings.api_docs != "off"
+    fixed = {"can_sign_out": can_sign_out, "has_docs": has_docs}
+    return HTMLResponse(render(template, **fixed, **content), status)
 
 
 @router.get("/")
@@ -118,11 +120,11 @@ def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
 
 
 @router.get("/trackers/{id}")
-def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
+async def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
     """A tracker: its verdict, its alarms, its extrinsics over time."""
-    record = find_tracker(state, caller, id)
+    record = await run_in_threadpool(find_tracker, state, caller, id)
     asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    found: dict[str, Any] = state.trackers.ask(id, asked)
+    found: dict[str, Any] = await state.trackers.answer(id, caller.tenant, asked)
     columns, cameras = camera_table(found["cameras"])
     return _page(
         request,
@@ -140,8 +142,11 @@ def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Re
 
 
 @router.get("/docs")
-def api_page(request: Request) -> Response:
-    """The API in words."""
+async def api_page(request: Request, state: State) -> Response:
+    """The API in words, for whom the operator lets read it."""
+    require_docs(state)
+    if state.settings.api_docs == "token":
+        await _visitor(request)
     gate: Gate = request.app.state.gate
     return _page(
         request,
@@ -160,9 +165,9 @@ def sign_in_page(request: Request) -> Response:
 
 
 @router.post("/sign-in")
-async def sign_in(request: Request) -> Response:
+async def sign_in(request: Request, state: State) -> Response:
     """Keep a token in the browser, where no script can read it."""
-    body = await read_whole(request.stream(), _MOST_FORM_BYTES)
+    body = await state.memory.read(request, "", _MOST_FORM_BYTES)
     fields = parse_qs(body.decode("utf-8", errors="replace"))
     secret = fields.get("token", [""])[0].strip()
     gate: Gate = request.app.state.gate

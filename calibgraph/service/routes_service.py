@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel
 from sqlalchemy.exc import SQLAlchemyError
 
-from calibgraph.service.access import Admin
+from calibgraph.service.access import Admin, Credentials, require
 from calibgraph.service.metrics import CONTENT_TYPE
 from calibgraph.service.problems import Problem, documented
-from calibgraph.service.state import State
+from calibgraph.service.state import Service, State
 
 router = APIRouter()
 
@@ -54,3 +56,23 @@ def metrics(state: State, caller: Admin) -> Response:
     state.metrics.queued.set(state.jobs.count("queued"))
     state.metrics.running.set(state.jobs.count("running"))
     return Response(state.metrics.text(), media_type=CONTENT_TYPE)
+
+
+@router.get("/openapi.json", include_in_schema=False)
+async def openapi(request: Request, state: State, credentials: Credentials) -> dict[str, Any]:
+    """The description of the API, for whom the operator lets read it."""
+    require_docs(state)
+    if state.settings.api_docs == "token":
+        await require("read")(request, credentials)
+    description: dict[str, Any] = request.app.openapi()
+    return description
+
+
+def require_docs(state: Service) -> None:
+    """Check that this server describes its API.
+
+    Raises:
+        Problem: if not.
+    """
+    if state.settings.api_docs == "off":
+        raise Problem(404, "this server does not describe its API; see calibgraph serve --api-docs")

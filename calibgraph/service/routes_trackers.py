@@ -23,7 +23,6 @@ from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
 from calibgraph.service.tracker_request import ARROW, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
-from calibgraph.service.uploads import read_whole
 from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")
@@ -140,31 +139,34 @@ async def create_tracker(request: Request, state: State, caller: Submitter) -> R
     """Begin to track a rig."""
     if not request.headers.get("content-type", "").startswith("application/json"):
         raise Problem(415, "send application/json")
-    content = parse_json(await read_whole(request.stream(), MAX_JSON_BYTES))
+    content = parse_json(await state.memory.read(request, caller.tenant, MAX_JSON_BYTES))
     if not isinstance(content, dict):
         raise Problem(422, "expected a JSON object")
     body = checked_model(TrackerBody, content, "tracker")
     config_from(body.config, "config")
-    record = await run_in_threadpool(_create, state, caller, body)
+    record = await _create(state, caller.tenant, body)
     headers = {"Location": f"/v1/trackers/{record.id}"}
     return JSONResponse(tracker_answer(record).model_dump(), 201, headers)
 
 
-def _create(state: Service, caller: Caller, body: TrackerBody) -> TrackerRecord:
+async def _create(state: Service, tenant: str, body: TrackerBody) -> TrackerRecord:
     state.require_room()
-    if state.tracker_table.count() >= state.settings.most_trackers:
-        raise Problem(429, "no more trackers; remove one", {"Retry-After": "60"})
     id = new_id()
     folder = state.folder.of_tracker(id)
-    folder.mkdir(mode=0o700)
-    try:
-        config = json.dumps(body.config)
-        rig = yaml_text(body.rig).encode()
-        state.trackers.ask(id, TrackerRequest("create", str(folder), rig, config=config))
-        return state.tracker_table.add(id, caller.tenant, body.name)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with state.trackers.begin(tenant) as begun:
+        held = await run_in_threadpool(state.tracker_table.count, tenant)
+        if held + begun > state.settings.most_trackers:
+            raise Problem(429, f"you have {held} trackers; remove one", {"Retry-After": "60"})
+        folder.mkdir(mode=0o700)
+        try:
+            config = json.dumps(body.config)
+            rig = (await run_in_threadpool(yaml_text, body.rig)).encode()
+            request = TrackerRequest("create", str(folder), rig, config=config)
+            await state.trackers.answer(id, tenant, request)
+            return await run_in_threadpool(state.tracker_table.add, id, tenant, body.name)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
 
 
 @router.get("", responses=documented())
@@ -185,9 +187,9 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
-    body = await read_whole(request.stream(), state.settings.frames_bytes)
+    body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
     asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
-    answer = await state.trackers.answer(id, asked)
+    answer = await state.trackers.answer(id, caller.tenant, asked)
     state.metrics.frames.inc(len(answer["updates"]))
     return JSONResponse(answer)
 
@@ -197,7 +199,7 @@ async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerS
     """The last estimate, with its error bars, verdicts and events."""
     await run_in_threadpool(find_tracker, state, caller, id)
     asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    return TrackerState(**await state.trackers.answer(id, asked))
+    return TrackerState(**await state.trackers.answer(id, caller.tenant, asked))
 
 
 @router.get(
@@ -209,13 +211,14 @@ async def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
     """The extrinsics over time, with their error bars and events."""
     await run_in_threadpool(find_tracker, state, caller, id)
     asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
-    return Response(await state.trackers.answer(id, asked), media_type="image/png")
+    return Response(await state.trackers.answer(id, caller.tenant, asked), media_type="image/png")
 
 
 @router.delete("/{id}", status_code=204, responses=documented(404, 422, 429))
-def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
+async def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
     """Remove a tracker and its state."""
-    find_tracker(state, caller, id)
-    state.tracker_table.remove(id)
-    state.trackers.ask(id, TrackerRequest("remove", str(state.folder.of_tracker(id))))
+    await run_in_threadpool(find_tracker, state, caller, id)
+    await run_in_threadpool(state.tracker_table.remove, id)
+    asked = TrackerRequest("remove", str(state.folder.of_tracker(id)))
+    await state.trackers.answer(id, caller.tenant, asked)
     return Response(status_code=204)

@@ -10,15 +10,14 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.bell import progress_of
-from calibgraph.service.folders import DataFolder
-from calibgraph.service.job_task import RESULT, WORK, JobOutcome, JobTask
-from calibgraph.service.jobs import MOST_STARTS, JobRecord, JobTable
+from calibgraph.service.folders import DataFolder, remove_folder
+from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobTask, Step
+from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
 from calibgraph.service.settings import Settings
@@ -31,20 +30,6 @@ _JOBS_PER_CHILD = 200
 _LOOK_EVERY_S = 1.0
 _EXPIRE_EVERY_S = 60.0
 _RETRY_AFTER_S = 2.0  # when the table cannot be used
-
-
-@dataclass(frozen=True)
-class Step:
-    """How far a job is.
-
-    Attributes:
-        stage: what it does.
-        done, total: steps of the stage.
-    """
-
-    stage: str
-    done: int
-    total: int
 
 
 @dataclass
@@ -115,14 +100,16 @@ class Runner:
 
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
-        changed = self._table.cancel(id)
+        if not self._table.cancel(id):
+            return False
         with self._taking:
-            for slot in self._slots:
-                if changed and slot.job == id:
-                    slot.child.kill()
-        if changed:
-            self._ring(id)
-        return changed
+            running = [slot for slot in self._slots if slot.job == id]
+            for slot in running:
+                slot.child.kill()
+        if not running:
+            self._discard_input(id)
+        self._ring(id)
+        return True
 
     def begin_stop(self) -> None:
         """Start no more jobs."""
@@ -178,7 +165,7 @@ class Runner:
     def _take(self, slot: _Slot) -> JobRecord | None:
         with self._taking:
             slot.job = None
-            record = self._table.start_next()
+            record = self._table.start_next(self._settings.jobs_per_tenant)
             slot.job = None if record is None else record.id
         return record
 
@@ -197,11 +184,13 @@ class Runner:
             self._table.finish(
                 record.id, "failed", error_kind=outcome.error_kind, error=outcome.error
             )
+        if outcome is not None:
+            self._deaths.pop(record.id, None)
+        if outcome is not None or self._is_finished(record.id):
+            self._discard_input(record.id)
         with self._taking:
             slot.job = None
         self._steps.pop(record.id, None)
-        if outcome is not None:
-            self._deaths.pop(record.id, None)
         state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
         self._metrics.jobs.labels(record.kind, state).inc()
         self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
@@ -242,6 +231,7 @@ class Runner:
             memory_bytes=settings.job_memory_bytes,
             fetch_bytes=settings.fetch_bytes,
             unpacked_bytes=settings.upload_bytes,
+            free_bytes=settings.free_bytes,
             timeout_s=settings.job_timeout_s,
         )
 
@@ -260,6 +250,15 @@ class Runner:
         folder = self._folder.of_job(id)
         shutil.rmtree(folder / RESULT, ignore_errors=True)
         (folder / WORK).rename(folder / RESULT)
+
+    def _is_finished(self, id: str) -> bool:
+        record = self._table.get(id)
+        return record is None or record.is_finished
+
+    def _discard_input(self, id: str) -> None:
+        """Remove all of a finished job that is not its result."""
+        for name in (INPUT, WORK):
+            remove_folder(self._folder.of_job(id) / name)
 
     def _expire(self) -> None:
         """A thread: remove the jobs whose results have been kept for long enough."""
@@ -280,17 +279,14 @@ class Runner:
             remove_folder(self._folder.of_job(id))
 
     def _remove_leftovers(self) -> None:
-        """Remove the folders of jobs that were not acknowledged, or are forgotten."""
-        known = self._table.ids()
+        """Remove the folders of jobs that are not known, and the input of those that ended."""
+        states = self._table.states()
         for folder in self._folder.jobs.iterdir():
-            if folder.name not in known:
+            if folder.name not in states:
                 remove_folder(folder)
+            elif states[folder.name] in FINISHED:
+                self._discard_input(folder.name)
 
 
 _MOST_DEATHS = min(5, MOST_STARTS)
 """Deaths of a job's process, while one server runs, after which they are its own fault."""
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder and all that is in it."""
-    shutil.rmtree(folder, ignore_errors=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import resource
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from fastapi import FastAPI
 
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import require_file
+from calibgraph.service.connections import LimitedConnection
 from calibgraph.service.state import Service
 
 _CLOSE_S = 5
@@ -85,20 +87,8 @@ def serve(app: FastAPI, address: Address) -> None:
     """
     service: Service = app.state.service
     require_safe(address, has_tokens=service.settings.tokens is not None)
-    config = uvicorn.Config(
-        app,
-        host=address.host,
-        port=address.port,
-        ssl_certfile=address.certificate,
-        ssl_keyfile=address.key,
-        server_header=False,
-        access_log=False,
-        log_level="info",
-        timeout_graceful_shutdown=_CLOSE_S,
-        timeout_keep_alive=_IDLE_S,
-        backlog=_BACKLOG,
-    )
-    server = _Server(config, service)
+    _allow_many_connections()
+    server = Server(app, address)
     try:
         server.run()
     except SystemExit as error:  # of uvicorn, after a line in its log
@@ -110,14 +100,43 @@ def serve(app: FastAPI, address: Address) -> None:
             service.stop()
 
 
-class _Server(uvicorn.Server):
-    """Wakes requests that wait as soon as a signal comes: uvicorn would wait for them."""
+def _allow_many_connections() -> None:
+    """Let this process have as many open files as it may: a connection is one."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
-    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+
+class Server(uvicorn.Server):
+    """A server of uvicorn with limits on connections.
+
+    It wakes requests that wait as soon as a signal comes: uvicorn would wait for them.
+
+    Args:
+        app: of :func:`calibgraph.service.app.create_app`.
+        address: where it listens.
+    """
+
+    def __init__(self, app: FastAPI, address: Address) -> None:
+        config = uvicorn.Config(
+            app,
+            host=address.host,
+            port=address.port,
+            ssl_certfile=address.certificate,
+            ssl_keyfile=address.key,
+            http=LimitedConnection,
+            ws="none",
+            server_header=False,
+            access_log=False,
+            log_level="info",
+            timeout_graceful_shutdown=_CLOSE_S,
+            timeout_keep_alive=_IDLE_S,
+            backlog=_BACKLOG,
+        )
         super().__init__(config)
-        self._service = service
+        self._service: Service = app.state.service
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to stop."""
         self._service.is_stopping = True
         self._service.bell.ring_all()
         super().handle_exit(sig, frame)

@@ -11,13 +11,14 @@ from sqlalchemy import Engine
 from calibgraph.errors import CalibrationError
 from calibgraph.service.bell import Bell
 from calibgraph.service.database import open_database
-from calibgraph.service.folders import DataFolder
+from calibgraph.service.folders import DataFolder, remove_folder
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root, open_roots
 from calibgraph.service.problems import Problem
+from calibgraph.service.room import Room
 from calibgraph.service.runner import Runner
-from calibgraph.service.settings import Settings
+from calibgraph.service.settings import MAX_BODIES_BYTES, Settings
 from calibgraph.service.tracker_table import TrackerTable
 from calibgraph.service.trackers import Trackers
 
@@ -38,6 +39,7 @@ class Service:
         trackers: the processes that hold them.
         roots: from which jobs may read.
         metrics: numbers for Prometheus.
+        disk, memory: room for uploads, and for bodies that are not written to disk.
         bell: wakes requests that wait.
         is_stopping: whether the server was told to stop.
     """
@@ -52,10 +54,20 @@ class Service:
     roots: tuple[Root, ...]
     metrics: Metrics
     bell: Bell
+    disk: Room = field(init=False)
+    memory: Room = field(init=False)
     is_stopping: bool = field(default=False)
 
+    def __post_init__(self) -> None:
+        self.disk = Room(self.folder.free_bytes, self.settings.free_bytes, 507)
+        self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
+
     def start(self) -> None:
-        """Begin to run jobs, in the event loop."""
+        """Remove what an earlier server left, and begin to run jobs, in the event loop."""
+        known = self.tracker_table.ids()
+        for left in self.folder.trackers.iterdir():
+            if left.name not in known:  # a server was killed while it made or removed it
+                remove_folder(left)
         self.bell.open()
         self.runner.start()
 

@@ -34,7 +34,7 @@ from calibgraph.service.requests import (
 )
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service
-from calibgraph.service.uploads import FormReader, Upload, read_whole
+from calibgraph.service.uploads import FormReader, Upload
 
 SETTINGS = "settings"
 _MOST_KEY = 255
@@ -66,7 +66,7 @@ async def submit(
     arriving = service.folder.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
-        job, digest = await _read(service, request, kind, arriving / INPUT)
+        job, digest = await _read(service, request, caller, kind, arriving / INPUT)
         return await run_in_threadpool(_keep, service, arriving, caller.tenant, job, digest, key)
     except OtherRequestError:
         raise Problem(422, "this Idempotency-Key was given with another request") from None
@@ -82,30 +82,33 @@ def _require_key(key: str | None) -> None:
 
 def _require_place_unless_known(service: Service, tenant: str, key: str | None) -> None:
     if service.jobs.known(tenant, key) is None:
-        _require_place_in_queue(service)
+        _require_place_in_queue(service, tenant)
 
 
-def _require_place_in_queue(service: Service) -> None:
-    waiting = service.jobs.count("queued")
+def _require_place_in_queue(service: Service, tenant: str) -> None:
+    waiting = service.jobs.count("queued", tenant)
     if waiting >= service.settings.most_queued:
         raise Problem(
-            429, f"{waiting} jobs wait already; try again", {"Retry-After": str(_RETRY_AFTER_S)}
+            429,
+            f"{waiting} of your jobs wait already; try again",
+            {"Retry-After": str(_RETRY_AFTER_S)},
         )
 
 
-async def _read(service: Service, request: Request, kind: JobKind, folder: Path) -> tuple[Job, str]:
+async def _read(
+    service: Service, request: Request, caller: Caller, kind: JobKind, folder: Path
+) -> tuple[Job, str]:
     """The job that a request asks for, its uploads in a folder; and the digest of all."""
-    content_type = request.headers.get("content-type", "")
-    media = content_type.partition(";")[0].strip().lower()
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
         allowed = {name: 1 for name in ALLOWED[kind]} | (
             {RECORDING: MAX_RECORDINGS} if RECORDING in ALLOWED[kind] else {}
         )
-        reader = FormReader(folder, allowed, service.settings.upload_bytes)
-        upload = await reader.read(content_type, request.stream())
+        with service.disk.hold(request, caller.tenant, service.settings.upload_bytes) as arrive:
+            upload = await FormReader(folder, allowed).read(request, arrive)
         job, digest = _job_of_form(upload, kind), f"{kind} {upload.digest}"
     elif media == "application/json":
-        body = await read_whole(request.stream(), MAX_JSON_BYTES)
+        body = await service.memory.read(request, caller.tenant, MAX_JSON_BYTES)
         job = job_of(_checked(REQUESTS[kind], parse_json(body)), kind)
         digest = f"{kind} {job.model_dump_json()}"
     else:
@@ -160,7 +163,7 @@ def _keep(
     known = service.jobs.known(tenant, key, digest)
     if known is not None:
         return known, True
-    _require_place_in_queue(service)
+    _require_place_in_queue(service, tenant)
     sync_tree(arriving)
     folder = service.folder.of_job(arriving.name)
     service.folder.keep(arriving, folder)

@@ -9,7 +9,7 @@ import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -256,12 +256,13 @@ def main() -> None:
     warm_up_tracker()
     trackers, pool = _Trackers(), ThreadPoolExecutor(_THREADS)
 
-    def answer(requests: list[TrackerRequest], _: Note) -> list[Any]:
+    def answer(requests: list[TrackerRequest], note: Note) -> None:
+        """Note each answer, with its place in the list, as soon as it is there."""
+        asked = {pool.submit(trackers.answer, request): i for i, request in enumerate(requests)}
+        for future in as_completed(asked):
+            note((asked[future], future.result()))
         if any(request.action == "close all" for request in requests):
-            answers = list(pool.map(trackers.answer, requests))
             trackers.close()
-            return answers
-        return list(pool.map(trackers.answer, requests))
 
     with memory_limit(int(sys.argv[2])):
         answer_requests(answer)

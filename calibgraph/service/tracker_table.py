@@ -60,10 +60,16 @@ class TrackerTable:
         with self._engine.connect() as connection:
             return [TrackerRecord(**row) for row in connection.execute(query).mappings()]
 
-    def count(self) -> int:
-        """How many there are."""
+    def ids(self) -> set[str]:
+        """Of all trackers."""
         with self._engine.connect() as connection:
-            return int(connection.execute(select(func.count()).select_from(trackers)).scalar_one())
+            return set(connection.execute(select(trackers.c.id)).scalars())
+
+    def count(self, tenant: str) -> int:
+        """How many a tenant has."""
+        query = select(func.count()).where(trackers.c.tenant == tenant)
+        with self._engine.connect() as connection:
+            return int(connection.execute(query).scalar_one())
 
     def remove(self, id: str) -> None:
         """Forget a tracker."""

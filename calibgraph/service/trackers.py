@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ _MOST_BYTES_AT_ONCE = 2 * 2**20
 """A few seconds of work: small frames take a millisecond a kilobyte."""
 _MOST_WAITING = 512
 _MOST_BYTES_WAITING = 64 * 2**20
+"""Of one tenant, for one process."""
 _AGAIN = {"Retry-After": "1"}
 
 
@@ -33,31 +35,31 @@ class _Asked:
 
 
 class _Host:
-    """A process with trackers: what was asked meanwhile is asked together."""
+    """A process with trackers: what was asked meanwhile is asked together, by turns of tenants."""
 
     def __init__(self, memory_bytes: int) -> None:
         self._child = ChildProcess(_CHILD, (str(memory_bytes),))
-        self._waiting: deque[_Asked] = deque()
-        self._bytes = 0
+        self._waiting: OrderedDict[str, deque[_Asked]] = OrderedDict()
         self._changed = threading.Condition()
         self._is_closed = False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def ask(self, request: TrackerRequest) -> Future[Any]:
+    def ask(self, tenant: str, request: TrackerRequest) -> Future[Any]:
         """The answer, when it has come.
 
         Raises:
-            Problem: if too much waits already.
+            Problem: if too much of the tenant waits already.
         """
         asked = _Asked(request, Future())
         with self._changed:
             if self._is_closed:
                 raise _stopping()
-            if len(self._waiting) >= _MOST_WAITING or self._bytes > _MOST_BYTES_WAITING:
+            waiting = self._waiting.setdefault(tenant, deque())
+            size = sum(len(each.request.body) for each in waiting)
+            if len(waiting) >= _MOST_WAITING or size > _MOST_BYTES_WAITING:
                 raise Problem(429, "the trackers are behind; send the frames again later", _AGAIN)
-            self._waiting.append(asked)
-            self._bytes += len(request.body)
+            waiting.append(asked)
             self._changed.notify()
         return asked.answer
 
@@ -67,25 +69,30 @@ class _Host:
         self._child.close()
 
     def _take(self) -> list[_Asked]:
-        """What has waited longest, some seconds of work; nothing when all is done and closed."""
+        """What is next, some seconds of work; nothing when all is done and closed."""
         together: list[_Asked] = []
         size = 0
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_closed)
             while self._waiting and len(together) < _MOST_AT_ONCE:
-                size += len(self._waiting[0].request.body)
+                tenant, waiting = next(iter(self._waiting.items()))
+                size += len(waiting[0].request.body)
                 if together and size > _MOST_BYTES_AT_ONCE:
                     break
-                together.append(self._waiting.popleft())
-                self._bytes -= len(together[-1].request.body)
+                together.append(waiting.popleft())
+                self._waiting.move_to_end(tenant)
+                if not waiting:
+                    del self._waiting[tenant]
         return together
 
     def _answer(self, together: list[_Asked]) -> None:
+        def give(note: tuple[int, Any]) -> None:
+            which, answer = note
+            together[which].answer.set_result(answer)
+
         try:
             self._child.start()
-            answers = self._child.ask([asked.request for asked in together], _TIMEOUT_S)
-            for asked, answer in zip(together, answers, strict=True):
-                asked.answer.set_result(answer)
+            self._child.ask([asked.request for asked in together], _TIMEOUT_S, give)
         except (ChildEndedError, ChildTimeoutError) as error:
             self._child.stop()
             for asked in together:
@@ -96,7 +103,8 @@ class _Host:
         """Let what was asked be answered, then write all states and end."""
         with self._changed:
             if not self._is_closed:
-                self._waiting.append(_Asked(TrackerRequest("close all", ""), Future()))
+                last = _Asked(TrackerRequest("close all", ""), Future())
+                self._waiting[""] = deque([last])  # no tenant has this name
             self._is_closed = True
             self._changed.notify()
         self._thread.join()
@@ -117,25 +125,32 @@ class Trackers:
     def __init__(self, folder: DataFolder, settings: Settings) -> None:
         self._folder, self._settings = folder, settings
         self._hosts: list[_Host] = []
+        self._begun: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._is_closed = False
 
-    def ask(self, id: str, request: TrackerRequest) -> Any:
-        """What the process of a tracker answers; see :meth:`answer`."""
-        return _checked(self._host(id).ask(request).result)
+    @contextmanager
+    def begin(self, tenant: str) -> Iterator[int]:
+        """Begin a tracker, in the event loop; how many the tenant begins at present."""
+        self._begun[tenant] += 1
+        try:
+            yield self._begun[tenant]
+        finally:
+            self._begun[tenant] -= 1
 
-    async def answer(self, id: str, request: TrackerRequest) -> Any:
+    async def answer(self, id: str, tenant: str, request: TrackerRequest) -> Any:
         """What the process of a tracker answers; no thread waits for it.
 
         Args:
             id: of the tracker.
+            tenant: who asks: tenants take turns.
             request: to it.
 
         Raises:
             Problem: if it is refused, too much waits, or the process ended: then it may be asked
                 again.
         """
-        asked = self._host(id).ask(request)
+        asked = self._host(id).ask(tenant, request)
         await asyncio.wait([asyncio.wrap_future(asked)])
         return _checked(asked.result)
 

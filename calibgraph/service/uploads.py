@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from fastapi import Request
 from python_multipart import MultipartParser
 from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import parse_options_header
@@ -57,12 +58,10 @@ class FormReader:
         folder: for the files.
         allowed: names of files, and how many there may be of each. The second of a name ``a`` is
             the file ``a_1``.
-        most_bytes: of the whole form.
     """
 
-    def __init__(self, folder: Path, allowed: Mapping[str, int], most_bytes: int) -> None:
-        self._folder, self._allowed, self._left = folder, allowed, most_bytes
-        self._most = most_bytes
+    def __init__(self, folder: Path, allowed: Mapping[str, int]) -> None:
+        self._folder, self._allowed = folder, allowed
         self._part = _Part()
         self._texts: list[tuple[str, str]] = []
         self._files: list[str] = []
@@ -71,22 +70,24 @@ class FormReader:
         self._is_whole = False
         self._parts = 0
 
-    async def read(self, content_type: str, body: AsyncIterator[bytes]) -> Upload:
-        """Read the form.
+    async def read(self, request: Request, arrive: Callable[[int], None]) -> Upload:
+        """Read the form in a request's body.
+
+        Args:
+            request: with the form.
+            arrive: called with the size of each piece of the body before it is written.
 
         Raises:
-            Problem: if it is malformed, too large, or has a file that is not allowed.
+            Problem: if it is malformed, or has a file that is not allowed.
         """
-        _, options = parse_options_header(content_type)
+        _, options = parse_options_header(request.headers.get("content-type", ""))
         boundary = options.get(b"boundary", b"")
         if not boundary or len(boundary) > 70:  # noqa: PLR2004 - RFC 2046
             raise Problem(400, "the Content-Type has no boundary, or one that is too long")
         try:
             parser = MultipartParser(boundary, self._callbacks())
-            async for chunk in body:
-                self._left -= len(chunk)
-                if self._left < 0:
-                    raise Problem(413, f"the upload is larger than {self._most} bytes")
+            async for chunk in request.stream():
+                arrive(len(chunk))
                 if chunk:
                     await run_in_threadpool(parser.write, chunk)  # it writes to disk
             parser.finalize()
@@ -184,17 +185,3 @@ class FormReader:
             file.flush()
             os.fsync(file.fileno())
             file.close()
-
-
-async def read_whole(body: AsyncIterator[bytes], most_bytes: int) -> bytes:
-    """A body that is kept in memory.
-
-    Raises:
-        Problem: if it has more bytes than these.
-    """
-    read = bytearray()
-    async for chunk in body:
-        read += chunk
-        if len(read) > most_bytes:
-            raise Problem(413, f"the body is larger than {most_bytes} bytes")
-    return bytes(read)

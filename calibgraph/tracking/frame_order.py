@@ -13,6 +13,10 @@ from calibgraph.model.places import PLACES
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
+_MOST_SKIPPED = {"number": 10**12, "stamp_ns": 2**62}
+"""Between two frames. Numbers that are nanoseconds pause for 17 min; a clock may be set once."""
+_SKIPPED_SHARE = 1000
+"""A larger number may skip this part of it: three weeks, if it is a time since 1970."""
 LONGEST_PLACE = 200
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
@@ -69,6 +73,15 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
             f"frame {number} {what}; frames must be in the order of their numbers: it is left out",
             frame=number,
         )
+    for what, value, before in (("number", number, last), ("stamp_ns", stamp, last_stamp)):
+        if value is None or before is None:
+            continue
+        if value - before > max(_MOST_SKIPPED[what], abs(before) // _SKIPPED_SHARE):
+            raise CorrespondenceError(
+                f"frame {number}: its {what} {value} is far beyond {before} of the frame before, "
+                "and the frames between would be too late; correct it: it is left out",
+                frame=number,
+            )
     if stamp is not None and last_stamp is not None and stamp <= last_stamp:
         raise CorrespondenceError(
             f"frame {number}: its stamp_ns {stamp} is not after {last_stamp} of the frame "

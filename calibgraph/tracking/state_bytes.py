@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import CalibrationError, FileError, in_words
 from calibgraph.files import require_file, write_bytes
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -100,7 +100,7 @@ def decode(data: bytes) -> Any:
     except StateError:
         raise
     except _DECODING_ERRORS as error:
-        raise StateError(f"is not a tracker's state ({error!r})") from error
+        raise StateError(f"is not a tracker's state ({in_words(error)})") from error
 
 
 def save_state_file(path: Path, state: bytes) -> None:

@@ -61,7 +61,7 @@ def _rigs(rig: bytes) -> Iterator[Hostile]:
         "huge hexadecimal": b"format: 0x" + b"f" * 50_000,
         "binary": bytes(range(256)) * 10,
         "empty": b"",
-        "zip": _zip({"rig.yaml": rig}),
+        "zip": zipped({"rig.yaml": rig}),
         "many cameras": b"format: calibgraph-rig/1\nlidar: lidar\ncameras:\n" + many.encode(),
         "pose of NaN": rig.replace(b"T_camera_lidar:\n", b"T_camera_lidar: [[.nan]]\n #", 1),
         "huge image": rig.replace(b"width_px: 1240", b"width_px: 1e300"),
@@ -129,34 +129,34 @@ def _names() -> Iterator[Hostile]:
 
 def _archives() -> Iterator[Hostile]:
     good = _dataset()
-    bomb = _zip({"lidar/000000.npy": bytes(300_000_000)})
-    lying = bytearray(_zip({"lidar/000000.npy": bytes(1000)}))
+    bomb = zipped({"lidar/000000.npy": bytes(300_000_000)})
+    lying = bytearray(zipped({"lidar/000000.npy": bytes(1000)}))
     place = lying.rfind(b"PK\x01\x02")
     lying[place + 24 : place + 28] = struct.pack("<I", 5)
-    encrypted = bytearray(_zip(good))
+    encrypted = bytearray(zipped(good))
     for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         encrypted[encrypted.find(mark) + offset] |= 1
     contents = {
         "bomb": bomb,
-        "bomb in a bomb": _zip({"lidar/a.npy": bomb}),
-        "many files": _zip({f"lidar/{i}.npy": b"" for i in range(100_001)}),
-        "parent folder": _zip({"../evil.npy": b""}),
-        "absolute": _zip({"/tmp/evil.npy": b""}),
-        "backslash": _zip({"..\\evil.npy": b""}),
-        "in the middle": _zip({"lidar/../../evil.npy": b""}),
-        "hidden": _zip({"lidar/.bashrc": b""}),
-        "long name": _zip({f"lidar/{'x' * 5000}.npy": b""}),
-        "case": _zip({"lidar/a.npy": b"", "lidar/A.npy": b""}),
-        "file for a folder": _zip({"lidar/a": b"", "rig.yaml": b"", "cameras/lidar/lidar": b""}),
+        "bomb in a bomb": zipped({"lidar/a.npy": bomb}),
+        "many files": zipped({f"lidar/{i}.npy": b"" for i in range(100_001)}),
+        "parent folder": zipped({"../evil.npy": b""}),
+        "absolute": zipped({"/tmp/evil.npy": b""}),
+        "backslash": zipped({"..\\evil.npy": b""}),
+        "in the middle": zipped({"lidar/../../evil.npy": b""}),
+        "hidden": zipped({"lidar/.bashrc": b""}),
+        "long name": zipped({f"lidar/{'x' * 5000}.npy": b""}),
+        "case": zipped({"lidar/a.npy": b"", "lidar/A.npy": b""}),
+        "file for a folder": zipped({"lidar/a": b"", "rig.yaml": b"", "cameras/lidar/lidar": b""}),
         "link": _link(),
-        "truncated": _zip(good)[:-100],
+        "truncated": zipped(good)[:-100],
         "encrypted": bytes(encrypted),
         "lie about a size": bytes(lying),
-        "unknown method": _zip(good).replace(
+        "unknown method": zipped(good).replace(
             b"PK\x01\x02\x14\x03\x14\x00\x00\x00\x08\x00",
             b"PK\x01\x02\x14\x03\x14\x00\x00\x00\x63\x00",
         ),
-        "empty": _zip({}),
+        "empty": zipped({}),
     }
     for name, content in contents.items():
         yield Hostile(f"archive: {name}", "calibrations", {"recording": content})
@@ -182,7 +182,7 @@ def _recordings() -> Iterator[Hostile]:
         "rig bomb": {**good, "rig.yaml": b"a: " + b"[" * 40_000},
     }
     for name, files in changes.items():
-        yield Hostile(f"recording: {name}", "calibrations", {"recording": _zip(files)})
+        yield Hostile(f"recording: {name}", "calibrations", {"recording": zipped(files)})
     bags = {
         "ROS 1 mark alone": b"#ROSBAG V2.0\n",
         "ROS 1 with a huge record": b"#ROSBAG V2.0\n" + struct.pack("<I", 2**31 - 1) + bytes(50),
@@ -203,7 +203,7 @@ def _dataset() -> dict[str, bytes]:
     return {name: (SAMPLE / name).read_bytes() for name in names}
 
 
-def _zip(files: Mapping[str, bytes]) -> bytes:
+def zipped(files: Mapping[str, bytes]) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, content in files.items():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.service.access import add_token, load_tokens
+from calibgraph.service.access import COOKIE, add_token, load_tokens
 from calibgraph.service.places import open_roots
 from calibgraph.service.serve import Address, require_certificate, require_safe
 from calibgraph.service.shield import STRICT_HEADERS
@@ -53,7 +54,8 @@ def expected(method: str, path: str, caller: str) -> set[int]:
 
 def test_every_operation_asks_who_calls(guarded: Guarded) -> None:
     client, callers, id = guarded
-    paths = client.get("/openapi.json").json()["paths"]
+    app: Any = client.app
+    paths = app.openapi()["paths"]
     operations = [(m.upper(), path) for path, item in paths.items() for m in item]
     assert len(operations) >= 19
     wrong = []
@@ -131,3 +133,34 @@ def test_files_that_are_no_certificate_are_named(tmp_path: Path) -> None:
 def test_an_empty_root_is_not_the_working_folder() -> None:
     with pytest.raises(FileError, match="--root: is empty"):
         open_roots(("",))
+
+
+@pytest.mark.parametrize(
+    ("api_docs", "unknown", "known"),
+    [
+        ("token", (401, 303), (200, 200)),
+        ("open", (200, 200), (200, 200)),
+        ("off", (404, 404), (404, 404)),
+    ],
+)
+def test_the_operator_chooses_who_reads_the_description_of_the_api(
+    make_server: Make,
+    tmp_path: Path,
+    api_docs: str,
+    unknown: tuple[int, int],
+    known: tuple[int, int],
+) -> None:
+    path = tmp_path / "tokens.yaml"
+    (token,) = make_tokens(path, ("ours", "read"))
+    client = make_server(tokens=path, api_docs=api_docs)
+    secret = token["Authorization"].removeprefix("Bearer ")
+
+    def statuses(headers: dict[str, str]) -> tuple[int, int]:
+        cookie = {"Cookie": f"{COOKIE}={secret}"} if headers else {}
+        return (
+            client.get("/openapi.json", headers=headers).status_code,
+            client.get("/docs", headers=cookie).status_code,
+        )
+
+    assert (statuses({}), statuses(token)) == (unknown, known)
+    assert make_server("alone").get("/openapi.json").status_code == 200

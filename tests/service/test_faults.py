@@ -13,7 +13,6 @@ from typing import Any
 
 import httpx
 import pytest
-import uvicorn
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
@@ -21,6 +20,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.service import submission
 from calibgraph.service.app import create_app
 from calibgraph.service.database import DATABASE
+from calibgraph.service.serve import Address, Server
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
 
@@ -29,7 +29,7 @@ from tests.service.conftest import URL, Make, Problem, service_folder
 def on_a_port(settings: Settings) -> Iterator[tuple[str, int, Any]]:
     """A server on loopback: its host, its port, its app."""
     app = create_app(settings)
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning"))
+    server = Server(app, Address(port=0))
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:

@@ -66,7 +66,7 @@ def test_a_database_of_before_that_field_gets_its_column(tmp_path: Path) -> None
     engine.dispose()
     engine = open_database(tmp_path, None, "owner")
     assert "cannot_tell" in {column["name"] for column in inspect(engine).get_columns("jobs")}
-    assert JobTable(engine).ids() == set()
+    assert JobTable(engine).states() == {}
     engine.dispose()
 
 

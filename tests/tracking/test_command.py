@@ -135,6 +135,24 @@ def test_a_number_that_nothing_can_follow_is_left_out(
     assert f"its {'number' if key == 'frame' else key} {2**63 - 1} is the largest" in err
 
 
+@pytest.mark.parametrize(
+    ("key", "number"),
+    [("frame", 2**63 - 2), ("frame", 2**53), ("frame", 10**13), ("stamp_ns", 2**63 - 2)],
+)
+def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
+    key: str, number: int, world: World, piped: Callable[..., Any], tmp_path: Path
+) -> None:
+    contents = [content_of(table) for table in world.tables]
+    for place, content in enumerate(contents):
+        content["stamp_ns"] = 10**18 + place
+    wrong = {**contents[6], key: number}
+    given = [json.dumps(c).encode() + b"\n" for c in (*contents[:6], wrong, *contents[6:])]
+    code, out, err = piped(world.rig, b"".join(given), "--out", tmp_path / "out")
+    assert code == 0
+    assert frames_in(out) == [content["frame"] for content in contents]
+    assert f"{number} is far beyond" in err
+
+
 @pytest.mark.parametrize("kind", ["one", "fisheye", "mixed", "tied"])
 def test_any_rig_continues_with_the_same_lines(
     kind: str, mixed_rig: Rig, call: Call, tmp_path: Path

@@ -21,7 +21,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import CalibrationError, FileError, in_words
 from calibgraph.io.bags.livox import LIVOX_CLOUDS, read_custom_msg
 
 if TYPE_CHECKING:
@@ -281,6 +281,6 @@ def _errors_in_one_line(path: Path) -> Iterator[None]:
         repair = _REPAIR.get(path.suffix.lower(), _REPAIR_ROS2)
         raise FileError(
             path,
-            f"is truncated, was not closed or is no ROS bag ({error or type(error).__name__}); "
+            f"is truncated, was not closed or is no ROS bag ({in_words(error)}); "
             f"record or copy it again, or repair it with `{repair}`",
         ) from error

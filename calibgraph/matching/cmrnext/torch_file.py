@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from calibgraph.errors import FileError
+from calibgraph.errors import FileError, in_words
 
 MAX_BYTES = 2 * 2**30
 MAX_ENTRIES = 100_000
@@ -105,7 +105,7 @@ def read_torch_file(path: Path) -> dict[Any, Any]:
 
 def _reason(error: Exception) -> str:
     """The cause alone: torch surrounds it with advice to load the file unsafely."""
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    text = in_words(error)
     cause = re.search(r"(?:WeightsUnpickler error:|\n\n)\s*(?!\n)(\S[^\n]*)", text)
     return (cause[1] if cause else text.splitlines()[0]).rstrip(". ")
 

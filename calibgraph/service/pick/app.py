@@ -11,6 +11,7 @@ from fastapi.staticfiles import StaticFiles
 from calibgraph.errors import CalibrationError
 from calibgraph.service.access import Gate
 from calibgraph.service.app import STATIC_FOLDER
+from calibgraph.service.connections import LimitedConnection
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.pick.router import pick_router
 from calibgraph.service.pick.workspace import Workspace
@@ -57,6 +58,11 @@ def loopback_socket(port: int) -> socket.socket:
 def pick_server(workspace: Workspace) -> uvicorn.Server:
     """A server of a session; ``run(sockets=[...])`` serves until it is interrupted."""
     config = uvicorn.Config(
-        create_pick_app(workspace), log_level="warning", server_header=False, access_log=False
+        create_pick_app(workspace),
+        http=LimitedConnection,
+        ws="none",
+        log_level="warning",
+        server_header=False,
+        access_log=False,
     )
     return uvicorn.Server(config)
