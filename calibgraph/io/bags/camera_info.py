@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import DatasetError
-from calibgraph.model.rig import MODELS_OF_OTHERS
-from factors import LensModel
-from factors.lens import COEFFICIENTS
+from calibgraph.io.lenses import fitted_coefficients, intrinsics_of_matrix, lens_model
 
 Array = NDArray[np.float64]
-
-_MODELS: Mapping[str, LensModel] = {**MODELS_OF_OTHERS, **{model: model for model in COEFFICIENTS}}
 
 
 @dataclass(frozen=True)
@@ -43,17 +37,13 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
         rectified: whether the images are rectified: by R, and of the camera matrix P.
 
     Raises:
-        DatasetError: if the camera is not calibrated, or its lens model is unknown.
+        FileError: if the camera is not calibrated, or its lens model is unknown.
     """
     frame = message.header.frame_id.lstrip("/")
     K = np.reshape(_field(message, "K"), (3, 3))
     if rectified:
         K = np.reshape(_field(message, "P"), (3, 4))[:, :3]
-    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise DatasetError(
-            f"{where}: holds no focal length, so the camera is not calibrated; calibrate its lens, "
-            "or give a rig with it (--rig)"
-        )
+    intrinsics_of_matrix(K, where)
     model, distortion = ("pinhole", []) if rectified else _distortion(message, where)
     R = np.reshape(_field(message, "R"), (3, 3))
     content = {"model": model, "distortion": distortion, **_on_image(message, K)}
@@ -82,16 +72,7 @@ def _on_image(message: Any, K: Array) -> dict[str, Any]:
 
 def _distortion(message: Any, where: str) -> tuple[str, list[float]]:
     """Lens model and coefficients; both may be empty for none, and zeros appended."""
-    given = np.trim_zeros(_field(message, "D"), "b").tolist()
-    model = _MODELS.get(message.distortion_model.strip().lower(), None if given else "pinhole")
-    if model is not None and len(given) <= max(COEFFICIENTS[model]):
-        return model, _padded(given, COEFFICIENTS[model])
-    raise DatasetError(
-        f"{where}: distortion model {message.distortion_model!r} with {len(given)} coefficients is "
-        f"unknown; known are {', '.join(_MODELS)}: give a rig with the lens (--rig)"
-    )
-
-
-def _padded(values: list[float], lengths: Sequence[int]) -> list[float]:
-    length = min(each for each in lengths if each >= len(values))
-    return values + [0.0] * (length - len(values))
+    given = _field(message, "D")
+    stated = message.distortion_model.strip() or ("" if given.any() else "none")
+    model = lens_model(stated, where)
+    return model, list(fitted_coefficients(given.tolist(), model, where))

@@ -12,8 +12,8 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
-from calibgraph.io.formats.part import Array, Part, RelativeCamera
+from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame, is_optical
+from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
@@ -75,6 +75,7 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
+        notes: what was assumed or left out in the files, a line each.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
+    notes: Sequence[str] = ()
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -132,11 +134,14 @@ def read_rig_parts(
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
-    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
+    named = {name: each for part in parts for name, each in part.camera_frames.items()
+             if is_optical(each) and each in tree.names}  # fmt: skip
+    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, {**named, **(camera_frames or {})})
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
     lidar = lidar_frame or "lidar"
-    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names)
+    notes = [note for part in parts for note in part.notes]
+    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names, notes)
 
 
 def _read_all(
@@ -149,6 +154,13 @@ def _read_all(
     """
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    lenses = sorted({name for part in read for name in part.lenses})
+    if len(lenses) == 1:
+        read = [part.rename({ONLY_CAMERA: lenses[0]}) for part in read]
+    for part in read:
+        if ONLY_CAMERA in part.T_camera_lidar and len(lenses) > 1:
+            raise FileError(part.path, f"names no camera; there are {', '.join(lenses)}: give it "
+                            "as NAME=FILE")  # fmt: skip
     known = {name for part in read for name in (*part.lenses, *part.T_camera_lidar)}
     if not any(part.lenses for part in read):
         raise CalibrationError(

@@ -6,12 +6,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text
 from calibgraph.io.formats.comments import commented_xml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
@@ -41,16 +38,12 @@ def _text(values: list[float] | NDArray[np.float64]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def read_urdf(path: Path) -> Part:
+def read_urdf(root: ElementTree.Element, path: Path) -> Part:
     """The frames of a URDF: its joints at their zero position.
 
     Raises:
-        FileError: if it is not XML, not a URDF, or not expanded.
+        FileError: if it is not a URDF, or not expanded.
     """
-    try:
-        root = fromstring(read_text(path), forbid_dtd=True)
-    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
-        raise FileError(path, f"is not a URDF: {error}") from error
     if root.tag != "robot":
         raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
     if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):
