@@ -100,9 +100,14 @@ def export(
     ] = False,
 ) -> None:
     """Write a calibration in the format of another program, with its direction as a comment."""
+    import numpy as np
+
     from calibgraph.io.formats.export import export_calibration
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
     with checked_arguments():
+        T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         written = export_calibration(
             source,
             out,
@@ -110,9 +115,17 @@ def export(
             cameras=camera or None,
             lidar_frame=lidar_frame,
             camera_frame=camera_frame,
-            T_base_lidar=None if lidar_pose is None else _parse_pose(lidar_pose),
+            T_base_lidar=T_base_lidar,
             even_if_failed=even_if_failed,
         )
+        rig = load_rig(source)
+    rig = rig.model_copy(
+        update={"cameras": {name: rig.cameras[name] for name in camera or rig.cameras}}
+    )
+    if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
+        print_plain(terminal(), f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
+    for line in find_implausible(rig):
+        print_plain(terminal(), f"warning: {line}")
     for path in written:
         print_plain(terminal(), f"{path}: written ({format})")
 
@@ -121,7 +134,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
     """The (4, 4) of six numbers.
 
     Raises:
-        ValueError: if they are not six.
+        ValueError: if they are not six, or an angle is in degrees.
     """
     from calibgraph.io.rotations import pose_of_angles
 
@@ -131,7 +144,10 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
         raise ValueError(
             f"--lidar-pose {text!r}: give six numbers, X Y Z ROLL PITCH YAW"
         ) from error
-    return pose_of_angles((x, y, z), (roll, pitch, yaw))
+    try:
+        return pose_of_angles((x, y, z), (roll, pitch, yaw))
+    except ValueError as error:
+        raise ValueError(f"--lidar-pose {text!r}: {error}") from error
 
 
 def import_(
@@ -149,25 +165,30 @@ def import_(
     ] = 0.5,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
-    from calibgraph.io.formats.rig_import import import_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.io.formats.words import describe_rig
+    from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
 
     named = [parse_file(text) for text in files]
     with checked_arguments():
-        rig = import_rig(
+        parts = read_rig_parts(
             [path for _, path in named],
             names={path: name for name, path in named if name},
             rename=parse_names("--rename", rename),
             lidar_frame=lidar_frame,
             camera_frames=parse_names("--camera-frame", camera_frame),
+        )
+        rig = parts.to_rig(
             size_px=None if size is None else parse_size(size),
             relative_sigma_deg=relative_sigma_deg,
             relative_sigma_cm=relative_sigma_cm,
         )
     rig.save(out, first_line=yaml_mark("import"))
-    for sentence in describe_rig(rig):
-        print_plain(terminal(), sentence)
+    notes = [f"note: {line}" for line in parts.notes]
+    warnings = [f"warning: {line}" for line in find_implausible(rig)]
+    for line in (*notes, *warnings, *describe_rig(rig)):
+        print_plain(terminal(), line)
     cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
     print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
 

@@ -67,8 +67,7 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
     Raises:
         FileError: if it is malformed, or a lens is none of ours.
     """
-    maps = [_Map(keys, f"{path}{keys and ': '}{': '.join(keys)}", each)
-            for keys, each in _maps(content)]  # fmt: skip
+    maps = [_Map(keys, ": ".join([str(path), *keys]), each) for keys, each in _maps(content)]
     cameras = [each for each in maps if each.numbers.hold_a_lens]
     single = len(cameras) == 1
     lenses: dict[str, CameraLens] = {}

@@ -58,7 +58,11 @@ def _link(joint: ElementTree.Element, path: Path) -> FrameLink:
     attributes = {} if origin is None else origin.attrib
     xyz = _numbers(attributes.get("xyz", "0 0 0"), joint, path)
     rpy = _numbers(attributes.get("rpy", "0 0 0"), joint, path)
-    return FrameLink(parent.get("link", ""), child.get("link", ""), pose_of_angles(xyz, rpy))
+    try:
+        T = pose_of_angles(xyz, rpy)
+    except ValueError as error:
+        raise FileError(path, f"joint {joint.get('name')!r}: {error}") from error
+    return FrameLink(parent.get("link", ""), child.get("link", ""), T)
 
 
 def _numbers(text: str, joint: ElementTree.Element, path: Path) -> list[float]:
