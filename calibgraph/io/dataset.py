@@ -21,8 +21,9 @@ from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
@@ -111,11 +112,13 @@ def load_dataset(
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
-    rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    rigs = [each.rig for each in read]
     for path, other in zip(paths, rigs, strict=True):
         _require_same_lenses(paths[0], rigs[0], path, other)
     from_bag = rig is None and is_bag(paths[0])
-    notes = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
+    notes = tuple(note for each in read for note in each.notes)
+    notes += (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
     data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""

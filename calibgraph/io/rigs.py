@@ -10,7 +10,8 @@ from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import rig_of_bag
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
-from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.incomplete import RigRead
+from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
 from calibgraph.io.published import published_format
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
@@ -31,14 +32,28 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     Raises:
         FileError, DatasetError: if there is none, or it is malformed.
     """
+    return read_rig(path, bag).rig
+
+
+def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
+    """As :func:`load_rig`, with notes on the cameras of a data set that were left out.
+
+    Raises:
+        FileError, DatasetError: if there is none, or it is malformed.
+    """
     path = rig_file(path)
     if is_bag(path):
-        return rig_of_bag(path, bag)
+        return RigRead(rig_of_bag(path, bag))
     published = published_format(path)
     if published is not None:
-        return published.load_rig(path)
+        return published.read_rig(path)
     if path.name == CALIBRATION_NAME:
-        return load_kitti_rig(path.parent)
+        return read_kitti_rig(path.parent)
+    return RigRead(_rig_of_file(path))
+
+
+def _rig_of_file(path: Path) -> Rig:
+    """The rig of a rig file, a result or an export."""
     content = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
     if is_calibration(content):
         return rig_of_calibration(content, path)

@@ -29,7 +29,7 @@ from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2
 from calibgraph.io.formats.urdf import read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
-from calibgraph.io.rigs import is_exported_rig, load_rig
+from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import Camera, Intrinsics
 
 _MAX_BYTES = 32 * 2**20
@@ -124,7 +124,7 @@ def _lens_of_bag(content: Mapping[str, Any], path: Path) -> CameraLens:
 
 
 def _part_of_rig(path: Path) -> Part:
-    rig = load_rig(path)
+    rig, notes = read_rig(path)
     return Part(
         path,
         lenses={name: _lens(camera) for name, camera in rig.cameras.items()},
@@ -133,6 +133,7 @@ def _part_of_rig(path: Path) -> Part:
             RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
             for p in rig.relative_poses
         ),
+        notes=notes,
     )
 
 
