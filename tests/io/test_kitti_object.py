@@ -68,7 +68,7 @@ def test_one_calibration_leaves_nothing_out(training: Path) -> None:
     [
         (("R0_rect", "R0_rect: 1 0 0"), "line 'R0_rect': expected 9 numbers"),
         (("Tr_velo_to_cam", ""), "line 'Tr_velo_to_cam' is missing"),
-        (("P2", "P2: " + " ".join(["nan"] * 12)), "is no projection matrix"),
+        (("P2", "P2: " + " ".join(["nan"] * 12)), "is no camera matrix"),
     ],
 )
 def test_a_wrong_calibration_is_one_line(

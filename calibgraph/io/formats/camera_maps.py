@@ -20,7 +20,7 @@ extrinsic_R, extrinsic_T           FAST-LIO, FAST-LIVO          p_imu = R p_lida
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +45,11 @@ _T_LIDAR_CAMERA = (("cameraextrinsicmat",), ("tlidarcamera",), ("tlidarcam",), (
 _T_IMU_CAMERA = (("extrinsicrotation", "extrinsictranslation"), ("cameraextr", "cameraextt"))
 _T_IMU_LIDAR = ("extrinsicr", "extrinsict")
 _BODY = ("bodytcam0", "bodytcam1")
-_NOT_READ = ("lidartocamtx", "extrinsicrot", "extrinsicrpy")
-"""Of LVI-SAM and LIO-SAM: versions of these programs differ in the axes that they mean."""
+_NOT_READ = {
+    "lidartocamtx": "versions of LVI-SAM mean different axes by it",
+    "extrinsicrot": "versions of LIO-SAM mean different axes by it",
+    "cameraposes": "it places cameras against each other, not against a LiDAR",
+}
 _DEEPEST = 6
 _SAME = 1e-6  # of transforms that are given twice: they may be rounded
 _PROGRAMS = (
@@ -69,31 +72,59 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
     """
     maps = [_Map(keys, ": ".join([str(path), *keys]), each) for keys, each in _maps(content)]
     cameras = [each for each in maps if each.numbers.hold_a_lens]
-    single = len(cameras) == 1
+    owner = name or ONLY_CAMERA
+    if len(cameras) == 1:
+        owner = name or cameras[0].name or path.stem
+    named = [(_camera_of(each, owner, path, single=len(cameras) == 1), each) for each in maps]
+    lenses, notes = _lenses(named, path)
+    links = [link for camera, each in named for link in each.links(camera)]
+    part = Part(
+        path,
+        lenses,
+        _extrinsics(named, path),
+        links=tuple(links),
+        camera_frames={
+            camera: f"{frame_id(camera)}_optical_frame"
+            for camera, each in named
+            if any(each.links(camera))
+        },
+        notes=(*notes, *(note for _, each in named for note in each.notes())),
+    )
+    if part.is_empty and any(each.numbers.hold_a_size for each in maps):
+        raise FileError(path, "holds no camera matrix; expected the key camera_matrix, K or fx")
+    return None if part.is_empty else part
+
+
+def _camera_of(each: _Map, owner: str, path: Path, *, single: bool) -> str:
+    """The camera that a mapping is about: its own, or that of the whole file."""
+    if each.target:
+        return each.target
+    return owner if single or not each.numbers.hold_a_lens else each.name or path.stem
+
+
+def _lenses(
+    named: Iterable[tuple[str, _Map]], path: Path
+) -> tuple[dict[str, CameraLens], list[str]]:
+    """The lenses by camera, and what was assumed of them."""
     lenses: dict[str, CameraLens] = {}
     notes: list[str] = []
-    for each in cameras:
-        camera = (name if single else None) or each.name or path.stem
-        if camera in lenses:
-            raise FileError(path, f"gives two cameras the name {camera!r}; give each its own")
-        lenses[camera], note = each.numbers.read()
-        notes += [note] if note else []
-    owner = next(iter(lenses)) if single else name or ONLY_CAMERA
+    for camera, each in named:
+        if each.numbers.hold_a_lens:
+            if camera in lenses:
+                raise FileError(path, f"gives two cameras the name {camera!r}; give each its own")
+            lenses[camera], note = each.numbers.read()
+            notes += [note] if note else []
+    return lenses, notes
+
+
+def _extrinsics(named: Iterable[tuple[str, _Map]], path: Path) -> dict[str, Array]:
+    """(4, 4) T_camera_lidar by camera."""
     T: dict[str, Array] = {}
-    links: list[FrameLink] = []
-    for each in maps:
-        is_named = each.numbers.hold_a_lens or each.target
-        camera = each.target or (each.name or path.stem if is_named and not single else owner)
+    for camera, each in named:
         for found in each.T_camera_lidar():
             if np.abs(T.setdefault(camera, found) - found).max() > _SAME:
                 raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
-        links += each.links(camera)
-        notes += each.notes()
-    if not (lenses or T or links) and any(each.numbers.hold_a_size for each in maps):
-        raise FileError(path, "holds no camera matrix; expected the key camera_matrix, K or fx")
-    if not (lenses or T or links):
-        return None
-    return Part(path, lenses, T, links=tuple(links), notes=tuple(notes))
+    return T
 
 
 class _Map:
@@ -138,11 +169,12 @@ class _Map:
 
     def notes(self) -> Iterator[str]:
         """What is left out."""
-        for name in filter(self._has, _NOT_READ):
-            yield (
-                f"{self._where}: {self.numbers.key(name)} is not read: versions of LVI-SAM and "
-                "LIO-SAM mean different axes by it; give the extrinsic by another file"
-            )
+        for name, why in _NOT_READ.items():
+            if self._has(name):
+                yield (
+                    f"{self._where}: {self.numbers.key(name)} is not read: {why}; give the pose of "
+                    "the camera by another file"
+                )
 
     def _transform(self, names: tuple[str, ...]) -> Array:
         """(4, 4) of a matrix of 3 or 4 rows, or of a rotation and a translation.

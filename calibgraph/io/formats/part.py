@@ -60,6 +60,11 @@ class Part:
     camera_frames: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether it holds no lens, no extrinsic and no frame."""
+        return not (self.lenses or self.T_camera_lidar or self.links)
+
     def rename(self, names: Mapping[str, str]) -> Part:
         """The same with other names of some cameras; frames keep theirs, but for ONLY_CAMERA's."""
         only = frame_id(names.get(ONLY_CAMERA, ONLY_CAMERA))
@@ -80,5 +85,8 @@ class Part:
                 )
                 for link in self.links
             ),
-            camera_frames={names.get(name, name): f for name, f in self.camera_frames.items()},
+            camera_frames={
+                names.get(name, name): frames.get(frame, frame)
+                for name, frame in self.camera_frames.items()
+            },
         )

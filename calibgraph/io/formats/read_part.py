@@ -11,6 +11,7 @@ from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
+from calibgraph.io.formats.basalt import is_basalt, read_basalt
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.camera_maps import read_camera_maps
 from calibgraph.io.formats.colmap import read_colmap
@@ -102,6 +103,7 @@ _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ..
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
     (is_kalibr, lambda content, path, _: read_kalibr(content, path)),
     (is_koide, read_koide),
+    (is_basalt, lambda content, path, _: read_basalt(content, path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )
 
