@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,8 @@ from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from calibgraph.model.rig import Rig
 
 _LIST = "list"
 
@@ -104,7 +107,7 @@ def export(
 
     from calibgraph.io.formats.export import export_calibration
     from calibgraph.io.rigs import load_rig
-    from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
+    from calibgraph.model.plausibility import MAX_DISTANCE_M
 
     with checked_arguments():
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
@@ -124,8 +127,7 @@ def export(
     )
     if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
         print_plain(terminal(), f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
-    for line in find_implausible(rig):
-        print_plain(terminal(), f"warning: {line}")
+    print_doubts(rig)
     for path in written:
         print_plain(terminal(), f"{path}: written ({format})")
 
@@ -167,7 +169,6 @@ def import_(
     """Build a rig file from files of others, and print where each camera looks and sits."""
     from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.io.formats.words import describe_rig
-    from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
 
     named = [parse_file(text) for text in files]
@@ -185,12 +186,21 @@ def import_(
             relative_sigma_cm=relative_sigma_cm,
         )
     rig.save(out, first_line=yaml_mark("import"))
-    notes = [f"note: {line}" for line in parts.notes]
-    warnings = [f"warning: {line}" for line in find_implausible(rig)]
-    for line in (*notes, *warnings, *describe_rig(rig)):
-        print_plain(terminal(), line)
+    print_doubts(rig, parts.notes)
+    for sentence in describe_rig(rig):
+        print_plain(terminal(), sentence)
     cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
     print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
+
+
+def print_doubts(rig: Rig, notes: Sequence[str] = ()) -> None:
+    """Print what was assumed of files, and the values of a rig that cannot be right."""
+    from calibgraph.model.plausibility import find_implausible
+
+    for note in notes:
+        print_plain(terminal(), f"note: {note}")
+    for line in find_implausible(rig):
+        print_plain(terminal(), f"warning: {line}")
 
 
 def parse_file(text: str) -> tuple[str, Path]:
