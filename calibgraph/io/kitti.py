@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.images import image_size
+from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.model.rig import Camera, Rig
 
 Array = NDArray[np.float64]
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"
-
-_ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 
 
 def camera_folders(sequence: Path) -> dict[str, Path]:
@@ -81,21 +80,15 @@ def camera_of_projection(
         FileError: if P is no such matrix, or the transform is none.
     """
     K = P[:, :3]
-    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0):
+    intrinsics = intrinsics_of_matrix(K, where)
+    if not np.isfinite(P).all():
         raise FileError(where, f"is no projection matrix of a camera: {P.tolist()}")
-    plain = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
-    if not np.allclose(K, plain, rtol=0, atol=_ROUNDED):
-        raise FileError(
-            where,
-            f"begins with {K.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; undo its scale, "
-            "and undistort the skew",
-        )
     shift = np.eye(4)
     shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
     content = {
         "width_px": size_px[0],
         "height_px": size_px[1],
-        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "intrinsics_px": intrinsics,
         "T_camera_lidar": shift @ T_rectified_lidar,
     }
     return checked_model(Camera, content, f"{where} and the LiDAR's pose")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.frame_files import FrameFiles
+from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.io.nuscenes_tables import (
     LIDAR,
     Instant,
@@ -63,7 +64,7 @@ def _camera(tables: Tables, taken: SampleData, T_ego_lidar: Array, where: Path) 
     content = {
         "width_px": taken.width,
         "height_px": taken.height,
-        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "intrinsics_px": intrinsics_of_matrix(K, f"{where}: {sensor.token}: camera_intrinsic"),
         "T_camera_lidar": invert(sensor.matrix(where)) @ T_ego_lidar,
     }
     return checked_model(Camera, content, f"{where}: {sensor.token}")

@@ -49,12 +49,12 @@ def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2: is no projection matrix"),
-        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2: is no projection matrix"),
-        ("P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0", "undo its scale"),
-        ("P2: 700 80 600 0 0 700 180 0 0 0 1 0", "undistort the skew"),
+        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2: is no camera matrix"),
+        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2: is no camera matrix"),
+        ("P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0", "undo its scale: divide by 2"),
+        ("P2: 700 80 600 0 0 700 180 0 0 0 1 0", "its skew is 80 px"),
         ("P3: 700 0 600 0 0 700 180 0 0 0 1 0\nP3: 7 0 6 0 0 7 2 0 0 0 1 0", "P3 is given twice"),
-        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2: is no projection matrix"),
+        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2: is no camera matrix"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and the LiDAR's pose: T_camera_lidar"),
         ("Tr: 1 0 0", "expected 12 numbers"),
         ("\xff\xfe", "is not a text file"),

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.lenses import CameraLens, lens_model, listed_coefficients
-from calibgraph.io.formats.part import Part
-from calibgraph.model.rig import Finite, Positive, Size
+import numpy as np
 
-_Nine = tuple[
-    Positive, Finite, Finite, Finite, Positive, Finite, Finite, Finite, Finite
-]  # fmt: skip
+from calibgraph.files import StrictNumbers, checked_model
+from calibgraph.io.formats.part import Part
+from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix, lens_model, listed_coefficients
+from calibgraph.model.rig import Finite, Size
+
+_Nine = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite]
 
 
 class _Matrix(StrictNumbers):
@@ -49,10 +49,11 @@ def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> P
         FileError: if it is malformed, or the lens is none of ours.
     """
     info = checked_model(_CameraInfo, content, path)
-    fx, _, cx, _, fy, cy, *_ = info.camera_matrix.data
+    K = np.reshape(info.camera_matrix.data, (3, 3))
+    intrinsics = intrinsics_of_matrix(K, f"{path}: camera_matrix")
     model = lens_model(info.distortion_model, path)
     coefficients = listed_coefficients(info.distortion_coefficients.data, model, path)
     size = (info.image_width, info.image_height)
-    lens = CameraLens(model, size, (fx, fy, cx, cy), coefficients)
+    lens = CameraLens(model, size, intrinsics, coefficients)
     given = info.camera_name.strip("/").replace("/", "_")  # narrow_stereo/left: no folder's name
     return Part(path, lenses={name or given or path.stem: lens})

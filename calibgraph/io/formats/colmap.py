@@ -8,8 +8,8 @@ from pathlib import Path
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
-from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients
 from calibgraph.io.formats.part import Part
+from calibgraph.io.lenses import CameraLens, fitted_coefficients, listed_intrinsics
 from factors import LensModel
 
 _HALF_PIXEL = 0.5
@@ -73,6 +73,6 @@ def _lens(words: list[str], path: Path, number: int) -> tuple[str, CameraLens]:
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise FileError(path, f"{where}: {name} has {count} parameters, found {words[_FIELDS:]}")
     fx, fy, cx, cy = intrinsics(values)
-    shifted = (fx, fy, cx - _HALF_PIXEL, cy - _HALF_PIXEL)
+    shifted = listed_intrinsics((fx, fy, cx - _HALF_PIXEL, cy - _HALF_PIXEL), f"{path}: {where}")
     coefficients = fitted_coefficients(values[start:], model, path)
     return f"camera_{identity}", CameraLens(model, (width, height), shifted, coefficients)

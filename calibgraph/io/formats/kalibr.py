@@ -12,18 +12,18 @@ from pydantic import ConfigDict, Field
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
-from calibgraph.io.formats.lenses import (
-    CameraLens,
-    carried_coefficients,
-    lens_model,
-    listed_coefficients,
-    no_place_for,
-    unified_coefficients,
-)
+from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.io.lenses import (
+    CameraLens,
+    lens_model,
+    listed_coefficients,
+    listed_intrinsics,
+    unified_coefficients,
+)
 from calibgraph.model.geometry import relative_transform
-from calibgraph.model.rig import Camera, Finite, Positive, Size, Transform
+from calibgraph.model.rig import Camera, Finite, Size, Transform
 
 _DERIVED = "computed from T_cam_lidar"
 
@@ -107,14 +107,6 @@ class _Camera(StrictNumbers):
     calibgraph: _Own = _Own()
 
 
-class _Focal(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite]
-
-
-class _Unified(StrictNumbers):
-    intrinsics: tuple[Finite, Positive, Positive, Finite, Finite]
-
-
 class _Camchain(StrictNumbers):
     cameras: Annotated[dict[str, _Camera], Field(min_length=1)]
 
@@ -167,9 +159,9 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
     model = lens_model(camera.distortion_model, path)
     if camera.camera_model != "pinhole":
         model = lens_model(camera.camera_model, path)  # raises: ds, eucm
-    focal = checked_model(_Focal, {"intrinsics": camera.intrinsics}, path)
+    intrinsics = listed_intrinsics(camera.intrinsics, f"{path}: intrinsics")
     coefficients = listed_coefficients(camera.distortion_coeffs, model, path)
-    return CameraLens(model, camera.resolution, focal.intrinsics, coefficients)
+    return CameraLens(model, camera.resolution, intrinsics, coefficients)
 
 
 def _omnidirectional(camera: _Camera, path: Path) -> CameraLens:
@@ -182,7 +174,6 @@ def _omnidirectional(camera: _Camera, path: Path) -> CameraLens:
         raise FileError(
             path, f"omni-{camera.distortion_model} is no lens here; calibrate it as omni-radtan"
         )
-    xi, *focal = checked_model(_Unified, {"intrinsics": camera.intrinsics}, path).intrinsics
-    coefficients = unified_coefficients(xi, camera.distortion_coeffs, path)
-    fx, fy, cx, cy = focal
-    return CameraLens("omnidirectional", camera.resolution, (fx, fy, cx, cy), coefficients)
+    intrinsics = listed_intrinsics(camera.intrinsics[1:], f"{path}: intrinsics after xi")
+    coefficients = unified_coefficients(camera.intrinsics[0], camera.distortion_coeffs, path)
+    return CameraLens("omnidirectional", camera.resolution, intrinsics, coefficients)

@@ -10,16 +10,16 @@ from typing import Any
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, read_text
 from calibgraph.io.formats.comments import stated_json
-from calibgraph.io.formats.lenses import (
-    CameraLens,
-    carried_coefficients,
-    lens_model,
-    listed_coefficients,
-    no_place_for,
-    unified_coefficients,
-)
+from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.lenses import (
+    CameraLens,
+    lens_model,
+    listed_coefficients,
+    listed_intrinsics,
+    unified_coefficients,
+)
 from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera as RigCamera
@@ -64,14 +64,6 @@ class _Camera(StrictNumbers):
     camera_model: str
     intrinsics: tuple[Finite, ...]
     distortion_coeffs: tuple[Finite, ...] = ()
-
-
-class _Focal(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite]
-
-
-class _Unified(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite, Finite]
 
 
 class _Panorama(StrictNumbers):
@@ -119,13 +111,13 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
     given = camera.distortion_coeffs
     if model == "equirectangular":  # width and height in place of focal lengths
         width, height = checked_model(_Panorama, values, path).intrinsics
-        intrinsics = (width / (2 * math.pi), height / math.pi, width / 2, height / 2)
-        return CameraLens(model, None, intrinsics, ())
+        focal = (width / (2 * math.pi), height / math.pi, width / 2, height / 2)
+        return CameraLens(model, None, listed_intrinsics(focal, path), ())
     if model == "omnidirectional":
-        *focal, xi = checked_model(_Unified, values, path).intrinsics
-        fx, fy, cx, cy = focal
-        return CameraLens(model, None, (fx, fy, cx, cy), unified_coefficients(xi, given, path))
-    intrinsics = checked_model(_Focal, values, path).intrinsics
+        intrinsics = listed_intrinsics(camera.intrinsics[:-1], f"{path}: intrinsics before xi")
+        coefficients = unified_coefficients(camera.intrinsics[-1], given, path)
+        return CameraLens(model, None, intrinsics, coefficients)
+    intrinsics = listed_intrinsics(camera.intrinsics, f"{path}: intrinsics")
     return CameraLens(model, None, intrinsics, listed_coefficients(given, model, path))
 
 

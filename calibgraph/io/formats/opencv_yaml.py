@@ -12,16 +12,17 @@ import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, read_text
-from calibgraph.io.formats.lenses import (
+from calibgraph.io.formats.part import Part
+from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.io.lenses import (
     CameraLens,
+    intrinsics_of_matrix,
     lens_model,
     listed_coefficients,
     unified_coefficients,
 )
-from calibgraph.io.formats.part import Part
-from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
-from calibgraph.model.rig import Finite, Positive, rigid_transform
+from calibgraph.model.rig import Finite, rigid_transform
 from calibgraph.yaml_text import parse_yaml
 
 _ALIASES = {
@@ -82,10 +83,6 @@ class _Camera(StrictNumbers):
     T_camera_lidar: _Matrix | None = None
 
 
-class _Diagonal(StrictNumbers):
-    focal_lengths: tuple[Positive, Positive]
-
-
 def is_opencv(text: str) -> bool:
     """Whether a text is OpenCV's YAML, which other readers refuse for its first line or tags."""
     return text.startswith("%YAML:1.0") or "!!opencv-matrix" in text
@@ -141,12 +138,11 @@ def _lens(camera: _Camera, path: Path) -> CameraLens:
     if camera.xi is not None:
         model = "omnidirectional"
     K = _array(camera.camera_matrix, (3, 3), "the camera matrix", path)
-    fx, fy = checked_model(_Diagonal, {"focal_lengths": (K[0, 0], K[1, 1])}, path).focal_lengths
     size = None
     if camera.width is not None and camera.height is not None:
         size = (camera.width, camera.height)
     coefficients = () if camera.distortion is None else camera.distortion.data
-    intrinsics = (fx, fy, float(K[0, 2]), float(K[1, 2]))
+    intrinsics = intrinsics_of_matrix(K, f"{path}: the camera matrix")
     if camera.xi is None:
         return CameraLens(model, size, intrinsics, listed_coefficients(coefficients, model, path))
     xi = camera.xi

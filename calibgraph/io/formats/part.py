@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.formats.lenses import CameraLens
+from calibgraph.io.lenses import CameraLens
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text, require_file
+from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
@@ -15,15 +15,15 @@ from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.colmap import read_colmap
 from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
 from calibgraph.io.formats.koide import read_koide
-from calibgraph.io.formats.lenses import CameraLens
 from calibgraph.io.formats.names import IMPORT_FORMATS
 from calibgraph.io.formats.opencv_yaml import is_opencv, read_opencv
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2
 from calibgraph.io.formats.urdf import read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
+from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import load_rig
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera, Intrinsics, Rig
 from calibgraph.yaml_text import parse_yaml
 
 _MAX_BYTES = 32 * 2**20
@@ -81,17 +81,15 @@ def _part_of_bag(path: Path) -> Part:
     found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
     return Part(
         path,
-        lenses={name: _lens_of_bag(camera.lens.content) for name, camera in cameras.items()},
+        lenses={name: _lens_of_bag(camera.lens.content, path) for name, camera in cameras.items()},
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
     )
 
 
-def _lens_of_bag(content: Mapping[str, Any]) -> CameraLens:
-    k = content["intrinsics_px"]
+def _lens_of_bag(content: Mapping[str, Any], path: Path) -> CameraLens:
     size = (content["width_px"], content["height_px"])
-    return CameraLens(
-        content["model"], size, (k["fx"], k["fy"], k["cx"], k["cy"]), tuple(content["distortion"])
-    )
+    intrinsics = checked_model(Intrinsics, content["intrinsics_px"], path)
+    return CameraLens(content["model"], size, intrinsics, tuple(content["distortion"]))
 
 
 def _part_of_rig(rig: Rig, path: Path) -> Part:
@@ -107,6 +105,5 @@ def _part_of_rig(rig: Rig, path: Path) -> Part:
 
 
 def _lens(camera: Camera) -> CameraLens:
-    k = camera.intrinsics_px
     size = (camera.width_px, camera.height_px)
-    return CameraLens(camera.model, size, (k.fx, k.fy, k.cx, k.cy), camera.distortion)
+    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion)

@@ -13,9 +13,9 @@ import numpy as np
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
 from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
-from calibgraph.io.formats.lenses import CameraLens
 from calibgraph.io.formats.part import Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
+from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
 
@@ -254,12 +254,11 @@ def _camera(
             "describe its mounting to calibgraph guess",
             camera=name,
         )
-    fx, fy, cx, cy = lens.intrinsics_px
     return {
         "model": lens.model,
         "width_px": size[0],
         "height_px": size[1],
-        "intrinsics_px": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        "intrinsics_px": lens.intrinsics_px,
         "distortion": lens.distortion,
         "T_camera_lidar": T_camera_lidar,
     }
