@@ -79,6 +79,10 @@ class Bag:
         """The topics of these types that have messages, sorted by name."""
         return [each for each in self.topics.values() if each.type in types and each.count]
 
+    def has(self, topic: str) -> bool:
+        """Whether a topic has messages."""
+        return topic in self.topics and bool(self.topics[topic].count)
+
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
@@ -143,6 +147,27 @@ class Bag:
                 f"the message of {topic} recorded at {record_ns} ns is no {kind.type} "
                 f"({error or type(error).__name__}); choose another topic or other frames",
             ) from error
+
+
+class Drive:
+    """A bag, and others of its drive, which are opened one by one as they are asked for."""
+
+    def __init__(self, bag: Bag, beside: Collection[Path] = ()) -> None:
+        self._opened = [bag]
+        self._waiting = [path for path in beside if path != bag.path]
+
+    @property
+    def bag(self) -> Bag:
+        """The first."""
+        return self._opened[0]
+
+    def __iter__(self) -> Iterator[Bag]:
+        number = 0
+        while number < len(self._opened) or self._waiting:
+            if number == len(self._opened):
+                self._opened.append(Bag(self._waiting.pop(0)))
+            yield self._opened[number]
+            number += 1
 
 
 def read_message(path: Path) -> tuple[bytes, Any]:

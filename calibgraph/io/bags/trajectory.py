@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags.frames import BagFrame
-from calibgraph.io.bags.messages import Bag, read_message
+from calibgraph.io.bags.messages import Bag, Drive, read_message
 from calibgraph.io.bags.options import ODOMETRY, BagOptions
 from calibgraph.io.bags.point_clouds import points_of
 from calibgraph.io.bags.transforms import (
@@ -182,7 +182,7 @@ def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, 
             f"{bag.path}: has {len(found)} topics of Odometry ({', '.join(found) or 'none'}); name "
             f"one by --topic {ODOMETRY}=/TOPIC, or use --motion tf or scans"
         )
-    topic, transforms, count = named or found[0], Transforms(bag, options.beside), 0
+    topic, transforms, count = named or found[0], Transforms(Drive(bag, options.beside)), 0
     for message in bag.messages([topic]):
         child, pose = message.content.child_frame_id.lstrip("/"), message.content.pose.pose
         T_child_lidar = transforms.between(child, lidar)
@@ -204,7 +204,7 @@ def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, 
 
 def _moving_transforms(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
     """Stamps and T_parent_lidar of the /tf transforms of a frame that the LiDAR hangs from."""
-    transforms = Transforms(bag, options.beside)
+    transforms = Transforms(Drive(bag, options.beside))
     for each in stamped_transforms(bag, MOVING):
         if not transforms.moving:  # the vehicle stands
             yield each.stamp_ns, np.eye(4)

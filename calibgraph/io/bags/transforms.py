@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.io.bags.messages import TREES, Bag
+from calibgraph.io.bags.messages import TREES, Bag, Drive
 from calibgraph.model.geometry import invert
 
 Array = NDArray[np.float64]
@@ -57,54 +56,53 @@ class Transforms:
     /tf that never change, as ROS 1 may have them.
 
     Args:
-        bag: whose transforms count first.
-        beside: other bags of the drive.
+        drive: the bag, whose transforms count first, and others.
     """
 
-    def __init__(self, bag: Bag, beside: Sequence[Path] = ()) -> None:
-        self._bag, self._beside = bag, beside
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._static: list[_Tree] = []
         self._used: dict[str, set[str]] = {}
 
-    @cached_property
-    def _own(self) -> _Tree:
-        return _static_tree(self._bag)
-
-    @cached_property
-    def _others(self) -> list[Bag]:
-        return [Bag(path) for path in self._beside if path != self._bag.path]
-
-    @cached_property
-    def _of_drive(self) -> _Tree:
-        others = [_static_tree(bag, f"/{STATIC} of {bag.path}") for bag in self._others]
-        return self._own.widened(others)
+    def _trees(self) -> Iterator[_Tree]:
+        """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
+        for number, bag in enumerate(self._drive):
+            if number == 0 and not self._static:
+                self._static.append(_static_tree(bag))
+            elif number == len(self._static):
+                other = _static_tree(bag, f"/{STATIC} of {bag.path}")
+                self._static.append(self._static[-1].widened([other]))
+            yield self._static[number]
+        yield self._unchanging
 
     @cached_property
     def _unchanging(self) -> _Tree:
-        bags = (self._bag, *self._others)
-        return self._of_drive.widened([_unchanging_tree(bag) for bag in bags])
+        *_, static = self._static
+        return static.widened([_unchanging_tree(bag) for bag in self._drive])
 
     def between(self, target: str, source: str) -> Array | None:
         """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
-        for find in (lambda: self._own, lambda: self._of_drive, lambda: self._unchanging):
-            links = find().links
-            T_target_source = _between(links, target, source)
+        for tree in self._trees():
+            T_target_source = _between(tree.links, target, source)
             if T_target_source is not None:
-                for frame in {*_ancestors(links, target), *_ancestors(links, source)} & {*links}:
-                    self._used.setdefault(links[frame].source, set()).add(frame)
+                ways = (_ancestors(tree.links, frame).keys() for frame in (target, source))
+                for frame in set.__xor__(*map(set, ways)):
+                    self._used.setdefault(tree.links[frame].source, set()).add(frame)
                 return T_target_source
         return None
 
     @property
     def moving(self) -> set[str]:
         """The frames on /tf that move against their parents."""
-        return self._unchanging.moving
+        *_, widest = self._trees()
+        return widest.moving
 
     @property
     def notes(self) -> list[str]:
         """A line for each transform that was left out, and each source beside /tf_static."""
-        left_out = [f"{why}; it is left out" for why in self._own.invalid.values()]
+        left_out = [f"{why}; it is left out" for why in next(self._trees()).invalid.values()]
         used = [
-            f"{self._bag.path}: {_listed(frames)} hang by {source}"
+            f"{self._drive.bag.path}: the transforms of {_listed(frames)} are from {source}"
             for source, frames in self._used.items()
             if source
         ]
@@ -112,7 +110,7 @@ class Transforms:
 
     def why_apart(self, *frames: str) -> str:
         """Why frames are not connected, and which frames there are."""
-        tree = self._unchanging
+        *_, tree = self._trees()
         for frame in frames:
             *_, top = _ancestors(tree.links, frame)
             if top in tree.invalid:
