@@ -56,10 +56,12 @@ def bag(
     rig = read.to_rig(sigmas)
     if out is not None:
         rig.save(out, first_line=yaml_mark("bag"))
+    notes = [*doubtful_axes(rig), *read.notes]
+    notes += [f"warning: {line}" for line in find_implausible(rig)]
     if as_json:
-        _print_json(topics, rig, out)
+        _print_json(topics, rig, notes, out)
         return
-    for line in (*describe_rig(rig), *doubtful_axes(rig), *read.notes):
+    for line in (*describe_rig(rig), *notes):
         print_plain(terminal(), line)
     if out is not None:
         print_plain(terminal(), f"{out}: written")
@@ -96,7 +98,9 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
     return [(each.name, each.type, each.count) for each in topics]
 
 
-def _print_json(topics: list[tuple[str, str, int]], rig: Rig, out: Path | None) -> None:
+def _print_json(
+    topics: list[tuple[str, str, int]], rig: Rig, notes: list[str], out: Path | None
+) -> None:
     from calibgraph.report.as_json import print_json
 
     keys = ("topic", "type", "messages")
@@ -104,6 +108,7 @@ def _print_json(topics: list[tuple[str, str, int]], rig: Rig, out: Path | None) 
         {
             "topics": [dict(zip(keys, each, strict=True)) for each in topics],
             "rig": rig.model_dump(mode="json"),
+            "notes": notes,
             "out": None if out is None else str(out),
         }
     )

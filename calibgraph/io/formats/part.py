@@ -44,6 +44,8 @@ class Part:
         T_camera_lidar: (4, 4) by camera.
         relative_poses: between cameras, measured independently of T_camera_lidar.
         links: frames in their parents.
+        frame_ids: of optical frames, by camera.
+        lidar: the LiDAR's frame; None if the file does not name it.
     """
 
     path: Path
@@ -51,6 +53,8 @@ class Part:
     T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
     relative_poses: tuple[RelativeCamera, ...] = ()
     links: tuple[FrameLink, ...] = ()
+    frame_ids: Mapping[str, str] = field(default_factory=dict)
+    lidar: str | None = None
 
     def rename(self, names: Mapping[str, str]) -> Part:
         """The same with other names of some cameras; frames keep theirs."""
@@ -58,6 +62,7 @@ class Part:
             self,
             lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
             T_camera_lidar={names.get(name, name): T for name, T in self.T_camera_lidar.items()},
+            frame_ids={names.get(name, name): frame for name, frame in self.frame_ids.items()},
             relative_poses=tuple(
                 replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
                 for pair in self.relative_poses

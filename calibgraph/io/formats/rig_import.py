@@ -75,6 +75,7 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
+        frame_ids: of optical frames, by camera.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
+    frame_ids: Mapping[str, str]
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -106,7 +108,10 @@ class RigParts:
         content: dict[str, Any] = {
             "lidar": self.lidar,
             "cameras": {
-                name: _camera(name, lens, T.get(name), size_px, self.frames)
+                name: {
+                    **_camera(name, lens, T.get(name), size_px, self.frames),
+                    "frame_id": self.frame_ids.get(name),
+                }
                 for name, lens in self.lenses.items()
             },
             "relative_poses": [_relative_pose(pair, *sigmas) for pair in self.pairs],
@@ -132,11 +137,16 @@ def read_rig_parts(
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
-    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
+    frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
+    lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
+    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
+    chosen = {**in_tree, **(camera_frames or {})}
+    of_tree = lidar if lidar_frame or lidar in tree.names else None
+    T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    lidar = lidar_frame or "lidar"
-    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names)
+    name = lidar or "lidar"
+    return RigParts(parts[0].path, name, lenses, T_camera_lidar, pairs, tree.names, frame_ids)
 
 
 def _read_all(
