@@ -88,8 +88,13 @@ def export(
         typer.Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
     ] = None,
     camera_frame: Annotated[
-        str, typer.Option(metavar="TEXT", help="Frame id of optical frames; {camera} is the name.")
-    ] = "{camera}_optical_frame",
+        str | None,
+        typer.Option(
+            metavar="TEXT",
+            help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
+            "the rig, or {camera}_optical_frame)",
+        ),
+    ] = None,
     lidar_pose: Annotated[
         str | None,
         typer.Option(

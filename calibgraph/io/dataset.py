@@ -16,7 +16,7 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
-from calibgraph.io.bags.rig import doubtful_axes
+from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
@@ -112,23 +112,30 @@ def load_dataset(
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
-    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
-    rigs = [each.rig for each in read]
-    for path, other in zip(paths, rigs, strict=True):
-        _require_same_lenses(paths[0], rigs[0], path, other)
-    from_bag = rig is None and is_bag(paths[0])
-    notes = tuple(note for each in read for note in each.notes)
-    notes += (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
-    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
+    bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
+    found = [RigRead(rig) if rig is not None else _rig_of(path, bag) for path in paths]
+    for path, (other, _) in zip(paths, found, strict=True):
+        _require_same_lenses(paths[0], found[0].rig, path, other)
+    notes = dict.fromkeys(note for each in found for note in each.notes)
+    data = Dataset(rig=found[0].rig, frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):
-            data = _with_bag(data, path, prefix, bag or BagOptions())
+            data = _with_bag(data, path, prefix, bag)
         else:
             data = _with_folder(data, path, prefix, complete=frames is None)
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     return data if frames is None else _complete(data.select(frames))
+
+
+def _rig_of(path: Path, bag: BagOptions) -> RigRead:
+    """The rig of a folder or a bag; of a bag, with notes on where its cameras are and why."""
+    if not is_bag(path):
+        return read_rig(path)
+    read = read_bag_rig(path, bag)
+    rig = read.to_rig()
+    return RigRead(rig, (*describe_rig(rig), *doubtful_axes(rig), *read.notes))
 
 
 def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:
@@ -227,7 +234,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

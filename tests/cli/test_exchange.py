@@ -11,9 +11,8 @@ import pytest
 import yaml
 
 from calibgraph import MatcherErrors, export_calibration, load_rig, simulate_correspondences, solve
-from calibgraph.cli.exchange import export, import_, parse_names
+from calibgraph.cli.exchange import import_, parse_names
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.formats.rig_export import CAMERA_FRAME
 from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, make_pair
@@ -163,7 +162,6 @@ def test_defaults_on_the_command_line_are_the_librarys() -> None:
     of_import = inspect.signature(import_).parameters
     assert of_import["relative_sigma_deg"].default == RELATIVE_SIGMA_DEG
     assert of_import["relative_sigma_cm"].default == RELATIVE_SIGMA_CM
-    assert inspect.signature(export).parameters["camera_frame"].default == CAMERA_FRAME
 
 
 def test_a_name_that_is_given_twice_is_refused() -> None:

@@ -48,7 +48,8 @@ class Part:
         T_camera_lidar: (4, 4) by camera.
         relative_poses: between cameras, measured independently of T_camera_lidar.
         links: frames in their parents.
-        camera_frames: per camera, the frame that its file names.
+        frame_ids: of optical frames, by camera.
+        lidar: the LiDAR's frame; None if the file does not name it.
         notes: what was assumed or left out, a line each.
     """
 
@@ -57,7 +58,8 @@ class Part:
     T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
     relative_poses: tuple[RelativeCamera, ...] = ()
     links: tuple[FrameLink, ...] = ()
-    camera_frames: Mapping[str, str] = field(default_factory=dict)
+    frame_ids: Mapping[str, str] = field(default_factory=dict)
+    lidar: str | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -85,8 +87,8 @@ class Part:
                 )
                 for link in self.links
             ),
-            camera_frames={
+            frame_ids={
                 names.get(name, name): frames.get(frame, frame)
-                for name, frame in self.camera_frames.items()
+                for name, frame in self.frame_ids.items()
             },
         )

@@ -110,12 +110,16 @@ _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ..
 
 def _part_of_bag(path: Path) -> Part:
     """Lenses from camera_info, and the extrinsics that /tf_static has."""
-    cameras = read_bag_rig(path).cameras
+    read = read_bag_rig(path)
+    cameras = read.cameras
     found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
     return Part(
         path,
         lenses={name: _lens_of_bag(camera.lens.content, path) for name, camera in cameras.items()},
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
+        frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
+        lidar=read.lidar,
+        notes=tuple(read.notes),
     )
 
 
@@ -135,6 +139,8 @@ def _part_of_rig(path: Path) -> Part:
             RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
             for p in rig.relative_poses
         ),
+        frame_ids={name: each.frame_id for name, each in rig.cameras.items() if each.frame_id},
+        lidar=rig.lidar,
         notes=notes,
     )
 

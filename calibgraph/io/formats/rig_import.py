@@ -12,7 +12,7 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame, is_optical
+from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
 from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
@@ -75,6 +75,7 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
+        frame_ids: of optical frames, by camera.
         notes: what was assumed or left out in the files, a line each.
     """
 
@@ -84,7 +85,8 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
-    notes: Sequence[str] = ()
+    frame_ids: Mapping[str, str]
+    notes: Sequence[str]
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -108,7 +110,10 @@ class RigParts:
         content: dict[str, Any] = {
             "lidar": self.lidar,
             "cameras": {
-                name: _camera(name, lens, T.get(name), size_px, self.frames)
+                name: {
+                    **_camera(name, lens, T.get(name), size_px, self.frames),
+                    "frame_id": self.frame_ids.get(name),
+                }
                 for name, lens in self.lenses.items()
             },
             "relative_poses": [_relative_pose(pair, *sigmas) for pair in self.pairs],
@@ -134,14 +139,24 @@ def read_rig_parts(
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
-    named = {name: each for part in parts for name, each in part.camera_frames.items()
-             if is_optical(each) and each in tree.names}  # fmt: skip
-    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, {**named, **(camera_frames or {})})
+    frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
+    lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
+    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
+    chosen = {**in_tree, **(camera_frames or {})}
+    of_tree = lidar if lidar_frame or lidar in tree.names else None
+    T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    lidar = lidar_frame or "lidar"
-    notes = [note for part in parts for note in part.notes]
-    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names, notes)
+    return RigParts(
+        path=parts[0].path,
+        lidar=lidar or "lidar",
+        lenses=lenses,
+        T_camera_lidar=T_camera_lidar,
+        pairs=pairs,
+        frames=tree.names,
+        frame_ids=frame_ids,
+        notes=[note for part in parts for note in part.notes],
+    )
 
 
 def _read_all(

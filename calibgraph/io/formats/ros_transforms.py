@@ -17,7 +17,8 @@ from calibgraph.model.rig import Finite
 
 _DIRECTION = (
     "each transform is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar"
+    "p_lidar = T * p_camera, the inverse of T_camera_lidar; a frame has one parent: take other "
+    "transforms to these optical frames out of the robot's description"
 )
 
 
