@@ -71,8 +71,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     """What the mappings of a file hold."""
     content = documents[0]
     if is_tf2(content):
-        listed = [each.get("transforms", [each]) for each in documents]
-        return read_tf2({"transforms": [frame for each in listed for frame in each]}, path)
+        return read_tf2(documents, path)
     if is_camera_info(content):
         documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:

@@ -397,14 +397,50 @@ def test_kitti_360_is_read_through_its_rectification(tmp_path: Path) -> None:
     names = ("perspective", "calib_cam_to_velo", "calib_cam_to_pose")
     rig = import_rig([tmp_path / f"{name}.txt" for name in names])
     assert_front(rig, "image_00")
-    # Camera 1 is 0.6 m along the first camera's x, before rectification: 1 m less 0.6 m.
-    point = rectify.T @ [*P_CAMERA, 1.0] - [0.6, 0, 0, 0]
+    # P is K [I | b] with b = -331.5 px / 552.5 px = -0.6 m: 1 m to the right is 0.4 m there.
     found = rig.T_camera_lidar["image_01"] @ P_LIDAR
-    np.testing.assert_allclose(found, rectify @ point, atol=1e-6)
-    assert (rig.cameras["image_01"].width_px, rig.cameras["image_01"].intrinsics_px.fx) == (
-        1408,
-        552.5,
-    )
+    np.testing.assert_allclose(found[:3], [0.4, 2.0, 10.0], atol=1e-6)
+    assert rig.cameras["image_01"].width_px == 1408
+    without_poses = import_rig([tmp_path / f"{name}.txt" for name in names[:2]])
+    assert list(without_poses.cameras) == ["image_00", "image_01"]
+
+
+def test_a_fisheye_of_kitti_360_is_in_its_place_by_the_poses(tmp_path: Path) -> None:
+    T_pose_cam, beside = np.eye(4), np.eye(4)
+    beside[0, 3] = 0.5  # along x of the first camera, whose axes it has
+    (tmp_path / "calib_cam_to_velo.txt").write_text(row(T_LIDAR_CAMERA))
+    poses = f"image_00: {row(T_pose_cam)}\nimage_02: {row(beside)}\n"
+    (tmp_path / "calib_cam_to_pose.txt").write_text(poses)
+    lens = {
+        **VINS,
+        "model_type": "MEI",
+        "mirror_parameters": {"xi": 2.2},
+        "camera_name": "image_02",
+        "projection_parameters": {"gamma1": 1336.0, "gamma2": 1335.0, "u0": 716.0, "v0": 705.0},
+    }
+    lens = {key: value for key, value in lens.items() if not key.startswith("extrinsic")}
+    files = [tmp_path / "calib_cam_to_velo.txt", tmp_path / "calib_cam_to_pose.txt"]
+    rig = import_rig([saved(tmp_path / "image_02.yaml", lens, "%YAML:1.0\n---\n"), *files])
+    found = rig.T_camera_lidar["image_02"] @ P_LIDAR
+    np.testing.assert_allclose(found[:3], [0.5, 2.0, 10.0], atol=1e-6)
+    assert rig.cameras["image_02"].distortion[0] == 2.2
+
+
+@pytest.mark.parametrize("bad", [{"w": 0.0}, {"w": float("nan")}, {"x": 3.0}])
+def test_a_frame_without_rotation_that_no_camera_needs_is_left_out(
+    bad: dict[str, float], tmp_path: Path
+) -> None:
+    rotation = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0, **bad}
+    broken = {**OTHER, "transform": {**OTHER["transform"], "rotation": rotation}}
+    files = write(tmp_path, front__yaml=documents(MESSAGE),
+                  tf__yaml=documents({"transforms": [broken, STAMPED]}))  # fmt: skip
+    assert_front(import_rig(files))
+    (note,) = read_rig_parts(files).notes
+    assert "frame 'gnss' is left out: quaternion" in note
+    broken = {**broken, "child_frame_id": "front_optical_frame"}
+    files = write(tmp_path, front__yaml=documents(MESSAGE), tf__yaml=documents(broken, OTHER))
+    with pytest.raises(CalibrationError, match="frame 'front_optical_frame' is left out: quat"):
+        import_rig(files)
 
 
 def test_an_extrinsic_of_no_named_camera_asks_for_its_name(tmp_path: Path) -> None:
