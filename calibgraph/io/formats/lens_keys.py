@@ -254,7 +254,7 @@ def numbers(value: Any, where: str) -> Array:
         raise FileError(where, f"expected finite numbers, found {describe_value(value)}")
     if is_matrix and "rows" in value and "cols" in value:
         rows, cols = value["rows"], value["cols"]
-        if not (isinstance(rows, int) and isinstance(cols, int) and rows * cols == found.size):
+        if not (type(rows) is type(cols) is int and rows > 0 and rows * cols == found.size):
             raise FileError(where, f"has {describe_value(rows)} rows, {describe_value(cols)} "
                             f"columns and {found.size} numbers")  # fmt: skip
         found = found.reshape(rows, cols)

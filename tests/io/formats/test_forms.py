@@ -378,6 +378,13 @@ def test_a_matrix_whose_file_states_no_direction_is_a_question(tmp_path: Path) -
         import_rig([tmp_path / "extrinsic.txt"])
 
 
+@pytest.mark.parametrize("text", ["At time 0.0\n- Translation: [1, 2, 3]\n", "hello\n", ""])
+def test_other_text_is_of_no_known_format(text: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text(text)
+    with pytest.raises(CalibrationError, match="is of no known format; known are Kalibr"):
+        import_rig([tmp_path / "notes.txt"])
+
+
 def test_kitti_360_is_read_through_its_rectification(tmp_path: Path) -> None:
     rectify = np.eye(4)
     rectify[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.3, 0.5], degrees=True).as_matrix()
