@@ -213,7 +213,9 @@ class _CameraReader:
         if first is None:
             self.notes.append(f"{stated}; frame {lens.frame!r} is its own, so it is not added")
         else:
-            self.notes.append(f"{stated}; it is added, as frame {lens.frame!r} is at that of {first}")
+            self.notes.append(
+                f"{stated}; it is added, as frame {lens.frame!r} is at that of {first}"
+            )
         return first is not None
 
     def _first_of_pair(self, frame: str, length_m: float, bag: Bag, info: str) -> str | None:

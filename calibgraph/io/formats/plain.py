@@ -31,7 +31,7 @@ def write_json(export: RigExport) -> str:
 def _content(export: RigExport, name: str) -> dict[str, Any]:
     camera, covariance = export.cameras[name], export.ros_covariance(name)
     return {
-        **camera.model_dump(),
+        **camera.model_dump(exclude={"frame_id"}),
         "optical_frame": export.optical_frames[name],
         "T_lidar_camera": export.T_lidar_camera(name).tolist(),
         "covariance": None if covariance is None else covariance.ravel().tolist(),

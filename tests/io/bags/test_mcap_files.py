@@ -130,9 +130,7 @@ def test_channels_of_other_encodings_are_left_alone(
     tmp_path: Path, name: str, encoding: str
 ) -> None:
     messages = sample_messages(Messages("mcap"))
-    path = write_mcap(
-        tmp_path / "drive.mcap", messages, beside=encoding or "none", **INDEXES[name]
-    )
+    path = write_mcap(tmp_path / "drive.mcap", messages, beside=encoding or "none", **INDEXES[name])
     require_the_sample(path)
     assert "/notes" in Bag(path).topics
 
@@ -199,9 +197,7 @@ def test_a_message_that_is_none_of_its_type_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
-    path = write_mcap(
-        tmp_path / "drive.mcap", sample_messages(Messages("mcap")), enable_crcs=False
-    )
+    path = write_mcap(tmp_path / "drive.mcap", sample_messages(Messages("mcap")), enable_crcs=False)
     text = struct.pack("<I", 4)
     path.write_bytes(path.read_bytes().replace(text + b"zstd", text + b"bzip"))
     with pytest.raises(FileError, match="its chunks are compressed by 'bzip'; known are lz4 and z"):

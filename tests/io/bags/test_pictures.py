@@ -111,7 +111,7 @@ def test_a_gray_and_a_colour_plane_are_the_image_of_the_camera(
     assert found.shape == colours.shape
     # the 8 bits of YUV are coarser than those of BGR by 255 / 219 and up to 2.02 for blue
     np.testing.assert_allclose(found.astype(int), colours, atol=4)
-    message.data = message.data[:-message.step]
+    message.data = message.data[: -message.step]
     with pytest.raises(DatasetError, match=f"px, encoding '{encoding}'; record it again"):
         picture_of(message, "here")
 
