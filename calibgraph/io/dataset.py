@@ -16,13 +16,14 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
-from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
+from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
@@ -112,11 +113,14 @@ def load_dataset(
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
-    found = [(rig, []) if rig is not None else _rig_of(path, bag) for path in paths]
-    for path, (other, _) in zip(paths, found, strict=True):
-        _require_same_lenses(paths[0], found[0][0], path, other)
-    notes = dict.fromkeys(note for _, of_bag in found for note in of_bag)
-    data = Dataset(rig=found[0][0], frames=(), folders=paths, notes=tuple(notes))
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    rigs = [each.rig for each in read]
+    for path, other in zip(paths, rigs, strict=True):
+        _require_same_lenses(paths[0], rigs[0], path, other)
+    from_bag = rig is None and is_bag(paths[0])
+    where = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
+    notes = dict.fromkeys((*where, *(note for each in read for note in each.notes)))
+    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):
@@ -126,15 +130,6 @@ def load_dataset(
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     return data if frames is None else _complete(data.select(frames))
-
-
-def _rig_of(path: Path, bag: BagOptions) -> tuple[Rig, list[str]]:
-    """The rig of a folder or a bag; of a bag, with notes on where its cameras are and why."""
-    if not is_bag(path):
-        return load_rig(path), []
-    read = read_bag_rig(path, bag)
-    rig = read.to_rig()
-    return rig, [*describe_rig(rig), *doubtful_axes(rig), *read.notes]
 
 
 def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model
-from calibgraph.model.rig import MODELS_OF_OTHERS, Intrinsics
+from calibgraph.model.lens_names import KNOWN, find_lens_model, plain_key
+from calibgraph.model.rig import Intrinsics
 from factors import LensModel
 from factors.lens import COEFFICIENTS, ORDERS
 from factors.wide_lenses import check_mirror
@@ -19,6 +21,19 @@ from factors.wide_lenses import check_mirror
 _ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 _NO_SKEW = 1e-4
 """Skew over fx is the angle [rad] by which columns lean: 0.006 deg, a tenth of a good sigma."""
+
+_PROJECTION_KEYS = (
+    "model", "cameramodel", "cammodel", "modeltype", "cameramodeltype", "cameratype", "camtype",
+    "projectionmodel", "projectiontype", "lensmodel", "lenstype", "type",
+)  # fmt: skip
+_DISTORTION_KEYS = (
+    "distortionmodel", "distmodel", "distortiontype", "disttype", "isfisheye", "fisheyemodel",
+)  # fmt: skip
+_FLAGS = ("isfisheye", "fisheyemodel", "distortiontype")
+"""Where 1 is a fisheye, and 0 is none: of OpenCV's samples and of MC-Calib."""
+_NONE = "none"
+_PERSPECTIVE = ("pinhole", "perspective", "pinholecamera")
+"""Names that leave the distortion to another key."""
 
 
 @dataclass(frozen=True)
@@ -38,28 +53,58 @@ class CameraLens:
     distortion: tuple[float, ...]
 
 
-def lens_model(name: str, path: Path) -> LensModel:
+def lens_model(name: str, where: Path | str) -> LensModel:
     """The model here of a name in a file of others.
 
     Raises:
         FileError: if calibgraph has no such lens.
     """
-    key = name.strip().lower().replace("-", "_").replace(" ", "_")
-    if key in ("none", ""):
-        return "pinhole"
-    ours = {model: model for model in COEFFICIENTS}
-    found = ours.get(key) or MODELS_OF_OTHERS.get(key)  # type: ignore[call-overload]
+    found = find_lens_model(name)
     if found is None:
         raise FileError(
-            path,
-            f"lens model {name!r} is none of calibgraph's: pinhole (plumb_bob, radtan, "
-            "rational_polynomial), fisheye (equidistant, Kannala-Brandt), omnidirectional (omni, "
-            "Mei) and equirectangular; calibrate the intrinsics with one of these",
+            where,
+            f"lens model {name!r} is none of calibgraph's, which are {KNOWN}; calibrate the "
+            "intrinsics with one of these",
         )
     return found
 
 
-def unified_coefficients(xi: float, values: Sequence[float], path: Path) -> tuple[float, ...]:
+def stated_model(content: Mapping[str, Any], where: Path | str) -> LensModel | None:
+    """The lens model that the keys of a mapping name, in any of their spellings; None if none does.
+
+    A pinhole with the distortion of a fisheye is a fisheye, as in Kalibr; an omnidirectional lens
+    may have the distortion of a pinhole.
+
+    Raises:
+        FileError: if a name is none of ours, or two keys contradict each other.
+    """
+    named = {str(key): _model_name(str(key), value) for key, value in content.items()}
+    kept = {key: name for key, name in named.items() if name}
+    models = {key: lens_model(name, where) for key, name in kept.items() if name != _NONE}
+    lenses = {model for key, model in models.items() if plain_key(key) in _PROJECTION_KEYS}
+    distortions = {model for key, model in models.items() if plain_key(key) in _DISTORTION_KEYS}
+    ideal = all(plain_key(kept[key]) in _PERSPECTIVE for key in models if models[key] == "pinhole")
+    if (lenses, distortions) == ({"pinhole"}, {"fisheye"}) and ideal:
+        return "fisheye"
+    if (lenses, distortions) == ({"omnidirectional"}, {"pinhole"}):
+        return "omnidirectional"
+    if len(lenses | distortions) > 1:
+        stated = " and ".join(f"{key} {kept[key]!r}" for key in models)
+        raise FileError(where, f"{stated} contradict each other; keep the one that is right")
+    return next(iter(lenses | distortions), "pinhole" if kept else None)
+
+
+def _model_name(key: str, value: Any) -> str:
+    """The model that a key names; empty if it is none of the keys that do."""
+    plain = plain_key(key)
+    if plain in _FLAGS and isinstance(value, int):
+        return "fisheye" if value else _NONE
+    is_name = plain in (*_PROJECTION_KEYS, *_DISTORTION_KEYS) and isinstance(value, (str, int))
+    name = str(value).strip() if is_name else ""
+    return _NONE if plain_key(name) == _NONE else name
+
+
+def unified_coefficients(xi: float, values: Sequence[float], path: Path | str) -> tuple[float, ...]:
     """The coefficients here of the unified model: xi, and k1, k2, p1, p2 of others, or none.
 
     Raises:
@@ -78,7 +123,9 @@ def unified_coefficients(xi: float, values: Sequence[float], path: Path) -> tupl
     return (xi, *kept[:4])
 
 
-def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -> tuple[float, ...]:
+def fitted_coefficients(
+    values: Sequence[float], model: LensModel, path: Path | str
+) -> tuple[float, ...]:
     """Distortion coefficients in a number that the model has: zeros at the end come and go.
 
     Raises:
@@ -97,7 +144,9 @@ def fitted_coefficients(values: Sequence[float], model: LensModel, path: Path) -
     )
 
 
-def listed_coefficients(values: Sequence[float], model: LensModel, path: Path) -> tuple[float, ...]:
+def listed_coefficients(
+    values: Sequence[float], model: LensModel, path: Path | str
+) -> tuple[float, ...]:
     """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does.
 
     Raises:

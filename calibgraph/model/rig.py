@@ -27,6 +27,7 @@ from pydantic import (
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
+from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS
 
@@ -123,31 +124,14 @@ def _checked_name(name: str) -> str:
     return name
 
 
-MODELS_OF_OTHERS: dict[str, LensModel] = {
-    "plumb_bob": "pinhole",
-    "radtan": "pinhole",
-    "rational_polynomial": "pinhole",
-    "equidistant": "fisheye",
-    "equi": "fisheye",
-    "kannala_brandt": "fisheye",
-    "omni": "omnidirectional",
-    "omnidir": "omnidirectional",
-    "mei": "omnidirectional",
-    "unified": "omnidirectional",
-    "panorama": "equirectangular",
-    "spherical": "equirectangular",
-}
-"""What ROS, Kalibr and others call the lens models."""
-
-
 def _checked_model(name: Any) -> Any:
     """The name of a lens model, as it is.
 
     Raises:
         ValueError: if it is the name that ROS or Kalibr give to one of ours.
     """
-    ours = MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
-    if ours is not None:
+    ours = find_lens_model(name) if isinstance(name, str) and name else None
+    if ours not in (None, name):
         raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")
     return name
 

@@ -69,3 +69,13 @@ def test_a_wrong_kitti_calibration_is_one_line(tmp_path: Path, line: str, said: 
     with pytest.raises(FileError, match=re.escape(said)) as caught:
         load_dataset(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_a_camera_without_its_line_is_left_out_with_a_note(tmp_path: Path) -> None:
+    folder = written_kitti(tmp_path / "00")
+    path = folder / "calib.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("P3")]
+    path.write_text("\n".join(lines))
+    data = load_dataset(folder)
+    assert list(data.rig.cameras) == ["image_2"]
+    assert data.notes == (f"{path}: line 'P3' is missing: camera 'image_3' is left out",)

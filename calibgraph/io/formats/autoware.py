@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
@@ -86,5 +87,8 @@ def read_autoware(content: dict[str, Any], path: Path) -> Part:
 
 def _link(parent: str, child: str, pose: Any, path: Path) -> FrameLink:
     p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
-    T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+    try:
+        T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+    except ValueError as error:
+        raise FileError(path, f"{parent}: {child}: {error}") from error
     return FrameLink(parent, child, T)

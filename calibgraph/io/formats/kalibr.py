@@ -17,9 +17,9 @@ from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.io.lenses import (
     CameraLens,
-    lens_model,
     listed_coefficients,
     listed_intrinsics,
+    stated_model,
     unified_coefficients,
 )
 from calibgraph.model.geometry import relative_transform
@@ -154,26 +154,17 @@ def _number(key: str) -> int:
 
 
 def _lens(camera: _Camera, path: Path) -> CameraLens:
-    if camera.camera_model == "omni":
+    names = camera.model_dump(include={"camera_model", "distortion_model"})
+    model = stated_model(names, path) or "pinhole"
+    if model == "omnidirectional":
         return _omnidirectional(camera, path)
-    model = lens_model(camera.distortion_model, path)
-    if camera.camera_model != "pinhole":
-        model = lens_model(camera.camera_model, path)  # raises: ds, eucm
     intrinsics = listed_intrinsics(camera.intrinsics, f"{path}: intrinsics")
     coefficients = listed_coefficients(camera.distortion_coeffs, model, path)
     return CameraLens(model, camera.resolution, intrinsics, coefficients)
 
 
 def _omnidirectional(camera: _Camera, path: Path) -> CameraLens:
-    """Kalibr's omni-radtan or omni-none: xi comes before the focal lengths.
-
-    Raises:
-        FileError: if it has another distortion.
-    """
-    if camera.distortion_model not in ("radtan", "none"):
-        raise FileError(
-            path, f"omni-{camera.distortion_model} is no lens here; calibrate it as omni-radtan"
-        )
+    """Kalibr's omni-radtan or omni-none: xi comes before the focal lengths."""
     intrinsics = listed_intrinsics(camera.intrinsics[1:], f"{path}: intrinsics after xi")
     coefficients = unified_coefficients(camera.intrinsics[0], camera.distortion_coeffs, path)
     return CameraLens("omnidirectional", camera.resolution, intrinsics, coefficients)

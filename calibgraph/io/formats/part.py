@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens
 
 Array = NDArray[np.float64]
+
+ONLY_CAMERA = ""
+"""Stands for the camera of a file that names none: the only one of all files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,8 @@ class Part:
         links: frames in their parents.
         frame_ids: of optical frames, by camera.
         lidar: the LiDAR's frame; None if the file does not name it.
+        camera_frames: per camera, the frame that its file names.
+        notes: what was assumed or left out, a line each.
     """
 
     path: Path
@@ -55,9 +61,18 @@ class Part:
     links: tuple[FrameLink, ...] = ()
     frame_ids: Mapping[str, str] = field(default_factory=dict)
     lidar: str | None = None
+    camera_frames: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it holds no lens, no extrinsic and no frame."""
+        return not (self.lenses or self.T_camera_lidar or self.links)
 
     def rename(self, names: Mapping[str, str]) -> Part:
-        """The same with other names of some cameras; frames keep theirs."""
+        """The same with other names of some cameras; frames keep theirs, but for ONLY_CAMERA's."""
+        only = frame_id(names.get(ONLY_CAMERA, ONLY_CAMERA))
+        frames = {f"_{axes}": f"{only}_{axes}" for axes in ("optical", "optical_frame")}
         return replace(
             self,
             lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
@@ -67,4 +82,16 @@ class Part:
                 replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
                 for pair in self.relative_poses
             ),
+            links=tuple(
+                replace(
+                    link,
+                    parent=frames.get(link.parent, link.parent),
+                    child=frames.get(link.child, link.child),
+                )
+                for link in self.links
+            ),
+            camera_frames={
+                names.get(name, name): frames.get(frame, frame)
+                for name, frame in self.camera_frames.items()
+            },
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
-from calibgraph.io.formats.part import Array, Part, RelativeCamera
+from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame, is_optical
+from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
@@ -75,6 +75,7 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
+        notes: what was assumed or left out in the files, a line each.
         frame_ids: of optical frames, by camera.
     """
 
@@ -84,7 +85,8 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
-    frame_ids: Mapping[str, str]
+    notes: Sequence[str] = ()
+    frame_ids: Mapping[str, str] = field(default_factory=dict)
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -138,15 +140,28 @@ def read_rig_parts(
     tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
+    stated = {name: frame for part in parts for name, frame in part.camera_frames.items()}
+    named = {name: frame for name, frame in {**stated, **frame_ids}.items()
+             if is_optical(frame) and frame in tree.names}  # fmt: skip
     lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
-    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
-    chosen = {**in_tree, **(camera_frames or {})}
-    of_tree = lidar if lidar_frame or lidar in tree.names else None
-    T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
+    T_camera_lidar |= _by_frames(
+        tree,
+        missing,
+        lidar if lidar_frame or lidar in tree.names else None,
+        {**named, **(camera_frames or {})},
+    )
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    name = lidar or "lidar"
-    return RigParts(parts[0].path, name, lenses, T_camera_lidar, pairs, tree.names, frame_ids)
+    return RigParts(
+        parts[0].path,
+        lidar or "lidar",
+        lenses,
+        T_camera_lidar,
+        pairs,
+        tree.names,
+        [note for part in parts for note in part.notes],
+        frame_ids,
+    )
 
 
 def _read_all(
@@ -159,6 +174,13 @@ def _read_all(
     """
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    lenses = sorted({name for part in read for name in part.lenses})
+    if len(lenses) == 1:
+        read = [part.rename({ONLY_CAMERA: lenses[0]}) for part in read]
+    for part in read:
+        if ONLY_CAMERA in part.T_camera_lidar and len(lenses) > 1:
+            raise FileError(part.path, f"names no camera; there are {', '.join(lenses)}: give it "
+                            "as NAME=FILE")  # fmt: skip
     known = {name for part in read for name in (*part.lenses, *part.T_camera_lidar)}
     if not any(part.lenses for part in read):
         raise CalibrationError(

@@ -130,24 +130,27 @@ class _Message(StrictNumbers):
 
 
 def is_tf2(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is a TFMessage."""
-    return "transforms" in content
+    """Whether the content of a YAML file is a TFMessage, or a single TransformStamped."""
+    return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
 
 
 def read_tf2(content: dict[str, Any], path: Path) -> Part:
-    """The frames of a TFMessage.
+    """The frames of a TFMessage, or of one TransformStamped; the last of several for a child.
 
     Raises:
         FileError: if it is malformed.
     """
-    message = checked_model(_Message, content, path)
+    listed = content if "transforms" in content else {"transforms": [content]}
+    message = checked_model(_Message, listed, path)
     try:
-        return Part(path, links=tuple(_link(stamped) for stamped in message.transforms))
+        links = {link.child: link for link in map(_link, message.transforms)}
     except ValueError as error:
         raise FileError(path, str(error)) from error
+    return Part(path, links=tuple(links.values()))
 
 
 def _link(stamped: _Stamped) -> FrameLink:
     t, q = stamped.transform.translation, stamped.transform.rotation
     T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-    return FrameLink(stamped.header.frame_id, stamped.child_frame_id, T)
+    parent, child = (name.lstrip("/") for name in (stamped.header.frame_id, stamped.child_frame_id))
+    return FrameLink(parent, child, T)

@@ -130,17 +130,18 @@ def test_an_import_keeps_the_frames_and_looks_for_them_in_other_files(tmp_path: 
     written = without(sample_messages(MAKE), "/tf_static")
     for each in written:
         if "camera_info" in each.topic:
-            each.content.header.frame_id = f"eye_of_{each.topic.split('/')[1]}"
+            each.content.header.frame_id = f"optical_of_{each.topic.split('/')[1]}"
     bare = write_bag(tmp_path, "mcap", written)
     joints = "".join(
-        f'<link name="eye_of_{name}"/><joint name="{name}" type="fixed"><parent link="velodyne"/>'
-        f'<child link="eye_of_{name}"/><origin xyz="0.5 0 {k}" rpy="-1.57 0 -1.57"/></joint>'
+        f'<link name="optical_of_{name}"/><joint name="{name}" type="fixed">'
+        f'<parent link="velodyne"/><child link="optical_of_{name}"/>'
+        f'<origin xyz="0.5 0 {k}" rpy="-1.57 0 -1.57"/></joint>'
         for k, name in enumerate(IDS)
     )
     (tmp_path / "robot.urdf").write_text(f'<robot name="r"><link name="velodyne"/>{joints}</robot>')
     rig: Rig = import_rig([bare, tmp_path / "robot.urdf"], rename={"left": "port"})
     assert rig.lidar == "velodyne"
-    assert rig.cameras["port"].frame_id == "eye_of_left"
+    assert rig.cameras["port"].frame_id == "optical_of_left"
 
 
 def test_a_frame_that_is_not_the_images_is_not_kept(tmp_path: Path) -> None:
