@@ -114,13 +114,14 @@ def load_dataset(
     _require_folders(paths, bag)
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
     read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
-    rigs = [each.rig for each in read]
-    for path, other in zip(paths, rigs, strict=True):
-        _require_same_lenses(paths[0], rigs[0], path, other)
-    from_bag = rig is None and is_bag(paths[0])
-    where = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
+    first = read[0].rig
+    for path, other in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other.rig)
+    where = (
+        (*describe_rig(first), *doubtful_axes(first)) if rig is None and is_bag(paths[0]) else ()
+    )
     notes = dict.fromkeys((*where, *(note for each in read for note in each.notes)))
-    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=tuple(notes))
+    data = Dataset(rig=first, frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):

@@ -67,4 +67,4 @@ def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> P
     intrinsics = checked_model(Intrinsics, lens.content["intrinsics_px"], path)
     camera = name or path.stem
     found = CameraLens(lens.content["model"], size, intrinsics, tuple(lens.content["distortion"]))
-    return Part(path, {camera: found}, camera_frames={camera: lens.frame} if lens.frame else {})
+    return Part(path, {camera: found}, frame_ids={camera: lens.frame} if lens.frame else {})

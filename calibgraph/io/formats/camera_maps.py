@@ -83,7 +83,7 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
         lenses,
         _extrinsics(named, path),
         links=tuple(links),
-        camera_frames={
+        frame_ids={
             camera: f"{frame_id(camera)}_optical_frame"
             for camera, each in named
             if any(each.links(camera))

@@ -50,7 +50,6 @@ class Part:
         links: frames in their parents.
         frame_ids: of optical frames, by camera.
         lidar: the LiDAR's frame; None if the file does not name it.
-        camera_frames: per camera, the frame that its file names.
         notes: what was assumed or left out, a line each.
     """
 
@@ -61,7 +60,6 @@ class Part:
     links: tuple[FrameLink, ...] = ()
     frame_ids: Mapping[str, str] = field(default_factory=dict)
     lidar: str | None = None
-    camera_frames: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property
@@ -77,7 +75,6 @@ class Part:
             self,
             lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
             T_camera_lidar={names.get(name, name): T for name, T in self.T_camera_lidar.items()},
-            frame_ids={names.get(name, name): frame for name, frame in self.frame_ids.items()},
             relative_poses=tuple(
                 replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
                 for pair in self.relative_poses
@@ -90,8 +87,8 @@ class Part:
                 )
                 for link in self.links
             ),
-            camera_frames={
+            frame_ids={
                 names.get(name, name): frames.get(frame, frame)
-                for name, frame in self.camera_frames.items()
+                for name, frame in self.frame_ids.items()
             },
         )

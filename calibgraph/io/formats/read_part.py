@@ -119,7 +119,7 @@ def _part_of_bag(path: Path) -> Part:
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
         frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
         lidar=read.lidar,
-        notes=read.notes,
+        notes=tuple(read.notes),
     )
 
 

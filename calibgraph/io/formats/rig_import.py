@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame, is_optical
+from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
 from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
@@ -75,8 +75,8 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
-        notes: what was assumed or left out in the files, a line each.
         frame_ids: of optical frames, by camera.
+        notes: what was assumed or left out in the files, a line each.
     """
 
     path: Path
@@ -85,8 +85,8 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
-    notes: Sequence[str] = ()
-    frame_ids: Mapping[str, str] = field(default_factory=dict)
+    frame_ids: Mapping[str, str]
+    notes: Sequence[str]
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -140,27 +140,22 @@ def read_rig_parts(
     tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
-    stated = {name: frame for part in parts for name, frame in part.camera_frames.items()}
-    named = {name: frame for name, frame in {**stated, **frame_ids}.items()
-             if is_optical(frame) and frame in tree.names}  # fmt: skip
     lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
-    T_camera_lidar |= _by_frames(
-        tree,
-        missing,
-        lidar if lidar_frame or lidar in tree.names else None,
-        {**named, **(camera_frames or {})},
-    )
+    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
+    chosen = {**in_tree, **(camera_frames or {})}
+    of_tree = lidar if lidar_frame or lidar in tree.names else None
+    T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
     return RigParts(
-        parts[0].path,
-        lidar or "lidar",
-        lenses,
-        T_camera_lidar,
-        pairs,
-        tree.names,
-        [note for part in parts for note in part.notes],
-        frame_ids,
+        path=parts[0].path,
+        lidar=lidar or "lidar",
+        lenses=lenses,
+        T_camera_lidar=T_camera_lidar,
+        pairs=pairs,
+        frames=tree.names,
+        frame_ids=frame_ids,
+        notes=[note for part in parts for note in part.notes],
     )
 
 
