@@ -89,7 +89,8 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
         FileError: if the path is no bag.
     """
     from calibgraph.errors import FileError
-    from calibgraph.io.bags.messages import Bag, is_bag
+    from calibgraph.io.bags.messages import Bag
+    from calibgraph.io.bags.storage import is_bag
 
     if not is_bag(path):
         raise FileError(path, "is no ROS bag; expected a .bag, .mcap or .db3 file, or the folder "

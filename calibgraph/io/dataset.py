@@ -16,7 +16,7 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
-from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
+from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
@@ -113,11 +113,15 @@ def load_dataset(
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
-    found = [RigRead(rig) if rig is not None else _rig_of(path, bag) for path in paths]
-    for path, (other, _) in zip(paths, found, strict=True):
-        _require_same_lenses(paths[0], found[0].rig, path, other)
-    notes = dict.fromkeys(note for each in found for note in each.notes)
-    data = Dataset(rig=found[0].rig, frames=(), folders=paths, notes=tuple(notes))
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    first = read[0].rig
+    for path, other in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other.rig)
+    where = (
+        (*describe_rig(first), *doubtful_axes(first)) if rig is None and is_bag(paths[0]) else ()
+    )
+    notes = dict.fromkeys((*where, *(note for each in read for note in each.notes)))
+    data = Dataset(rig=first, frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):
@@ -127,15 +131,6 @@ def load_dataset(
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     return data if frames is None else _complete(data.select(frames))
-
-
-def _rig_of(path: Path, bag: BagOptions) -> RigRead:
-    """The rig of a folder or a bag; of a bag, with notes on where its cameras are and why."""
-    if not is_bag(path):
-        return read_rig(path)
-    read = read_bag_rig(path, bag)
-    rig = read.to_rig()
-    return RigRead(rig, (*describe_rig(rig), *doubtful_axes(rig), *read.notes))
 
 
 def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:

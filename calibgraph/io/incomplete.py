@@ -20,7 +20,7 @@ class RigRead(NamedTuple):
 
     Attributes:
         rig: of its complete cameras.
-        notes: which cameras were left out, a line each.
+        notes: what was left out, added or taken from elsewhere, a line each.
     """
 
     rig: Rig

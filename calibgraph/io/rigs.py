@@ -8,7 +8,7 @@ from typing import Any
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
-from calibgraph.io.bags.rig import rig_of_bag
+from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.incomplete import RigRead
 from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
@@ -36,14 +36,15 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
 
 
 def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
-    """As :func:`load_rig`, with notes on the cameras of a data set that were left out.
+    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere.
 
     Raises:
         FileError, DatasetError: if there is none, or it is malformed.
     """
     path = rig_file(path)
     if is_bag(path):
-        return RigRead(rig_of_bag(path, bag))
+        read = read_bag_rig(path, bag)
+        return RigRead(read.to_rig(), read.notes)
     published = published_format(path)
     if published is not None:
         return published.read_rig(path)

@@ -77,7 +77,7 @@ def stated_baseline(message: Any) -> Array:
     P = np.reshape(_field(message, "P"), (3, 4))
     if not (np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
         return np.zeros(3)
-    return np.linalg.solve(P[:, :3], P[:, 3])
+    return np.asarray(np.linalg.solve(P[:, :3], P[:, 3]), dtype=np.float64)
 
 
 def _field(message: Any, name: str) -> Array:

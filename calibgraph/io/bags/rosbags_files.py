@@ -23,6 +23,7 @@ class RosbagsFile:
         self._reader: Any = Reader1(path) if ros1 else Reader2(path)
         self._reader.open()
         self.start_ns, self.stop_ns = self._reader.start_time, self._reader.end_time
+        connections: Any = self._reader.connections
         self.topics = topics_by_name(
             make_topic(
                 each.topic,
@@ -30,7 +31,7 @@ class RosbagsFile:
                 each.msgcount,
                 "ros1" if ros1 else each.ext.serialization_format,
             )
-            for each in self._reader.connections
+            for each in connections
         )
 
     def close(self) -> None:

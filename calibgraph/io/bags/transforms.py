@@ -204,7 +204,7 @@ def values_of(shift: Any, turn: Any) -> tuple[tuple[float, ...], tuple[float, ..
 
 
 def pose_matrix(shift: Sequence[float], turn: Sequence[float]) -> Array | None:
-    """(4, 4) of a translation and a quaternion x y z w; None if they are none, as 0 0 0 0 or NaN."""
+    """(4, 4) of a translation and a quaternion x y z w; None if they are none: 0 0 0 0, or NaN."""
     length = float(np.linalg.norm(turn))
     if not (np.isfinite([*shift, length]).all() and length > _LEAST_LENGTH):
         return None

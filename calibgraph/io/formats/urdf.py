@@ -16,8 +16,8 @@ from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
 
 _DIRECTION = (
     "each joint's origin is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar; rpy about fixed x, y, z; a frame has one "
-    "parent: take other joints to these optical frames out of the robot's description"
+    "p_lidar = T * p_camera, the inverse of T_camera_lidar; rpy about fixed x, y, z; a frame has "
+    "one parent: take other joints to these optical frames out of the robot's description"
 )
 
 

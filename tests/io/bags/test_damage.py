@@ -111,7 +111,7 @@ def test_without_a_library_the_command_that_installs_it_is_named(
     imports: Callable[..., Any] = builtins.__import__
 
     def without_library(name: str, *rest: Any) -> Any:
-        if name.split(".")[0] == library:
+        if name.partition(".")[0] == library:
             raise ImportError(f"No module named {name!r}")
         return imports(name, *rest)
 
