@@ -49,6 +49,7 @@ _NOT_READ = {
     "lidartocamtx": "versions of LVI-SAM mean different axes by it",
     "extrinsicrot": "versions of LIO-SAM mean different axes by it",
     "cameraposes": "it places cameras against each other, not against a LiDAR",
+    "cameraposematrix": "it places cameras against each other, not against a LiDAR",
 }
 _DEEPEST = 6
 _SAME = 1e-6  # of transforms that are given twice: they may be rounded

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 _KEYS = {
     "K": (
         "cameramatrix", "cameramat", "k", "camk", "cameraintrinsic", "cameraintrinsics",
-        "intrinsicmatrix", "intrinsics",
+        "intrinsicmatrix", "intrinsics", "mtx",
     ),
     "D": (
         "distortioncoefficients", "distortionvector", "distortioncoeffs", "distcoeffs", "distcoeff",

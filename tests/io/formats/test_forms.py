@@ -170,6 +170,16 @@ def test_the_cameras_of_vins_are_tied_to_the_lidar_through_the_imu(tmp_path: Pat
     assert_front(import_rig([vins, tmp_path / "fast_lio.yaml"], rename={"front": "left"}), "left")
 
 
+def test_kalibr_s_cameras_in_the_imu_are_tied_to_the_lidar(tmp_path: Path) -> None:
+    chain = {"cam0": {
+        "camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": [0.0] * 4,
+        "intrinsics": [480.0, 481.0, 320.0, 180.0], "resolution": [640, 360],
+        "T_cam_imu": np.linalg.inv(T_IMU_CAMERA).tolist()}}  # fmt: skip
+    files = [saved(tmp_path / "camchain.yaml", chain), saved(tmp_path / "lio.yaml", LIO)]
+    assert_front(import_rig(files), "cam0")
+    assert_front(import_rig(files, rename={"cam0": "left"}), "left")
+
+
 def test_vins_fusion_has_the_pose_of_each_camera_in_the_body(tmp_path: Path) -> None:
     fusion = {"imu": 1, "num_of_cam": 1, "body_T_cam0": matrix(T_IMU_CAMERA), "cam0_calib": "a"}
     lens = {key: value for key, value in VINS.items() if not key.startswith("extrinsic")}
