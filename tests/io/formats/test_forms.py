@@ -244,6 +244,20 @@ def test_a_fisheye_of_fast_livo_has_its_own_names(tmp_path: Path) -> None:
     assert (camera.model, camera.distortion) == ("fisheye", (-0.05, 0.01, 0.0, 1e-3))
 
 
+@pytest.mark.parametrize("key", ["Tbc", "IMU.T_b_c1"])
+def test_orb_slam_has_the_pose_of_its_camera_in_the_imu(key: str, tmp_path: Path) -> None:
+    content = {
+        "Camera.type": "KannalaBrandt8", "Camera1.fx": 480.0, "Camera1.fy": 481.0,
+        "Camera1.cx": 320.0, "Camera1.cy": 180.0, "Camera1.k1": 0.01, "Camera1.k2": 0.0,
+        "Camera1.k3": 0.002, "Camera1.k4": 0.0, "Camera.width": 640, "Camera.height": 360,
+        key: matrix(T_IMU_CAMERA),
+    }  # fmt: skip
+    path = saved(tmp_path / "front.yaml", content, "%YAML:1.0\n---\n")
+    rig = import_rig([path, saved(tmp_path / "lio.yaml", LIO)])
+    assert_front(rig)
+    assert rig.cameras["front"].distortion == (0.01, 0.0, 0.002, 0.0)
+
+
 def test_r3live_has_the_pose_of_the_camera_in_the_imu(tmp_path: Path) -> None:
     content = {
         "Lidar_front_end": {"lidar_type": 1, "N_SCANS": 6},
