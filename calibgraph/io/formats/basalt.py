@@ -8,7 +8,7 @@ from typing import Any
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.lens_keys import LensKeys
-from calibgraph.io.formats.part import FrameLink, Part
+from calibgraph.io.formats.part import IMU, FrameLink, Part
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.rig import Finite
 
@@ -50,7 +50,7 @@ def read_basalt(content: dict[str, Any], path: Path) -> Part:
             lenses[f"cam{i}"], _ = keys.read()
             xyzw = (pose.qx, pose.qy, pose.qz, pose.qw)
             T = pose_of_quaternion((pose.px, pose.py, pose.pz), xyzw)
-            links.append(FrameLink("imu", f"cam{i}_optical_frame", T))
+            links.append(FrameLink(IMU, f"cam{i}_optical_frame", T))
     except ValueError as error:
         raise FileError(path, str(error)) from error
     return Part(path, lenses, links=tuple(links))

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.io.formats.lens_keys import LensKeys, is_group
-from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
+from calibgraph.io.formats.part import IMU, ONLY_CAMERA, FrameLink, Part
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
@@ -38,7 +38,7 @@ from calibgraph.model.rig import rigid_transform
 
 Array = NDArray[np.float64]
 
-_IMU, _LIDAR = "imu", "lidar"
+_LIDAR = "lidar"
 _T_CAMERA_LIDAR = (
     ("tcameralidar",), ("tcamlidar",), ("tcl",), ("sensorcalib",), ("rcl", "pcl"),
 )  # fmt: skip
@@ -165,12 +165,12 @@ class _Map:
         """The poses of the camera and of the LiDAR in the IMU."""
         for names in _T_IMU_CAMERA:
             if self._has(*names):
-                yield FrameLink(_IMU, f"{frame_id(camera)}_optical_frame", self._transform(names))
+                yield FrameLink(IMU, f"{frame_id(camera)}_optical_frame", self._transform(names))
         for index, name in enumerate(_BODY):
             if self._has(name):
-                yield FrameLink(_IMU, f"cam{index}_optical_frame", self._transform((name,)))
+                yield FrameLink(IMU, f"cam{index}_optical_frame", self._transform((name,)))
         if self._has(*_T_IMU_LIDAR):
-            yield FrameLink(_IMU, _LIDAR, self._transform(_T_IMU_LIDAR))
+            yield FrameLink(IMU, _LIDAR, self._transform(_T_IMU_LIDAR))
 
     def notes(self) -> Iterator[str]:
         """What is left out."""

@@ -13,7 +13,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
-from calibgraph.io.formats.part import FrameLink, Part, RelativeCamera
+from calibgraph.io.formats.part import IMU, FrameLink, Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.io.lenses import (
     CameraLens,
@@ -142,7 +142,7 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
         },
         relative_poses=tuple(_relative_poses(keys, chain, names)),
         links=tuple(
-            FrameLink("imu", frames[name], invert(T)) for name, T in in_imu.items() if T is not None
+            FrameLink(IMU, frames[name], invert(T)) for name, T in in_imu.items() if T is not None
         ),
         frame_ids=frames,
     )

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 ONLY_CAMERA = ""
 """Stands for the camera of a file that names none: the only one of all files."""
 
+IMU = "imu"
+"""The frame of the IMU in files that give poses in it."""
+
 
 @dataclass(frozen=True, eq=False)
 class RelativeCamera:

@@ -12,7 +12,13 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
+from calibgraph.io.formats.frames import (
+    NO_LIDAR_IN_IMU,
+    FrameTree,
+    find_camera_frame,
+    find_lidar_frame,
+    tied_links,
+)
 from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
@@ -137,14 +143,17 @@ def read_rig_parts(
     parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
-    tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
+    links = [link for part in parts for link in part.links]
+    tied = tied_links(links, lidar_frame)
+    tree = FrameTree(tied)
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
     lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
     in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
     chosen = {**in_tree, **(camera_frames or {})}
     of_tree = lidar if lidar_frame or lidar in tree.names else None
     notes = [note for part in parts for note in part.notes]
+    notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
         T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
     except CalibrationError as error:

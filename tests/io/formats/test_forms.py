@@ -180,6 +180,14 @@ def test_kalibr_s_cameras_in_the_imu_are_tied_to_the_lidar(tmp_path: Path) -> No
     assert_front(import_rig(files, rename={"cam0": "left"}), "left")
 
 
+def test_cameras_in_an_imu_without_a_lidar_do_not_stand_in_the_way(tmp_path: Path) -> None:
+    vins = saved(tmp_path / "front.yaml", VINS)
+    with pytest.raises(CalibrationError, match="as no file has the LiDAR in the IMU"):
+        import_rig([vins])
+    kit = write(tmp_path, kit__yaml=SENSOR_KIT)
+    assert_front(import_rig([vins, *kit]))
+
+
 def test_vins_fusion_has_the_pose_of_each_camera_in_the_body(tmp_path: Path) -> None:
     fusion = {"imu": 1, "num_of_cam": 1, "body_T_cam0": matrix(T_IMU_CAMERA), "cam0_calib": "a"}
     lens = {key: value for key, value in VINS.items() if not key.startswith("extrinsic")}
