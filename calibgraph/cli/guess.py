@@ -17,6 +17,7 @@ from calibgraph.cli.exchange import (
     parse_file,
     parse_names,
     parse_size,
+    print_doubts,
 )
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
@@ -91,6 +92,7 @@ def guess(
         from calibgraph.report.as_json import print_json
 
         print_json(found.to_mapping())
+    print_doubts(found.rig, parts.notes)
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")

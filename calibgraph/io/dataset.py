@@ -21,8 +21,9 @@ from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
@@ -111,16 +112,20 @@ def load_dataset(
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
-    rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
-    for path, other in zip(paths, rigs, strict=True):
-        _require_same_lenses(paths[0], rigs[0], path, other)
-    from_bag = rig is None and is_bag(paths[0])
-    notes = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
-    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
+    bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    first = read[0].rig
+    for path, other in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other.rig)
+    where = (
+        (*describe_rig(first), *doubtful_axes(first)) if rig is None and is_bag(paths[0]) else ()
+    )
+    notes = dict.fromkeys((*where, *(note for each in read for note in each.notes)))
+    data = Dataset(rig=first, frames=(), folders=paths, notes=tuple(notes))
     for path in paths:
         prefix = f"{path.name}/" if len(paths) > 1 else ""
         if is_bag(path):
-            data = _with_bag(data, path, prefix, bag or BagOptions())
+            data = _with_bag(data, path, prefix, bag)
         else:
             data = _with_folder(data, path, prefix, complete=frames is None)
     if data.recorded == data.frames:
@@ -224,7 +229,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
-from calibgraph.io.bags.messages import is_bag as is_bag
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.options import BagOptions as BagOptions
 from calibgraph.io.bags.pictures import picture_of
 from calibgraph.io.bags.point_clouds import points_of, timed_points_of
+from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.motion import ScanMotion
 
 
