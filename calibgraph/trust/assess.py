@@ -108,14 +108,13 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
 
 
 def _implausible_checks(guess: Rig, checks: Checks) -> Checks:
-    """Values of a rig that may explain the failure of a camera."""
-    failed = [name for name, each in checks.items() if any(c.status == "FAIL" for c in each)]
-    lines = find_implausible(guess)
-    return {
-        name: [
-            Check("values of the rig", "FAIL", line.removeprefix(f"{name}: "))
-            for line in lines
-            if line.startswith(f"{name}: ")
-        ]
-        for name in failed
-    }
+    """Values of a rig that may explain why checks of a camera FAIL; they decide nothing."""
+    found: dict[str, list[Check]] = {}
+    for line in find_implausible(guess):
+        name, _, text = line.partition(": ")
+        of_camera = checks.get(name, ())
+        if any(check.status == "FAIL" for check in of_camera):
+            decided = any(check.decisive for check in of_camera)
+            check = Check("values of the rig", "FAIL" if decided else "WARN", text)
+            found.setdefault(name, []).append(check)
+    return found

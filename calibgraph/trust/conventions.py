@@ -136,8 +136,9 @@ class _Trial:
     def find(self) -> str | None:
         """A sentence on the error that, undone, fits best the cameras that are not near it now."""
         some = list(self.guess.T_camera_lidar.items())[:_CAMERAS]
-        given = {name: self._refine(self._approach(name, T)) for name, T in some}
-        lost = {n: T for n, T in some if given[n].z_score < least_z_score(ALONE)}
+        given = {name: self._approach(name, T) for name, T in some}
+        given = {n: one if _is_accepted(one) else self._refine(one) for n, one in given.items()}
+        lost = {name: T for name, T in some if not _is_accepted(given[name])}
         starts = _corrected(lost)
         tried = [{name: self._approach(name, T) for name, T in each.items()} for each in starts]
         tried.sort(key=lambda each: -sum(candidate.z_score for candidate in each.values()))
@@ -175,6 +176,11 @@ class _Trial:
         if np.sum(valid & camera.in_image(pixels)) < _LEAST_POINTS:
             return Candidate({name: camera}, 0.0)
         return approach(self.frames, {name: camera})
+
+
+def _is_accepted(candidate: Candidate) -> bool:
+    """Whether a single pose that was tried agrees by far better than by chance."""
+    return candidate.z_score >= least_z_score(ALONE)
 
 
 def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
