@@ -121,12 +121,18 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
     assert all("no point of the cloud lies in the image" in error for error in errors[1:])
 
 
-def test_clouds_in_millimetres_are_named_with_their_distance(folder: Path) -> None:
-    change_clouds(folder, lambda cloud: cloud * np.float32([1e3, 1e3, 1e3, 1][: cloud.shape[1]]))
-    (warning,) = texts(diagnose([folder]), "warning")
-    assert warning.startswith("median distance of the points 9.")
-    assert "e+03 m" in warning
-    assert warning.endswith("are the clouds in millimetres?")
+@pytest.mark.parametrize(
+    ("scale", "expected"),
+    [
+        (1000, "9.33e+03 m is above 1e+03 m: are the clouds in millimetres?"),
+        (100, "933 m is above 200 m: are the clouds in centimetres?"),
+    ],
+)
+def test_clouds_in_other_units_are_named_with_their_distance(
+    folder: Path, scale: float, expected: str
+) -> None:
+    change_clouds(folder, lambda cloud: cloud * np.float32([scale] * 3 + [1])[: cloud.shape[1]])
+    assert texts(diagnose([folder]), "warning") == [f"median distance of the points {expected}"]
 
 
 def test_clouds_joined_with_a_wrong_extrinsic_are_named_with_how_far_apart(folder: Path) -> None:

@@ -134,7 +134,7 @@ class _Trial:
     guess: Rig
 
     def find(self) -> str | None:
-        """A sentence on the error that, undone, fits best the cameras that are not near it now."""
+        """A sentence on the error that, undone, fits best the cameras that are lost with it."""
         some = list(self.guess.T_camera_lidar.items())[:_CAMERAS]
         given = {name: self._approach(name, T) for name, T in some}
         given = {n: one if _is_accepted(one) else self._refine(one) for n, one in given.items()}

@@ -65,8 +65,12 @@ def _doubts_about_cloud(frame: Frame, cloud: Cloud) -> Iterator[str]:
 
 def _distance_check(cloud: Cloud) -> Check:
     """Whether a cloud can be in metres."""
-    median_m = float(np.median(np.linalg.norm(cloud[:, :3], axis=1)))
-    return threshold("point_distance").check(median_m)
+    row, median_m = (
+        threshold("point_distance"),
+        float(np.median(np.linalg.norm(cloud[:, :3], axis=1))),
+    )
+    centimetres = row.grade(median_m) == "WARN"  # in millimetres it would be a small room
+    return row.check(median_m, advice="are the clouds in centimetres?" if centimetres else "")
 
 
 def explain_guess(data: Dataset, rig: Rig, cloud: Cloud) -> str | None:
