@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -19,6 +20,8 @@ from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.joined_clouds import displacement_of_parts
 from calibgraph.trust.thresholds import threshold
+
+_log = logging.getLogger(__name__)
 
 Level = Literal["error", "warning", "note"]
 Cloud = NDArray[np.float32]
@@ -65,10 +68,8 @@ def _doubts_about_cloud(frame: Frame, cloud: Cloud) -> Iterator[str]:
 
 def _distance_check(cloud: Cloud) -> Check:
     """Whether a cloud can be in metres."""
-    row, median_m = (
-        threshold("point_distance"),
-        float(np.median(np.linalg.norm(cloud[:, :3], axis=1))),
-    )
+    row = threshold("point_distance")
+    median_m = float(np.median(np.linalg.norm(cloud[:, :3], axis=1)))
     centimetres = row.grade(median_m) == "WARN"  # in millimetres it would be a small room
     return row.check(median_m, advice="are the clouds in centimetres?" if centimetres else "")
 
@@ -104,19 +105,32 @@ def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
     ]
 
 
-def check_inputs(data: Dataset, rig: Rig) -> tuple[str, ...]:
-    """Warnings about a dataset and its guess, before cameras are searched for.
+def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str, ...]:
+    """Warnings about a dataset and its guess, before cameras are searched for; they are logged.
+
+    Args:
+        data: images and clouds.
+        rig: the guess.
+        at_guess: whether a matcher starts there; others may do without clouds, and are warned of
+            the rig alone.
 
     Raises:
         FileError: if a cloud cannot be read.
         DatasetError: if no camera has points of a cloud in view. One that has none may still be
             placed by what it sees in common with others.
     """
+    warnings = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
+    for text in warnings:
+        _log.warning(text)
+    return tuple(warnings)
+
+
+def _check_at_guess(data: Dataset, rig: Rig) -> list[str]:
     frame = data.frames[len(data.frames) // 2]
     cloud = frame.load_cloud()
     doubts = find_doubts(rig, frame, cloud)
     out_of_view = describe_out_of_view(count_points_in_view(rig, cloud))
     if len(out_of_view) < len(rig.cameras):
-        return (*doubts, *out_of_view)
+        return [*doubts, *out_of_view]
     reasons = [explain_guess(data, rig, cloud), *doubts, *out_of_view]
     raise DatasetError("; ".join(reason for reason in reasons if reason))
