@@ -36,6 +36,7 @@ from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.inputs import check_inputs
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
@@ -68,6 +69,8 @@ def match_in_rounds(
     full = find_matcher(matcher, seed=config.seed)
     data, guess = _open(dataset, rig, full.most_frames)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
+    with watch("inputs"):
+        warnings = check_inputs(data, guess, at_guess=full.stage1 == "rig")
     with watch("places"):
         places = find_stationary(data, guess)
     with watch("locate"):
@@ -85,7 +88,9 @@ def match_in_rounds(
         if out_of_time():
             break
     missed = full.rounds - 1 - index
-    run = MatchingRun(data, full, guess, table, solution, tuple(rounds), watch, missed)
+    run = MatchingRun(
+        data, full, guess, table, solution, tuple(rounds), watch, missed, warnings=warnings
+    )
     if not out_of_time():
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
@@ -179,7 +184,7 @@ def _solve(
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise
-        hint = f"{error}; the images fit better if the guess is {intended}"
+        hint = f"{error}; {intended}"
         raise CorrespondenceError(hint, camera=error.camera) from error
 
 

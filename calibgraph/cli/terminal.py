@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import time
@@ -40,12 +41,15 @@ def print_plain(console: Console, text: str) -> None:
 def progress_bar(first: str = "starting") -> Iterator[Progress]:
     """Progress on stderr: a bar that is removed in the end, or lines if stderr is no terminal.
 
+    Warnings that the work logs are printed, a line each.
+
     Args:
         first: description until the callback is called for the first time.
     """
     console = terminal()
     if not console.is_terminal:
-        yield progress_lines(lambda line: print_plain(console, line))
+        with _printed_warnings(console):
+            yield progress_lines(lambda line: print_plain(console, line))
         return
     from rich.progress import (
         BarColumn,
@@ -59,9 +63,10 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
     left = (TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, *left, console=console, transient=True) as bar:
         task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
-        )
+        with _printed_warnings(bar.console):
+            yield lambda what, done, total: bar.update(
+                task, description=what, completed=done, total=total
+            )
 
 
 def progress_lines(
@@ -83,3 +88,26 @@ def progress_lines(
             print_line(f"{now - start:5.0f} s  {what}, {done} of {total}")
 
     return progress
+
+
+@contextmanager
+def _printed_warnings(console: Console) -> Iterator[None]:
+    """Warnings that are logged meanwhile are printed."""
+    logger, lines = logging.getLogger("calibgraph"), _WarningLines(console)
+    logger.addHandler(lines)
+    try:
+        yield
+    finally:
+        logger.removeHandler(lines)
+
+
+class _WarningLines(logging.Handler):
+    """Prints warnings as lines above a progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.WARNING)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one."""
+        print_plain(self._console, f"{record.levelname.lower()}: {record.getMessage()}")
