@@ -34,7 +34,7 @@ def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
     Raises:
         ValueError: if the quaternion has another length.
     """
-    length = float(np.linalg.norm(xyzw))
+    length = math.hypot(*xyzw)
     if not abs(length - 1.0) <= ROUNDING:
         raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
     return _pose(xyz_m, Rotation.from_quat(xyzw).as_matrix())

@@ -13,6 +13,7 @@ CameraExtrinsicMat, T_lidar_camera Autoware.AI                  p_lidar = T p_ca
 extrinsicRotation, -Translation    VINS-Mono, LVI-SAM           p_imu = R p_camera + t
 body_T_cam0, body_T_cam1           VINS-Fusion                  p_imu = T p_camera
 camera_ext_R, camera_ext_t         R3LIVE                       p_imu = R p_camera + t
+Tbc, IMU.T_b_c1                    ORB-SLAM3                    p_imu = T p_camera
 extrinsic_R, extrinsic_T           FAST-LIO, FAST-LIVO          p_imu = R p_lidar + t
 =================================  ===========================  ==================================
 """
@@ -42,13 +43,17 @@ _T_CAMERA_LIDAR = (
     ("tcameralidar",), ("tcamlidar",), ("tcl",), ("sensorcalib",), ("rcl", "pcl"),
 )  # fmt: skip
 _T_LIDAR_CAMERA = (("cameraextrinsicmat",), ("tlidarcamera",), ("tlidarcam",), ("tlc",))
-_T_IMU_CAMERA = (("extrinsicrotation", "extrinsictranslation"), ("cameraextr", "cameraextt"))
+_T_IMU_CAMERA = (
+    ("extrinsicrotation", "extrinsictranslation"), ("cameraextr", "cameraextt"), ("tbc",),
+    ("tbc1",),
+)  # fmt: skip
 _T_IMU_LIDAR = ("extrinsicr", "extrinsict")
 _BODY = ("bodytcam0", "bodytcam1")
 _NOT_READ = {
     "lidartocamtx": "versions of LVI-SAM mean different axes by it",
     "extrinsicrot": "versions of LIO-SAM mean different axes by it",
     "cameraposes": "it places cameras against each other, not against a LiDAR",
+    "cameraposematrix": "it places cameras against each other, not against a LiDAR",
 }
 _DEEPEST = 6
 _SAME = 1e-6  # of transforms that are given twice: they may be rounded

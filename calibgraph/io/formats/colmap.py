@@ -41,6 +41,13 @@ _MODELS: dict[
 """Per model: number of parameters, model here, its focal lengths and centre, their number."""
 
 
+def is_colmap(text: str) -> bool:
+    """Whether the first line that is no comment begins as COLMAP's: a number and a model."""
+    lines = (line.split() for line in text.splitlines() if not line.lstrip().startswith("#"))
+    words = next((line for line in lines if line), [""])
+    return words[0].isdecimal() and len(words) > 1 and words[1][0].isalpha()
+
+
 def read_colmap(path: Path) -> Part:
     """The lenses, named camera_ID.
 

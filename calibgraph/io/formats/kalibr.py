@@ -13,7 +13,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
-from calibgraph.io.formats.part import Part, RelativeCamera
+from calibgraph.io.formats.part import FrameLink, Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.io.lenses import (
     CameraLens,
@@ -22,7 +22,7 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
-from calibgraph.model.geometry import relative_transform
+from calibgraph.model.geometry import invert, relative_transform
 from calibgraph.model.rig import Camera, Finite, Size, Transform
 
 _DERIVED = "computed from T_cam_lidar"
@@ -104,6 +104,7 @@ class _Camera(StrictNumbers):
     resolution: tuple[Size, Size] | None = None
     T_cn_cnm1: Transform | None = None
     T_cam_lidar: Transform | None = None
+    T_cam_imu: Transform | None = None
     calibgraph: _Own = _Own()
 
 
@@ -119,6 +120,8 @@ def is_kalibr(content: dict[str, Any]) -> bool:
 def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     """Lenses, T_cam_lidar where it is given, and T_cn_cnm1 as relative poses.
 
+    T_cam_imu maps IMU to camera coordinates: a file with the LiDAR in the IMU completes it.
+
     Raises:
         FileError: if the file is malformed, or a lens is none of ours.
     """
@@ -127,6 +130,8 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     names = {key: camera.calibgraph.camera or key for key, camera in chain.cameras.items()}
     if len(set(names.values())) < len(names):
         raise FileError(path, f"two cameras have one name: {', '.join(names.values())}")
+    in_imu = {names[key]: camera.T_cam_imu for key, camera in chain.cameras.items()}
+    frames = {name: f"{name}_optical_frame" for name, T in in_imu.items() if T is not None}
     return Part(
         path=path,
         lenses={names[key]: _lens(camera, path) for key, camera in chain.cameras.items()},
@@ -136,6 +141,10 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
             if camera.T_cam_lidar is not None
         },
         relative_poses=tuple(_relative_poses(keys, chain, names)),
+        links=tuple(
+            FrameLink("imu", frames[name], invert(T)) for name, T in in_imu.items() if T is not None
+        ),
+        frame_ids=frames,
     )
 
 

@@ -7,7 +7,7 @@ calib_cam_to_velo.txt    12 or 16 numbers            p_velo = M p_cam, of KITTI-
 calib_velo_to_cam.txt    12 numbers, or R: and T:    p_cam = M p_velo
 calib_cam_to_pose.txt    image_0k: 12 numbers        p_pose = M p_cam
 perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified images; p_rectified =
-                         S_rect_0k                   R_rect_0k p_cam
+                         S_rect_0k                   R_rect_00 p_cam, p_k = p_rectified + K^-1 P[3]
 =======================  ==========================  ==============================================
 """
 
@@ -71,17 +71,25 @@ def read_kitti_lines(path: Path, name: str | None) -> Part:
 
 
 def _rectified(lines: dict[str, list[float]], numbers: list[str], path: Path) -> Part:
-    """The lenses of rectified images, and how rectification turns their cameras."""
+    """The lenses of rectified images, and the frames of their cameras.
+
+    The first is turned by its rectification; others are shifted against it, as P = K [I | b] has
+    p_k = p_first + b.
+    """
     lenses, links = {}, []
     for k in numbers:
         P = _matrix(lines, f"P_rect_{k}", (3, 4), path)
-        R = np.eye(4)
-        R[:3, :3] = _matrix(lines, f"R_rect_{k}", (3, 3), path)
-        width, height = _matrix(lines, f"S_rect_{k}", (1, 2), path)[0]
         K = intrinsics_of_matrix(P[:, :3], f"{path}: P_rect_{k}")
+        width, height = _matrix(lines, f"S_rect_{k}", (1, 2), path)[0]
         lenses[f"image_{k}"] = CameraLens("pinhole", (int(width), int(height)), K, ())
-        T = invert(_rigid(R.ravel().tolist(), path, f"R_rect_{k}"))
-        links.append(FrameLink(f"image_{k}_optical", f"image_{k}_optical_frame", T))
+        parent, T_k_parent = f"image_{k}_optical", np.eye(4)
+        if P[:, 3].any():
+            parent = f"image_{numbers[0]}_optical_frame"
+            T_k_parent[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+        else:
+            T_k_parent[:3, :3] = _matrix(lines, f"R_rect_{k}", (3, 3), path)
+        T = invert(_rigid(T_k_parent.ravel().tolist(), path, f"R_rect_{k}"))
+        links.append(FrameLink(parent, f"image_{k}_optical_frame", T))
     return Part(path, lenses, links=tuple(links))
 
 

@@ -28,13 +28,14 @@ from calibgraph.model.lens_names import plain_key
 from calibgraph.model.rig import Intrinsics, Size
 from calibgraph.yaml_text import describe_value
 from factors import LensModel
+from factors.lens import COEFFICIENTS
 
 Array = NDArray[np.float64]
 
 _KEYS = {
     "K": (
         "cameramatrix", "cameramat", "k", "camk", "cameraintrinsic", "cameraintrinsics",
-        "intrinsicmatrix", "intrinsics",
+        "intrinsicmatrix", "intrinsics", "mtx",
     ),
     "D": (
         "distortioncoefficients", "distortionvector", "distortioncoeffs", "distcoeffs", "distcoeff",
@@ -56,8 +57,6 @@ _GROUPS = (
 _PINHOLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE, _CAMODOCAL = ("k1", "k2", "k3", "k4"), ("k2", "k3", "k4", "k5")
 _FISHEYE_COUNT = 4
-
-
 _LENS_KEYS = frozenset(alias for aliases in _KEYS.values() for alias in aliases)
 
 
@@ -81,7 +80,9 @@ class LensKeys:
     @property
     def hold_a_lens(self) -> bool:
         """Whether there is a camera matrix, or focal lengths."""
-        return self._key("fx") is not None or self._key("K") is not None
+        matrix = self._key("K")
+        is_matrix = matrix is not None and isinstance(self._content[matrix], (list, dict))
+        return is_matrix or self._key("fx") is not None
 
     @property
     def hold_a_size(self) -> bool:
@@ -176,25 +177,28 @@ class LensKeys:
 
     def _distortion(self, stated: LensModel | None) -> tuple[LensModel, tuple[float, ...], str]:
         """The model, the coefficients and a note on what was assumed."""
-        xi, key = self._key("xi"), self._key("D")
-        if xi is not None and stated not in (None, "omnidirectional"):
-            raise FileError(self._where, f"xi is of an omnidirectional lens, which the {stated} is "
+        xi, key, note = self._key("xi"), self._key("D"), ""
+        model: LensModel = stated or ("pinhole" if xi is None else "omnidirectional")
+        if xi is not None and model != "omnidirectional":
+            raise FileError(self._where, f"xi is of an omnidirectional lens, which the {model} is "
                             "not; correct the model")  # fmt: skip
         if key is None:
-            model: LensModel = stated or ("pinhole" if xi is None else "omnidirectional")
-            values, listed, note = self._named(model, stated), False, ""
+            values = self._named(model, stated)
         else:
             found = numbers(self._content[key], f"{self._where}: {key}")
             note = "" if stated or xi else self._assume(found, key)
-            model, listed = stated or ("pinhole" if xi is None else "omnidirectional"), True
             values = found.ravel().tolist()
         if model == "omnidirectional":
-            if xi is None and key is None:
-                raise FileError(self._where, "key 'xi' is missing; add it")
-            mirror, *values = [self._number(xi), *values] if xi else [*values, 0.0]
-            return model, unified_coefficients(mirror, values, self._where), note
-        fit = listed_coefficients if listed else fitted_coefficients
+            return model, self._unified(xi, values), note
+        fit = fitted_coefficients if key is None else listed_coefficients
         return model, fit(values, model, self._where), note
+
+    def _unified(self, xi: str | None, values: list[float]) -> tuple[float, ...]:
+        """Xi and its coefficients; without a key it is the first of five, as in ROS."""
+        if xi is None and len(values) != max(COEFFICIENTS["omnidirectional"]):
+            raise FileError(self._where, "key 'xi' is missing; add it")
+        mirror, *others = values if xi is None else [self._number(xi), *values]
+        return unified_coefficients(mirror, others, self._where)
 
     def _assume(self, found: Array, key: str) -> str:
         """The note on a pinhole that no key states.
@@ -254,7 +258,7 @@ def numbers(value: Any, where: str) -> Array:
         raise FileError(where, f"expected finite numbers, found {describe_value(value)}")
     if is_matrix and "rows" in value and "cols" in value:
         rows, cols = value["rows"], value["cols"]
-        if not (isinstance(rows, int) and isinstance(cols, int) and rows * cols == found.size):
+        if not (type(rows) is type(cols) is int and rows > 0 and rows * cols == found.size):
             raise FileError(where, f"has {describe_value(rows)} rows, {describe_value(cols)} "
                             f"columns and {found.size} numbers")  # fmt: skip
         found = found.reshape(rows, cols)

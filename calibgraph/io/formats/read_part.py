@@ -14,7 +14,7 @@ from calibgraph.io.formats.autoware import is_autoware, read_autoware
 from calibgraph.io.formats.basalt import is_basalt, read_basalt
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.camera_maps import read_camera_maps
-from calibgraph.io.formats.colmap import read_colmap
+from calibgraph.io.formats.colmap import is_colmap, read_colmap
 from calibgraph.io.formats.documents import (
     YAML_SUFFIXES,
     content_of_storage,
@@ -34,6 +34,7 @@ from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import Camera, Intrinsics
 
 _MAX_BYTES = 32 * 2**20
+_COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:
@@ -59,20 +60,30 @@ def read_part(path: Path, name: str | None) -> Part:
             return read_urdf(root, path)
         return _read_content([content_of_storage(root)], path, name)
     if suffix == ".txt":
-        return (
-            read_kitti_lines(path, name) if is_kitti_lines(read_text(path)) else read_colmap(path)
-        )
+        return _read_lines(path, name)
     if suffix in (*YAML_SUFFIXES, ".json"):
         return _read_content(read_documents(path), path, name)
     raise FileError(path, f"its format is not known; known are {IMPORT_FORMATS}")
+
+
+def _read_lines(path: Path, name: str | None) -> Part:
+    """What a text file of lines holds."""
+    text = read_text(path)
+    if is_colmap(text) or path.name == _COLMAP_NAME:
+        return read_colmap(path)
+    if is_kitti_lines(text):
+        return read_kitti_lines(path, name)
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    raise FileError(
+        path, f"its line {first[:40]!r} is of no known format; known are {IMPORT_FORMATS}"
+    )
 
 
 def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> Part:
     """What the mappings of a file hold."""
     content = documents[0]
     if is_tf2(content):
-        listed = [each.get("transforms", [each]) for each in documents]
-        return read_tf2({"transforms": [frame for each in listed for frame in each]}, path)
+        return read_tf2(documents, path)
     if is_camera_info(content):
         documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:

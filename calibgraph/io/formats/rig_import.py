@@ -111,7 +111,7 @@ class RigParts:
             "lidar": self.lidar,
             "cameras": {
                 name: {
-                    **_camera(name, lens, T.get(name), size_px, self.frames),
+                    **_camera(name, lens, T.get(name), size_px, self),
                     "frame_id": self.frame_ids.get(name),
                 }
                 for name, lens in self.lenses.items()
@@ -144,7 +144,11 @@ def read_rig_parts(
     in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
     chosen = {**in_tree, **(camera_frames or {})}
     of_tree = lidar if lidar_frame or lidar in tree.names else None
-    T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
+    notes = [note for part in parts for note in part.notes]
+    try:
+        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
+    except CalibrationError as error:
+        raise CalibrationError("; ".join([str(error), *notes])) from error
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
     return RigParts(
@@ -155,7 +159,7 @@ def read_rig_parts(
         pairs=pairs,
         frames=tree.names,
         frame_ids=frame_ids,
-        notes=[note for part in parts for note in part.notes],
+        notes=notes,
     )
 
 
@@ -260,7 +264,7 @@ def _camera(
     lens: CameraLens,
     T_camera_lidar: Array | None,
     size_px: tuple[int, int] | None,
-    frames: Sequence[str],
+    parts: RigParts,
 ) -> dict[str, Any]:
     """The content of a rig file for a camera.
 
@@ -274,11 +278,12 @@ def _camera(
             camera=name,
         )
     if T_camera_lidar is None:
-        listed = f" (its frames are {', '.join(frames)})" if frames else ""
+        listed = f" (its frames are {', '.join(parts.frames)})" if parts.frames else ""
+        notes = "".join(f"; {note}" for note in parts.notes)
         raise RigError(
             f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
             "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
-            "describe its mounting to calibgraph guess",
+            f"describe its mounting to calibgraph guess{notes}",
             camera=name,
         )
     return {

@@ -170,6 +170,16 @@ def test_the_cameras_of_vins_are_tied_to_the_lidar_through_the_imu(tmp_path: Pat
     assert_front(import_rig([vins, tmp_path / "fast_lio.yaml"], rename={"front": "left"}), "left")
 
 
+def test_kalibr_s_cameras_in_the_imu_are_tied_to_the_lidar(tmp_path: Path) -> None:
+    chain = {"cam0": {
+        "camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": [0.0] * 4,
+        "intrinsics": [480.0, 481.0, 320.0, 180.0], "resolution": [640, 360],
+        "T_cam_imu": np.linalg.inv(T_IMU_CAMERA).tolist()}}  # fmt: skip
+    files = [saved(tmp_path / "camchain.yaml", chain), saved(tmp_path / "lio.yaml", LIO)]
+    assert_front(import_rig(files), "cam0")
+    assert_front(import_rig(files, rename={"cam0": "left"}), "left")
+
+
 def test_vins_fusion_has_the_pose_of_each_camera_in_the_body(tmp_path: Path) -> None:
     fusion = {"imu": 1, "num_of_cam": 1, "body_T_cam0": matrix(T_IMU_CAMERA), "cam0_calib": "a"}
     lens = {key: value for key, value in VINS.items() if not key.startswith("extrinsic")}
@@ -232,6 +242,20 @@ def test_a_fisheye_of_fast_livo_has_its_own_names(tmp_path: Path) -> None:
     files = [saved(tmp_path / "a.yaml", {"c": LIVO}), saved(tmp_path / "front.yaml", lens)]
     camera = import_rig(files).cameras["front"]
     assert (camera.model, camera.distortion) == ("fisheye", (-0.05, 0.01, 0.0, 1e-3))
+
+
+@pytest.mark.parametrize("key", ["Tbc", "IMU.T_b_c1"])
+def test_orb_slam_has_the_pose_of_its_camera_in_the_imu(key: str, tmp_path: Path) -> None:
+    content = {
+        "Camera.type": "KannalaBrandt8", "Camera1.fx": 480.0, "Camera1.fy": 481.0,
+        "Camera1.cx": 320.0, "Camera1.cy": 180.0, "Camera1.k1": 0.01, "Camera1.k2": 0.0,
+        "Camera1.k3": 0.002, "Camera1.k4": 0.0, "Camera.width": 640, "Camera.height": 360,
+        key: matrix(T_IMU_CAMERA),
+    }  # fmt: skip
+    path = saved(tmp_path / "front.yaml", content, "%YAML:1.0\n---\n")
+    rig = import_rig([path, saved(tmp_path / "lio.yaml", LIO)])
+    assert_front(rig)
+    assert rig.cameras["front"].distortion == (0.01, 0.0, 0.002, 0.0)
 
 
 def test_r3live_has_the_pose_of_the_camera_in_the_imu(tmp_path: Path) -> None:
@@ -378,6 +402,13 @@ def test_a_matrix_whose_file_states_no_direction_is_a_question(tmp_path: Path) -
         import_rig([tmp_path / "extrinsic.txt"])
 
 
+@pytest.mark.parametrize("text", ["At time 0.0\n- Translation: [1, 2, 3]\n", "hello\n", ""])
+def test_other_text_is_of_no_known_format(text: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text(text)
+    with pytest.raises(CalibrationError, match="is of no known format; known are Kalibr"):
+        import_rig([tmp_path / "notes.txt"])
+
+
 def test_kitti_360_is_read_through_its_rectification(tmp_path: Path) -> None:
     rectify = np.eye(4)
     rectify[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.3, 0.5], degrees=True).as_matrix()
@@ -397,14 +428,50 @@ def test_kitti_360_is_read_through_its_rectification(tmp_path: Path) -> None:
     names = ("perspective", "calib_cam_to_velo", "calib_cam_to_pose")
     rig = import_rig([tmp_path / f"{name}.txt" for name in names])
     assert_front(rig, "image_00")
-    # Camera 1 is 0.6 m along the first camera's x, before rectification: 1 m less 0.6 m.
-    point = rectify.T @ [*P_CAMERA, 1.0] - [0.6, 0, 0, 0]
+    # P is K [I | b] with b = -331.5 px / 552.5 px = -0.6 m: 1 m to the right is 0.4 m there.
     found = rig.T_camera_lidar["image_01"] @ P_LIDAR
-    np.testing.assert_allclose(found, rectify @ point, atol=1e-6)
-    assert (rig.cameras["image_01"].width_px, rig.cameras["image_01"].intrinsics_px.fx) == (
-        1408,
-        552.5,
-    )
+    np.testing.assert_allclose(found[:3], [0.4, 2.0, 10.0], atol=1e-6)
+    assert rig.cameras["image_01"].width_px == 1408
+    without_poses = import_rig([tmp_path / f"{name}.txt" for name in names[:2]])
+    assert list(without_poses.cameras) == ["image_00", "image_01"]
+
+
+def test_a_fisheye_of_kitti_360_is_in_its_place_by_the_poses(tmp_path: Path) -> None:
+    T_pose_cam, beside = np.eye(4), np.eye(4)
+    beside[0, 3] = 0.5  # along x of the first camera, whose axes it has
+    (tmp_path / "calib_cam_to_velo.txt").write_text(row(T_LIDAR_CAMERA))
+    poses = f"image_00: {row(T_pose_cam)}\nimage_02: {row(beside)}\n"
+    (tmp_path / "calib_cam_to_pose.txt").write_text(poses)
+    lens = {
+        **VINS,
+        "model_type": "MEI",
+        "mirror_parameters": {"xi": 2.2},
+        "camera_name": "image_02",
+        "projection_parameters": {"gamma1": 1336.0, "gamma2": 1335.0, "u0": 716.0, "v0": 705.0},
+    }
+    lens = {key: value for key, value in lens.items() if not key.startswith("extrinsic")}
+    files = [tmp_path / "calib_cam_to_velo.txt", tmp_path / "calib_cam_to_pose.txt"]
+    rig = import_rig([saved(tmp_path / "image_02.yaml", lens, "%YAML:1.0\n---\n"), *files])
+    found = rig.T_camera_lidar["image_02"] @ P_LIDAR
+    np.testing.assert_allclose(found[:3], [0.5, 2.0, 10.0], atol=1e-6)
+    assert rig.cameras["image_02"].distortion[0] == 2.2
+
+
+@pytest.mark.parametrize("bad", [{"w": 0.0}, {"w": float("nan")}, {"x": 3.0}])
+def test_a_frame_without_rotation_that_no_camera_needs_is_left_out(
+    bad: dict[str, float], tmp_path: Path
+) -> None:
+    rotation = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0, **bad}
+    broken = {**OTHER, "transform": {**OTHER["transform"], "rotation": rotation}}
+    files = write(tmp_path, front__yaml=documents(MESSAGE),
+                  tf__yaml=documents({"transforms": [broken, STAMPED]}))  # fmt: skip
+    assert_front(import_rig(files))
+    (note,) = read_rig_parts(files).notes
+    assert "frame 'gnss' is left out: quaternion" in note
+    broken = {**broken, "child_frame_id": "front_optical_frame"}
+    files = write(tmp_path, front__yaml=documents(MESSAGE), tf__yaml=documents(broken, OTHER))
+    with pytest.raises(CalibrationError, match="frame 'front_optical_frame' is left out: quat"):
+        import_rig(files)
 
 
 def test_an_extrinsic_of_no_named_camera_asks_for_its_name(tmp_path: Path) -> None:

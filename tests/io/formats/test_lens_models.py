@@ -222,10 +222,11 @@ def test_keys_that_differ_are_refused(tmp_path: Path) -> None:
         ({"K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}, "camera_matrix and K differ"),
         ({"Camera1.fx": 3, "Camera2.fx": 4}, "Camera1.fx and Camera2.fx differ"),
         ({"xi": 1.2, "model": "pinhole"}, "xi is of an omnidirectional lens"),
+        ({"model": "omnidir", "distortion_coefficients": FOUR}, "key 'xi' is missing"),
         ({"T_lidar_camera": matrix(4, 4, np.eye(4).ravel().tolist())}, "different T_camera_lidar"),
     ):
         with pytest.raises(CalibrationError, match=said):
-            import_rig([as_yaml(tmp_path, lens(matrix(1, 5, [0.0] * 5), **keys))])
+            import_rig([as_yaml(tmp_path, {**lens(matrix(1, 5, [0.0] * 5)), **keys})])
 
 
 def test_named_coefficients_without_a_model_are_a_question(tmp_path: Path) -> None:
