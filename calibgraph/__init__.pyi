@@ -10,7 +10,6 @@ from .audit import check as check
 from .audit import drift as drift
 from .audit.page import write_audit_report as write_audit_report
 from .doctor import Diagnosis as Diagnosis
-from .doctor import Finding as Finding
 from .doctor import diagnose as diagnose
 from .errors import CalibrationError as CalibrationError
 from .errors import CorrespondenceError as CorrespondenceError
@@ -80,5 +79,6 @@ from .tracking import Event as Event
 from .tracking import IncrementalCalibrator as IncrementalCalibrator
 from .tracking import Update as Update
 from .tracking import warm_up_tracker as warm_up_tracker
+from .trust.inputs import Finding as Finding
 from .view.mcap_file import write_mcap as write_mcap
 from .view.rerun_file import write_rerun as write_rerun

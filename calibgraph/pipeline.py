@@ -78,6 +78,7 @@ def calibrate(
         correspondences=run.correspondences,
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
+        warnings=run.warnings,
         inputs=inputs,
         timings_s=run.watch.seconds,
     )

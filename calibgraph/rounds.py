@@ -23,19 +23,21 @@ from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
-from calibgraph.matching.protocol import Matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
 from calibgraph.matching.standstill import same_places
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.perturbation import perturb
+from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.repeats import PLACES, SAME_PLACE
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.inputs import check_inputs
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
@@ -70,6 +72,8 @@ def match_in_rounds(
     if full.stage1 == "rig":  # frame weights need a pose per frame, which only PnP gives
         config = config.changed(stage1="rig", learnt_weights=False)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
+    with watch("inputs"):
+        warnings = _warn_of_inputs(data, guess, full)
     with watch("places"):
         places = find_same_places(data, guess)
     with watch("locate"):
@@ -87,7 +91,9 @@ def match_in_rounds(
         if out_of_time():
             break
     missed = full.rounds - 1 - index
-    run = MatchingRun(data, full, guess, table, solution, tuple(rounds), watch, missed)
+    run = MatchingRun(
+        data, full, guess, table, solution, tuple(rounds), watch, missed, warnings=warnings
+    )
     if not out_of_time():
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
@@ -130,6 +136,19 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     data = keep_frames(data)
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     return data, guess
+
+
+def _warn_of_inputs(data: Dataset, guess: Rig, matcher: FullMatcher) -> tuple[str, ...]:
+    """Warnings about the dataset and its guess, which are logged; of tables, about the rig alone.
+
+    Raises:
+        FileError, DatasetError: see :func:`calibgraph.trust.inputs.check_inputs`.
+    """
+    at_guess = matcher.stage1 == "rig"  # others may do without clouds, or from any guess
+    warnings = check_inputs(data, guess) if at_guess else tuple(find_implausible(guess))
+    for text in warnings:
+        _log.warning(text)
+    return warnings
 
 
 def find_same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
@@ -176,7 +195,7 @@ def _solve(
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise
-        hint = f"{error}; the images fit better if the guess is {intended}"
+        hint = f"{error}; {intended}"
         raise CorrespondenceError(hint, camera=error.camera) from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -36,6 +37,8 @@ def print_plain(console: Console, text: str) -> None:
 def progress_bar(first: str = "starting") -> Iterator[Progress]:
     """A progress bar on stderr, removed when the work is done; none if stderr is no terminal.
 
+    Warnings that the work logs are printed, a line each.
+
     Args:
         first: description until the callback is called for the first time.
     """
@@ -47,6 +50,23 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
         task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
-        )
+        logger, lines = logging.getLogger("calibgraph"), _WarningLines(bar.console)
+        logger.addHandler(lines)
+        try:
+            yield lambda what, done, total: bar.update(
+                task, description=what, completed=done, total=total
+            )
+        finally:
+            logger.removeHandler(lines)
+
+
+class _WarningLines(logging.Handler):
+    """Prints warnings as lines above a progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.WARNING)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one."""
+        print_plain(self._console, f"{record.levelname.lower()}: {record.getMessage()}")

@@ -162,6 +162,7 @@ class _Parts(BaseModel):
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
     rounds: tuple[dict[str, Any], ...]
+    warnings: tuple[str, ...] = ()
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
@@ -204,6 +205,7 @@ _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = ("residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap")
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
+    "warnings",
     "counts", "timings_s", "terms", "prior_share", "inputs", "versions",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}

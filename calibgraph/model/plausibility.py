@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 MAX_DISTANCE_M = 20.0
 """Between a camera and its LiDAR, or two cameras: longer than a lorry."""
+_LENGTHS = "lengths in millimetres or centimetres?"
 _FOCAL_SHARE = 0.1, 20.0
 """Pixels per radian over the image's longer side: below, even a pinhole sees over 157 deg and the
 image circle of a fisheye covers less than a tenth of the image; above, the image shows 3 deg."""
@@ -49,9 +50,6 @@ def find_implausible(rig: Rig) -> list[str]:
         if distance > MAX_DISTANCE_M:
             lines.append(f"{pair.b} is {distance:.0f} m from {pair.a}: {_LENGTHS}")
     return lines
-
-
-_LENGTHS = "lengths in millimetres or centimetres?"
 
 
 def _extrinsic(T_camera_lidar: Array) -> Iterator[str]:

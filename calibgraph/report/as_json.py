@@ -42,6 +42,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "cannot_tell": result.verdict.cannot_tell,
         "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
+        "warnings": list(result.warnings),
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,

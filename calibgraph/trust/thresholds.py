@@ -233,7 +233,7 @@ LIMITS: tuple[Limit, ...] = (
           "is this near to the result, and as near as the next row."),
     Limit("convention_translation", 2.5, "m", "See the row above."),
     Limit("convention_gain", 1.3, "times", "A convention error explains a failed guess if, undone, "
-          "the z-score exceeds the guess's by this factor, and the FAIL limit of `z_score`."),
+          "the z-score exceeds the guess's by this factor, and what chance gives."),
 )
 # fmt: on
 

@@ -12,6 +12,7 @@ from calibgraph import Camera, Intrinsics, Rig, load_rig
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import RelativePose
+from factors import LensModel
 from tests.conftest import SAMPLE
 
 HD = {"size": (1280, 720), "centre": (640, 360)}
@@ -23,7 +24,7 @@ def lines(  # noqa: PLR0913 - a camera
     centre: tuple[float, float] = (320, 180),
     size: tuple[int, int] = (640, 360),
     distortion: tuple[float, ...] = (),
-    model: str = "pinhole",
+    model: LensModel = "pinhole",
     shift_m: float = 0.1,
     T: np.ndarray = T_OPTICAL_LINK,
 ) -> list[str]:
