@@ -16,6 +16,7 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
+from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
@@ -113,17 +114,12 @@ def load_dataset(
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
-    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
-    first = read[0].rig
-    for path, other in zip(paths, read, strict=True):
-        _require_same_lenses(paths[0], first, path, other.rig)
-    where = (
-        (*describe_rig(first), *doubtful_axes(first)) if rig is None and is_bag(paths[0]) else ()
-    )
-    notes = dict.fromkeys((*where, *(note for each in read for note in each.notes)))
-    data = Dataset(rig=first, frames=(), folders=paths, notes=tuple(notes))
-    for path in paths:
-        prefix = f"{path.name}/" if len(paths) > 1 else ""
+    bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
+    data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
+    notes = (f"{path}: has no clouds; it serves the other bags" for path in sorted(bare))
+    data = replace(data, notes=(*data.notes, *notes))
+    for path in data.folders:
+        prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         if is_bag(path):
             data = _with_bag(data, path, prefix, bag)
         else:
@@ -131,6 +127,22 @@ def load_dataset(
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     return data if frames is None else _complete(data.select(frames))
+
+
+def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
+    """The rig of all sources, which may differ in their extrinsics, and notes on it.
+
+    Raises:
+        FileError, DatasetError: if a rig is missing, or the rigs differ.
+    """
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    first = read[0].rig
+    for path, other in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other.rig)
+    notes = [note for each in read for note in each.notes]
+    if rig is None and is_bag(paths[0]):
+        notes = [*describe_rig(first), *doubtful_axes(first), *notes]
+    return Dataset(rig=first, frames=(), folders=paths, notes=tuple(dict.fromkeys(notes)))
 
 
 def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:

@@ -115,6 +115,21 @@ def test_any_bag_of_a_drive_may_have_the_transforms_and_lenses(
     assert f"{bags[1]}: /left/camera_info is that of {bags[0]}" in notes
 
 
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_bag_of_transforms_or_lenses_alone_serves_the_others(tmp_path: Path, kind: str) -> None:
+    written = sample_messages(Messages(kind))
+    ends = ("tf_static", "camera_info")
+    tree, infos = ([e for e in written if e.topic.endswith(end)] for end in ends)
+    rest = [each for each in written if not each.topic.endswith(ends)]
+    parts = {"tree": tree, "infos": infos, "rest": rest}
+    bags = [write_bag(tmp_path / name, kind, part) for name, part in parts.items()]
+    notes = require_guess(bags)
+    assert len(load_dataset(bags).frames) == 6
+    assert f"{bags[0]}: has no clouds; it serves the other bags" in notes
+    with pytest.raises(DatasetError, match="it has neither images nor PointCloud2, but "):
+        load_dataset(bags[:2])
+
+
 def test_transforms_of_the_own_bag_count_first(tmp_path: Path) -> None:
     moved = tree_of(RIG)
     moved[0][2][:3, 3] += 1.0
