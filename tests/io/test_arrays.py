@@ -55,14 +55,14 @@ def test_equal_arrays_have_equal_hashes_under_names_of_their_own() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"cloud": CLOUD[:, :2]}, r"cloud 0 has shape \(2, 2\) of float32, expected \(n, 3\)"),
-        ({"cloud": CLOUD[0]}, r"cloud 0 has shape \(4,\)"),
-        ({"cloud": CLOUD.astype(object)}, "cloud 0 has shape .* of object"),
+        ({"cloud": CLOUD[:, :2]}, r"clouds\[0\]: has shape \(2, 2\), expected \(n, 3\)"),
+        ({"cloud": CLOUD[0]}, r"clouds\[0\]: has shape \(4,\)"),
+        ({"cloud": CLOUD.astype(object)}, r"clouds\[0\]: has shape .* of object"),
         ({"cloud": CLOUD[:0]}, "holds no point"),
         ({"cloud": np.full((2, 3), np.inf)}, "not finite"),
-        ({"image": IMAGE.astype(float)}, r"image 0 has shape \(6, 8, 3\) of float64, expected"),
-        ({"image": IMAGE[:, :7]}, r"image 0 has shape \(6, 7, 3\) of uint8, expected \(6, 8, 3\)"),
-        ({"image": IMAGE[None]}, "image 0 has shape"),
+        ({"image": IMAGE.astype(float)}, r"images\['front'\]\[0\] has shape \(6, 8, 3\) of float64, expected"),
+        ({"image": IMAGE[:, :7]}, r"images\['front'\]\[0\] has shape \(6, 7, 3\) of uint8, expected \(6, 8, 3\)"),
+        ({"image": IMAGE[None]}, r"images\['front'\]\[0\] has shape"),
         ({"rig": Rig(cameras={"rear": SMALL})}, "images are of front, the rig has rear"),
     ],
 )

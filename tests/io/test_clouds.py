@@ -108,21 +108,24 @@ def ply(*properties: str) -> bytes:
         ("no_z.ply", ply("x", "y", "intensity"), "expected one z"),
         ("two_x.ply", ply("x", "x", "y", "z"), "expected one x"),
         ("no_y.pcd", pcd("x a z intensity"), "expected one y"),
-        ("negative.pcd", pcd("x y z intensity", count="1 1 1 -1"), "do not fit"),
-        ("negative_x.pcd", pcd("x y z intensity", count="-1 1 1 1"), "do not fit"),
+        ("negative.pcd", pcd("x y z intensity", count="1 1 1 -1"), "found '-1'"),
+        ("negative_x.pcd", pcd("x y z intensity", count="-1 1 1 1"), "found '-1'"),
         ("wide_x.pcd", pcd("x y z intensity", count="2 1 1 1"), "expected one x"),
         ("sizes.pcd", pcd("x y z intensity", size="4 4 4"), "malformed"),
         ("coded.pcd", pcd("x y z intensity").replace(b"binary", b"gzip"), "unknown encoding"),
         ("coded.ply", ply("x", "y", "z", "a").replace(b"_little", b"_middle"), "unknown encoding"),
-        ("many.ply", ply("x", "y", "z", "a").replace(b"500", b"9" * 5000), "of 5000 digits"),
+        (
+            "many.ply",
+            ply("x", "y", "z", "a").replace(b"500", b"9" * 5000),
+            "malformed PLY header, at .element vertex 999",
+        ),
         ("wide.pcd", pcd("x y z intensity").replace(b"WIDTH 500", b"WIDTH 7"), "do not fit"),
         ("odd.pcd", pcd("x y z intensity", size="4 4 3 5"), "do not fit"),
     ],
 )
-def test_fields_that_open3d_would_make_up_are_refused(
+def test_malformed_headers_are_refused(
     name: str, data: bytes, message: str, tmp_path: Path
 ) -> None:
-    pytest.importorskip("open3d", reason="open3d is missing", exc_type=ImportError)
     path = tmp_path / name
     path.write_bytes(data)
     with pytest.raises(FileError, match=message):
