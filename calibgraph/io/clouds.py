@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import tokenize
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -114,8 +115,8 @@ def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.flo
 
 def _read_npy(path: Path) -> RawCloud:
     try:
-        with _PARSER, path.open("rb") as file:  # numpy leaves it open if it is no whole archive
-            array = np.load(file, allow_pickle=False)
+        with _PARSER, path.open("rb") as file, warnings.catch_warnings(action="ignore"):
+            array = np.load(file, allow_pickle=False)  # warns of headers by Python 2
     except _UNREADABLE as error:
         raise FileError(
             path, f"cannot be read as a .npy array ({error!r}); is it complete?"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -18,6 +17,7 @@ from calibgraph.io.lzf import MOST_RATIO, unpack_lzf
 from calibgraph.io.point_fields import (
     RawCloud,
     choose_fields,
+    lines_of_text,
     raw_cloud,
     read_count,
     read_rows,
@@ -106,9 +106,9 @@ def _ascii_columns(
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field; padding may be left out of the lines."""
     widths = [sum(f.count for f in fields), sum(f.count for f in fields if f.name != _PADDING)]
-    lines = io.StringIO(str(body, "ascii", "replace"))
+    lines = lines_of_text(body)
     rows = read_rows(path, lines, count, widths)
-    if any(not line.isspace() for line in lines):
+    if next(lines, None) is not None:
         raise too_long(path, count)
     at, full = 0, rows.shape[1] == widths[0]
     for each in fields:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from calibgraph.errors import FileError
 from calibgraph.io.point_fields import (
     RawCloud,
     choose_fields,
+    lines_of_text,
     raw_cloud,
     read_count,
     read_rows,
@@ -124,9 +124,8 @@ def _ascii_columns(
 ) -> list[NDArray[Any]]:
     """The values of each property of the vertices: a line per item."""
     at = _vertices_at(elements)
-    lines = (line for line in io.StringIO(str(body, "ascii", "replace")) if not line.isspace())
     before = sum(each.count for each in elements[:at] if each.properties)
-    rest = islice(lines, min(before, len(body)), None)
+    rest = islice(lines_of_text(body), min(before, len(body)), None)
     rows = read_rows(path, rest, elements[at].count, [len(elements[at].properties)])
     if not elements[at + 1 :] and next(rest, None) is not None:
         raise too_long(path, elements[at].count)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ INTENSITIES = (
 
 _SCALAR = "scalar_"  # CloudCompare's prefix
 _MOST_DIGITS = 18  # of a number of 64 bits
+_LONGEST_LINE = 2**20
 
 
 class RawCloud(NamedTuple):
@@ -107,10 +109,16 @@ def too_long(path: Path, count: int) -> FileError:
     return FileError(path, f"goes on after the {count} points of its header; write it again")
 
 
+def lines_of_text(body: memoryview) -> Iterator[str]:
+    """The lines of a text that are not blank, one at a time; overlong ones are cut."""
+    text = io.TextIOWrapper(io.BytesIO(body), "ascii", "replace", newline="\n")
+    return (line for line in iter(lambda: text.readline(_LONGEST_LINE), "") if not line.isspace())
+
+
 def read_rows(
-    path: Path, lines: Iterable[str], count: int, widths: Sequence[int]
+    path: Path, lines: Iterator[str], count: int, widths: Sequence[int]
 ) -> NDArray[np.float64]:
-    """(count, width) numbers of lines of text; blank ones are left out.
+    """(count, width) numbers of the next lines.
 
     Args:
         path: of the file.
@@ -121,14 +129,13 @@ def read_rows(
     Raises:
         FileError: if there are fewer lines, or they hold something else.
     """
-    filled = (line for line in lines if not line.isspace())
-    first = next(filled, "")
+    first = next(lines, "")
     if len(first.split()) not in widths:
         raise FileError(
             path, f"its first point has {len(first.split())} numbers, expected {widths[0]}"
         )
     try:
-        rows = np.loadtxt(islice(chain([first], filled), count), ndmin=2, comments=None)
+        rows = np.loadtxt(islice(chain([first], lines), count), ndmin=2, comments=None)
     except ValueError as error:
         raise FileError(path, f"holds no points where they should be: {error}") from None
     if len(rows) != count:
