@@ -53,7 +53,7 @@ def describe_cloud(where: str, cloud: RawCloud) -> Iterator[str]:
     if np.isnan(intensity).all():
         yield f"{where}: no intensity among its fields {' '.join(cloud.fields)}; {_COST}"
     elif np.nanmin(intensity) == np.nanmax(intensity):
-        yield f"{where}: the intensity is {np.nanmax(intensity):g} at all points; {_COST}"
+        yield f"{where}: the intensity is {np.nanmax(intensity) + 0:g} at all points; {_COST}"
 
 
 def doubt_unit(where: str, points: NDArray[np.float32]) -> list[str]:

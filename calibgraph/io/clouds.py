@@ -117,12 +117,17 @@ def _read_npy(path: Path) -> RawCloud:
     try:
         with _PARSER, path.open("rb") as file, warnings.catch_warnings(action="ignore"):
             array = np.load(file, allow_pickle=False)  # warns of headers by Python 2
+            rest = file.read(1)
     except _UNREADABLE as error:
         raise FileError(
             path, f"cannot be read as a .npy array ({error!r}); is it complete?"
         ) from None
     if not isinstance(array, np.ndarray):
         raise FileError(path, "is an archive of arrays, expected one array; write it with np.save")
+    if rest:
+        raise FileError(
+            path, f"goes on after the {array.shape} numbers of its header; write it again"
+        )
     return cloud_of_array(array, path)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import random
+import re
 import resource
 import struct
 import sys
@@ -107,8 +108,15 @@ def _header(data: bytes, rng: random.Random) -> int:
     return max(1, min(len(data), rng.choice([_HEADER, _HEADER, _HEADER, len(data)])))
 
 
-def check(path: Path, data: bytes) -> bool:
-    """Whether it was read; another error than of the file is one of the reader."""
+def mutate_header(data: bytes, rng: random.Random) -> bytes:
+    """A change before the points, which stay: they may be refused, but not become others."""
+    end = re.search(rb"DATA|end_header|\n$", data[:_HEADER] if data[0] != 0x93 else data[:128])
+    at = end.end() if end else 0
+    return rng.choice(MUTATIONS)(data[:at], rng) + data[at:] if at else data
+
+
+def check(path: Path, data: bytes, same: bool = False) -> bool:
+    """Whether it was read, if ``same`` as CLOUD; another error than of the file is the reader's."""
     path.write_bytes(data)
     try:
         cloud = load_cloud(path)
@@ -116,6 +124,7 @@ def check(path: Path, data: bytes) -> bool:
         assert "\n" not in str(error) and str(path) in str(error), error
         return False
     assert cloud.dtype == np.float32 and cloud.shape[1] == 4 and np.isfinite(cloud[:, :3]).all()
+    assert not same or np.array_equal(cloud[:, :3], CLOUD[:, :3]), "other points"
     assert cloud.nbytes <= 100 * len(data), "more points than the file can hold"
     return True
 
@@ -128,9 +137,10 @@ def main(seed: int, count: int, folder: Path) -> None:
     read = 0
     for number in range(count):
         name = rng.choice(list(files))
-        data = mutate(files[name], rng)
+        same = number % 2 == 0
+        data = (mutate_header if same else mutate)(files[name], rng)
         (folder / "last").write_text(f"{number} {name}")
-        read += check(folder / name, data)
+        read += check(folder / name, data, same)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     print(read, count - read, grown // 1024)
 

@@ -96,6 +96,17 @@ def test_a_hostile_npy_header_is_one_line(header: str | None, tmp_path: Path) ->
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("shape", [(500, 3), (499, 4), (250, 4)])
+def test_an_npy_header_that_claims_less_than_there_is_scrambles_no_points(
+    shape: tuple[int, int], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "cloud.npy", CLOUD)
+    data = (tmp_path / "cloud.npy").read_bytes()
+    (tmp_path / "cloud.npy").write_bytes(data.replace(b"(500, 4)", str(shape).encode()))
+    with pytest.raises(FileError, match=r"goes on after the \(\d+, \d\) numbers"):
+        load_cloud(tmp_path / "cloud.npy")
+
+
 def pcd(fields: str, size: str = "4 4 4 4", count: str = "1 1 1 1") -> bytes:
     header = f"""VERSION 0.7
 FIELDS {fields}
