@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
-from calibgraph.io.cloud_notes import doubt_unit
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.words import describe_rig
@@ -165,8 +164,6 @@ def _examine_frames(
             others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
             findings.append(Finding("error", problems[0] + others))
     clouds = [(f, cloud) for f, (cloud, _) in zip(frames, read, strict=True) if cloud is not None]
-    doubts = [line for f, cloud in clouds[:1] for line in doubt_unit(str(f.cloud_path), cloud)]
-    findings += [Finding("warning", line) for line in doubts]
     findings += _repeats("cloud", [(f.name, f.cloud_path) for f, _ in clouds])
     for name in rig.cameras:
         images = [(f.name, f.image_paths[name]) for f, _ in clouds]

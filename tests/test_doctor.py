@@ -39,16 +39,6 @@ def test_the_sample_has_nothing_to_fix(tmp_path: Path) -> None:
     )
 
 
-def test_clouds_in_millimetres_are_a_warning_and_those_without_intensity_a_note(
-    folder: Path,
-) -> None:
-    for path in (folder / "lidar").iterdir():
-        np.save(path, np.load(path)[:, :3] * 1000)
-    found = diagnose([folder])
-    assert any("is it in millimetres or centimetres?" in text for text in texts(found, "warning"))
-    assert any("no intensity among its fields x y z" in text for text in texts(found, "note"))
-
-
 def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Path) -> None:
     (folder / "cameras/left/000002.jpg").unlink()
     for name in ("000000", "000001"):

@@ -1,4 +1,4 @@
-"""Notes about a cloud: it has no intensity, its columns were guessed, it is not in metres."""
+"""Notes about a cloud: it has no intensity, or its columns were told by its content."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
@@ -16,10 +15,6 @@ from calibgraph.io.point_fields import RawCloud
 
 _COST = "the error bars become about twice as wide without; record it, or name its field intensity"
 """Measured on data/sample: 1.8 to 2.8 times the error bars without it, with half of the matches."""
-
-_FARTHEST_M = 500
-"""Median range of a scan. It is 2 to 12 m in the clouds of 11 LiDARs, so thousands in millimetres;
-half the range of the LiDARs that see farthest."""
 
 
 def read_cloud_notes(path: Path) -> list[str]:
@@ -54,19 +49,3 @@ def describe_cloud(where: str, cloud: RawCloud) -> Iterator[str]:
         yield f"{where}: no intensity among its fields {' '.join(cloud.fields)}; {_COST}"
     elif np.nanmin(intensity) == np.nanmax(intensity):
         yield f"{where}: the intensity is {np.nanmax(intensity) + 0:g} at all points; {_COST}"
-
-
-def doubt_unit(where: str, points: NDArray[np.float32]) -> list[str]:
-    """A line if a cloud is not in metres by its size, else none.
-
-    Args:
-        where: its name.
-        points: (n, 3+) x y z.
-    """
-    median = float(np.median(np.linalg.norm(points[:, :3], axis=1)))
-    if median <= _FARTHEST_M:
-        return []
-    return [
-        f"{where}: half of its points are farther than {median:.0f} m, expected metres: is it in "
-        "millimetres or centimetres?"
-    ]

@@ -1,14 +1,13 @@
-"""What is said of a cloud that can be read, but is poor or not in metres."""
+"""Notes about clouds that can be read, but are poor."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from calibgraph import load_dataset
-from calibgraph.io.cloud_notes import doubt_unit, read_cloud_notes
+from calibgraph.io.cloud_notes import read_cloud_notes
 from tests.io.cloud_files import CLOUD, pcd
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
@@ -31,11 +30,3 @@ def test_a_good_and_an_unreadable_cloud_have_no_note(tmp_path: Path) -> None:
     assert read_cloud_notes(tmp_path / "cloud.pcd") == []
     assert read_cloud_notes(tmp_path / "missing.pcd") == []
     assert load_dataset(SAMPLE).notes == ()
-
-
-@pytest.mark.parametrize("unit", [1e3, 1e2])
-def test_other_units_are_doubted(unit: float) -> None:
-    points = np.load(SAMPLE / "lidar" / "000000.npy")
-    assert doubt_unit("cloud", points) == []
-    (line,) = doubt_unit("cloud", points * np.float32(unit))
-    assert "is it in millimetres or centimetres?" in line
