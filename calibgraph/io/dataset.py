@@ -19,6 +19,7 @@ from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
+from calibgraph.io.cloud_notes import read_cloud_notes
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
@@ -39,7 +40,8 @@ class Dataset:
         frames: in order of time.
         folders: their sources.
         recorded: all frames of the folders, where only some of them were selected.
-        notes: what was found in a bag or in tables and what was left out of it, a line each.
+        notes: what was found in the first cloud, a bag or tables, and what was left out, a line
+            each.
     """
 
     rig: Rig
@@ -126,7 +128,9 @@ def load_dataset(
             data = _with_folder(data, path, prefix, complete=frames is None)
     if data.recorded == data.frames:
         data = replace(data, recorded=())
-    return data if frames is None else _complete(data.select(frames))
+    data = data if frames is None else _complete(data.select(frames))
+    of_clouds = (note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path))
+    return replace(data, notes=(*of_clouds, *data.notes))
 
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:

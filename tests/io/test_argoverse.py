@@ -119,7 +119,7 @@ def test_a_sweep_without_an_image_of_a_camera_is_left_out(tmp_path: Path) -> Non
         ("calibration/egovehicle_SE3_sensor.feather",
          {"sensor_name": ["front_left"], **{n: [0.0] for n in
           ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}}, "has length 0, expected 1"),
-        (f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "y": [2.0]}, "column 'z' is missing"),
+        (f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "y": [2.0]}, "expected one z"),
         (f"sensors/lidar/{START_NS}.feather", {"x": [None], "y": [2.0], "z": [1.0]}, "1 empty"),
         ("sensors/lidar/first.feather", {"x": [1.0]}, "its name is no stamp"),
         (f"sensors/lidar/{10**24}.feather", {"x": [1.0]}, "its name is no stamp"),
