@@ -18,7 +18,7 @@ $(VENV)/base: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/base
-	$(INSTALL) --editable '.[test,pointcloud,learned,ros,motion,ray,dask,view,service,las,video,postgres]'
+	$(INSTALL) --editable '.[test,simulation,learned,ros,motion,ray,dask,view,service,las,video,postgres]'
 	@touch $@
 
 install: $(VENV)/base ## Install into .venv

@@ -1,4 +1,4 @@
-"""Write docs/results.md from the results files: the newest run of every command.
+"""Write benchmarks/notes/results.md from the results files: the newest run of every command.
 
 python -m benchmarks.results
 """
@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.tables import RESULTS, ROOT, Entry
+from benchmarks.tables import RESULTS, Entry
 
-PAGE = ROOT / "docs" / "results.md"
+PAGE = Path(__file__).parent / "notes" / "results.md"
 EARLIER = RESULTS / "earlier.md"
 """Tables of before there were results files; they state where they come from."""
 
@@ -22,7 +22,7 @@ uncommitted changes). What each benchmark measures: `benchmarks/README.md`."""
 
 
 def page() -> str:
-    """The text of docs/results.md."""
+    """The text of benchmarks/notes/results.md."""
     sections = (section for path in sorted(RESULTS.glob("*.jsonl")) for section in _sections(path))
     return "\n\n".join([_HEAD, *sections, EARLIER.read_text("utf-8").strip()]) + "\n"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
-"""A file per benchmark, of which ``benchmarks.results`` writes ``docs/results.md``."""
+"""A file per benchmark, of which ``benchmarks.results`` writes ``benchmarks/notes/results.md``."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,10 @@
 public names are listed in ``__init__.pyi``; each is imported on first use.
 """
 
+import logging
+
 import lazy_loader
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # nothing is printed unless asked for
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

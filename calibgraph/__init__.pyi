@@ -10,7 +10,6 @@ from .audit import check as check
 from .audit import drift as drift
 from .audit.page import write_audit_report as write_audit_report
 from .doctor import Diagnosis as Diagnosis
-from .doctor import Finding as Finding
 from .doctor import diagnose as diagnose
 from .errors import CalibrationError as CalibrationError
 from .errors import CorrespondenceError as CorrespondenceError
@@ -23,10 +22,10 @@ from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
-from .fleet.sharded.solve import solve_sharded as solve_sharded
 from .guessing.guess import CameraGuess as CameraGuess
 from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
+from .guessing.template import write_rig_template as write_rig_template
 from .io.arrays import dataset_from_arrays as dataset_from_arrays
 from .io.bags.options import BagOptions as BagOptions
 from .io.bags.rig import rig_of_bag as rig_of_bag
@@ -80,5 +79,6 @@ from .tracking import Event as Event
 from .tracking import IncrementalCalibrator as IncrementalCalibrator
 from .tracking import Update as Update
 from .tracking import warm_up_tracker as warm_up_tracker
+from .trust.inputs import Finding as Finding
 from .view.mcap_file import write_mcap as write_mcap
 from .view.rerun_file import write_rerun as write_rerun

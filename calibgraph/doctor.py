@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +21,19 @@ from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.standstill import same_places
 from calibgraph.matching.structure.matcher import MOST_FRAMES
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.report.point_overlay import write_guess_overlays
 from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.trust.conventions import undo_convention_errors
+from calibgraph.trust.inputs import (
+    Finding,
+    count_points_in_view,
+    describe_out_of_view,
+    explain_guess,
+    find_doubts,
+)
 
-Level = Literal["error", "warning", "note"]
 _ORDER = ("error", "warning", "note")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line about a dataset: an error stops a calibration, a warning spoils it."""
-
-    level: Level
-    text: str
 
 
 @dataclass(frozen=True)
@@ -106,8 +103,8 @@ def diagnose(
     written: list[Path] = []
     if clouds:
         frame, cloud = clouds[len(clouds) // 2]
-        seen = {name: _count_seen(camera, cloud) for name, camera in data.rig.cameras.items()}
-        findings += _examine_guess(data.rig, cloud, seen)
+        seen = count_points_in_view(data.rig, cloud)
+        findings += _examine_guess(examined, (frame, cloud), seen)
         if pictures is not None and not any(finding.level == "error" for finding in findings):
             written = write_guess_overlays(frame, data.rig, pictures)
     findings.sort(key=lambda finding: _ORDER.index(finding.level))
@@ -231,26 +228,17 @@ def _examine_places(data: Dataset) -> Iterator[Finding]:
         )
 
 
-def _examine_guess(rig: Rig, cloud: NDArray[np.float32], seen: dict[str, int]) -> Iterator[Finding]:
-    """Whether the cameras see points of a cloud by the guess, and which see the same."""
-    for name, camera in rig.cameras.items():
-        yield Finding("note", f"{name}: {seen[name]} of {len(cloud)} points lie in the image")
-        if not seen[name]:
-            fitting = [
-                error
-                for error, T in undo_convention_errors(camera.T_camera_lidar).items()
-                if _count_seen(camera.moved_to(T), cloud)
-            ]
-            hint = f"; some would if the guess is {', or '.join(fitting)}" if fitting else ""
-            yield Finding(
-                "error", f"{name}: by the guess, no point of the cloud lies in the image{hint}"
-            )
-    pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(rig, cloud)) or "none"
+def _examine_guess(
+    data: Dataset, cloud_of: tuple[Frame, NDArray[np.float32]], seen: Mapping[str, int]
+) -> Iterator[Finding]:
+    """What cannot be right, whether cameras see points by the guess, and which see the same."""
+    frame, cloud = cloud_of
+    doubts = find_doubts(data.rig, frame, cloud)
+    intended = explain_guess(data, data.rig, cloud)
+    yield from [Finding("error", f"{intended}: correct it")] if intended else []
+    yield from (Finding("error", text) for text in describe_out_of_view(seen))
+    yield from (Finding("warning", text) for text in doubts)
+    for name, count in seen.items():
+        yield Finding("note", f"{name}: {count} of {len(cloud)} points lie in the image")
+    pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(data.rig, cloud)) or "none"
     yield Finding("note", f"cameras that see the same by the guess: {pairs}")
-
-
-def _count_seen(camera: Camera, cloud: NDArray[np.float32]) -> int:
-    """Number of points of a cloud that lie in the image."""
-    T = camera.T_camera_lidar
-    pixels, valid = camera.lens.project(cloud[:, :3].astype(np.float64) @ T[:3, :3].T + T[:3, 3])
-    return int(np.sum(valid & camera.in_image(pixels)))

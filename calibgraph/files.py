@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -159,6 +160,23 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if path.stat().st_size > MAX_YAML_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
     return parse_yaml(read_text(path), path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        FileError: if the file is missing, too large, not JSON, or no object.
+    """
+    if require_file(path).stat().st_size > MAX_YAML_BYTES:
+        raise FileError(path, f"{path.stat().st_size} bytes is too large for a JSON file")
+    try:
+        content = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise FileError(path, f"is not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise FileError(path, f"holds {describe_value(content)}, expected an object {{...}}")
+    return content
 
 
 def read_text(path: Path) -> str:

@@ -30,12 +30,13 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.perturbation import perturb
+from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch
-from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.repeats import PLACES, SAME_PLACE
+from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.inputs import check_inputs
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
@@ -67,18 +68,18 @@ def match_in_rounds(
     config = config or Config()
     full = find_matcher(matcher, seed=config.seed)
     data, guess = _open(dataset, rig, full.most_frames)
-    if full.stage1 == "rig":  # frame weights need a pose per frame, which only PnP gives
-        config = config.changed(stage1="rig", learnt_weights=False)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
+    with watch("inputs"):
+        warnings = check_inputs(data, guess, at_guess=full.stage1 == "rig")
     with watch("places"):
-        places = find_same_places(data, guess)
+        places = find_stationary(data, guess)
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
-    estimate, found = start.rig, start.findings.to_metadata() | places
+    estimate, found = start.rig, start.findings.to_metadata()
     for index in range(start.first_round, full.rounds):
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=progress)
-            table = replace(table, metadata={**table.metadata, **found})
+            table = replace(table, metadata={**table.metadata, **found}).with_places(places)
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
@@ -87,18 +88,20 @@ def match_in_rounds(
         if out_of_time():
             break
     missed = full.rounds - 1 - index
-    run = MatchingRun(data, full, guess, table, solution, tuple(rounds), watch, missed)
+    run = MatchingRun(
+        data, full, guess, table, solution, tuple(rounds), watch, missed, warnings=warnings
+    )
     if not out_of_time():
         with watch("match_again"):
             run = rematch(run, progress, out_of_time)
     full.release()
     with watch("places"):
-        run = name_places(run)
+        run = assign_places(run)
     return replace(run, out_of_time=out_of_time())
 
 
-def name_places(run: MatchingRun) -> MatchingRun:
-    """The run with the frames of each place named in its correspondences' metadata.
+def assign_places(run: MatchingRun) -> MatchingRun:
+    """The run, solved again with the places of its frames.
 
     Where the matcher's error has a part that frames of one place share. The camera with the highest
     z-score shows where the places are.
@@ -107,15 +110,21 @@ def name_places(run: MatchingRun) -> MatchingRun:
     found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
     if not findings.place_variance or not found:
         return run
-    camera = max(found, key=lambda name: found[name])
-    seed = run.solution.config.seed
+    camera, config = max(found, key=lambda name: found[name]), run.solution.config
     try:
-        places = find_places(run.dataset, camera, rig.cameras[camera], seed=seed)
+        groups = find_places(run.dataset, camera, rig.cameras[camera], seed=config.seed)
     except (CalibrationError, OSError):  # the checks on images report it
         return run
-    table = run.correspondences
-    named = replace(table, metadata={**table.metadata, PLACES: places})
-    return replace(run, correspondences=named, solution=run.solution.with_places(places))
+    places = replace(run.correspondences.places, places=as_groups(groups))
+    table = run.correspondences.with_places(places)
+    solution = solve_joint(
+        run.solution.rig,
+        table,
+        config,
+        run.solution.terms,
+        camera_matches=run.solution.camera_matches,
+    )
+    return replace(run, correspondences=table, solution=solution)
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[Dataset, Rig]:
@@ -132,13 +141,12 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     return data, guess
 
 
-def find_same_places(data: Dataset, rig: Rig) -> dict[str, list[list[int]]]:
-    """Which frames are of one place, as metadata of a table; empty if all are of their own."""
+def find_stationary(data: Dataset, rig: Rig) -> Places:
+    """During which frames the vehicle stands."""
     try:
-        places = same_places(data, rig)
+        return Places(stationary=as_groups(same_places(data, rig)))
     except (CalibrationError, OSError):  # the checks on images report it
-        return {}
-    return {SAME_PLACE: places} if places else {}
+        return Places()
 
 
 def _deadline(seconds: float | None) -> Callable[[], bool]:
@@ -159,7 +167,7 @@ def _solve(
     """The joint solve; where there is too little to solve from, with a hint about the guess.
 
     A camera with too few correspondences is placed by what it sees in common with another; if that
-    does not place it either, it is held, and the others are calibrated.
+    does not place it either, it is excluded, and the others are calibrated.
 
     Raises:
         CorrespondenceError: if that is so of all cameras.
@@ -172,27 +180,12 @@ def _solve(
             matches = with_surfaces(matches, dataset, matched[0])
             return solve_joint(*matched, config, terms, camera_matches=matches)
         with suppress(CorrespondenceError):
-            return _solve_some(*matched, config, terms)
+            return solve_without_failing(*matched, config, terms)
         intended = likely_intended_guess(dataset, guess)
         if intended is None:
             raise
-        hint = f"{error}; the images fit better if the guess is {intended}"
+        hint = f"{error}; {intended}"
         raise CorrespondenceError(hint, camera=error.camera) from error
-
-
-def _solve_some(rig: Rig, table: Correspondences, config: Config, terms: Terms) -> Solution:
-    """The joint solve, in which cameras whose correspondences do not agree on a pose are held.
-
-    Raises:
-        CorrespondenceError: if that is so of all cameras.
-    """
-    while True:
-        try:
-            return solve_joint(rig, table, config, terms, hold=True)
-        except CorrespondenceError as error:
-            if error.camera is None or not table.counts().get(error.camera):
-                raise
-            table = table.select(table.camera_index != table.cameras.index(error.camera))
 
 
 def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:
@@ -255,8 +248,7 @@ def _from_displaced_start(
     config, terms = run.solution.config, run.solution.terms
     rig = run.solution.solved_rig
     estimate = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=config.seed)
-    before = run.correspondences.metadata
-    places = {key: before[key] for key in (SAME_PLACE,) if key in before}
+    places = run.correspondences.places
     last = None
     for index in dict.fromkeys(rounds):
         if out_of_time():
@@ -267,8 +259,8 @@ def _from_displaced_start(
             round_index=index,
             progress=lambda what, done, total: progress("matching again", done, total),
         )
-        table = replace(table, metadata={**table.metadata, **places})
-        solution = solve_joint(estimate, table, config, terms, hold=bool(run.solution.held))
+        table = table.with_places(places)
+        solution = solve_joint(estimate, table, config, terms)
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return last
@@ -303,6 +295,6 @@ def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> M
     return replace(
         run,
         correspondences=mixed,
-        solution=solve_joint(start, mixed, *settings, hold=bool(run.solution.held)),
+        solution=solve_joint(start, mixed, *settings),
         rounds=(*run.rounds[:-1], last),
     )

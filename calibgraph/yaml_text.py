@@ -21,6 +21,18 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
     Raises:
         FileError: if it is not YAML, not a mapping, or too deep or large when written out.
     """
+    documents = parse_yaml_documents(text, path)
+    if len(documents) != 1:
+        raise FileError(path, f"holds {len(documents)} YAML documents, expected a single one")
+    return documents[0]
+
+
+def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
+    """The mappings in the text of a YAML file, between lines ``---``; without empty ones.
+
+    Raises:
+        FileError: as of :func:`parse_yaml`.
+    """
     separators = sum(map(text.count, _SEPARATORS))
     if separators > MAX_YAML_VALUES:
         why = f"holds some {separators} values, expected up to {MAX_YAML_VALUES}; is it a table?"
@@ -28,22 +40,24 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
     if _bracket_depth(text) > MAX_YAML_DEPTH:
         raise FileError(path, _TOO_DEEP)
     try:
-        content = yaml.load(text, Loader=_Loader)
-        expanded = _expanded_size(content, {})
+        documents = list(yaml.load_all(text, Loader=_Loader))
+        documents = [each for each in documents if each is not None] or documents[:1]
+        expanded = sum(_expanded_size(each, {}) for each in documents)
     except (yaml.YAMLError, ValueError, IndexError) as error:
         why = str(error).replace('in "<unicode string>", ', "")
         raise FileError(path, f"is not valid YAML: {why}") from error
     except RecursionError:
         raise FileError(path, _TOO_DEEP) from None
-    if not isinstance(content, dict):
-        raise FileError(
-            path, f"holds {describe_value(content)}, expected a mapping of keys to values"
-        )
+    for content in documents or [None]:
+        if not isinstance(content, dict):
+            raise FileError(
+                path, f"holds {describe_value(content)}, expected a mapping of keys to values"
+            )
     if expanded > MAX_YAML_VALUES:
         raise FileError(
             path, f"its aliases stand for over {MAX_YAML_VALUES} values; write them out"
         )
-    return content
+    return documents
 
 
 _SEPARATORS = (",", "\n", ": ", "- ", "? ", "[", "{")

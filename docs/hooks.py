@@ -1,4 +1,4 @@
-"""What `mkdocs build` adds to the pages: generated tables, formulas as MathML, pictures."""
+"""What `mkdocs build` adds to the pages: the API, formulas as MathML, pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from tables import GENERATED
+from tables import PART
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ("data/overlay.png", "data/track.png")
@@ -24,12 +24,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill in the generated tables, and point to the pictures where the site has them."""
-    for name, generate in GENERATED.items():
-        line = f"<!-- generated: {name} -->"
-        if line in markdown:
-            markdown = markdown.replace(line, generate())
-    return markdown.replace("](../data/", "](data/")
+    """Full descriptions in place of the tables of the API; pictures where the site has them."""
+    return PART.sub(_described, markdown).replace("](../data/", "](data/")
+
+
+def _described(part: re.Match[str]) -> str:
+    """A generated part; of the API, what mkdocstrings makes of every name."""
+    if part["name"] != "api":
+        return part["text"]
+    return "\n\n".join(f"::: calibgraph.{name}" for name in part["arguments"].split())
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -1,9 +1,15 @@
-"""Tables for the pages, in place of a line ``<!-- generated: NAME -->``, from the code itself."""
+"""The generated parts of the pages, from the code itself.
+
+    python -m docs.tables
+
+writes them anew between the lines ``<!-- generated: NAME -->`` and ``<!-- end generated -->``.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import click
@@ -59,14 +65,46 @@ def commands() -> str:
     return "\n\n".join(_command(name, command) for name, command in _walk(get_command(app)))
 
 
-GENERATED: Mapping[str, Callable[[], str]] = {
+def api(*names: str) -> str:
+    """Public names with the first line of their docstrings."""
+    import calibgraph
+
+    first_lines = (_cell((getattr(calibgraph, n).__doc__ or "").split("\n\n")[0]) for n in names)
+    return table(
+        ["name", "meaning"], ([f"`{n}`", t] for n, t in zip(names, first_lines, strict=True))
+    )
+
+
+GENERATED: Mapping[str, Callable[..., str]] = {
     "thresholds": thresholds,
     "settings": settings,
     "tracking settings": tracking_settings,
     "training settings": training_settings,
     "presets": presets,
     "commands": commands,
+    "api": api,
 }
+"""By the first word or words after ``generated:``; what follows a colon are arguments."""
+
+PART = re.compile(
+    r"<!-- generated: (?P<name>[\w ]+)(?:: (?P<arguments>[\w ]+))? -->\n(?P<text>.*?)"
+    r"<!-- end generated -->",
+    re.DOTALL,
+)
+
+
+def with_generated_parts(page: str) -> str:
+    """The text of a page, its generated parts made anew."""
+
+    def part(match: re.Match[str]) -> str:
+        head = match[0].partition("\n")[0]
+        text = GENERATED[match["name"]](*(match["arguments"] or "").split())
+        return f"{head}\n\n{text}\n\n<!-- end generated -->"
+
+    return PART.sub(part, page)
+
+
+_ROLE = re.compile(r":(?:func|class|meth|mod):")  # docstrings are written for Sphinx
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -155,9 +193,15 @@ def _command(name: str, command: click.Command) -> str:
 
 def _flags(option: click.Parameter) -> str:
     names = "`, `".join([*option.opts, *option.secondary_opts])
-    return f"`{names} {option.metavar}`" if option.metavar else f"`{names}`"
+    flags = f"`{names} {option.metavar}`" if option.metavar else f"`{names}`"
+    return flags.replace("|", r"\|")
 
 
 def _shown_default(option: click.Parameter) -> str:
     shown = getattr(option, "show_default", False)
     return f"`{option.default}`" if shown and option.default not in (None, False) else ""
+
+
+if __name__ == "__main__":
+    for _page in sorted(Path(__file__).parent.glob("*.md")):
+        _page.write_text(with_generated_parts(_page.read_text("utf-8")), "utf-8")

@@ -1,4 +1,4 @@
-"""The benchmarks can be called, and docs/results.md is what they recorded."""
+"""The benchmarks can be called, and benchmarks/notes/results.md is what they recorded."""
 
 from __future__ import annotations
 

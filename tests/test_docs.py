@@ -1,4 +1,4 @@
-"""README and pages: links lead somewhere, command lines parse, Python compiles."""
+"""README and pages: links lead somewhere, commands parse, Python compiles, sentences are short."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ import calibgraph
 from calibgraph.cli.app import app
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.config import Config
-from docs.tables import GENERATED
+from docs.tables import GENERATED, PART, with_generated_parts
 from tests.conftest import ROOT
 
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
+NOTES = sorted(ROOT.glob("benchmarks/notes/*.md"))
 READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
-PLACEHOLDER = re.compile(r"<!-- generated: (.*) -->")
+PROSE_PAGES = sorted([ROOT / "README.md", ROOT / "data" / "README.md", *ROOT.glob("docs/**/*.md")])
+LONGEST_SENTENCE = 35
+LONGEST_README = 800
 SERVER = "--server http://127.0.0.1:8080 "  # an option of the program, before the command
 VALUES = ("--help", "--version", "--debug")
 
@@ -30,7 +33,7 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=name_of)
 def test_links_lead_to_files_and_headings(page: Path) -> None:
     text = without_code(page.read_text())
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -41,6 +44,31 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
         assert file.exists(), f"{target}: no such file"
         if anchor and file.suffix == ".md":
             assert anchor in anchors_of(file), f"{target}: no such heading"
+
+
+@pytest.mark.parametrize("page", PROSE_PAGES, ids=name_of)
+def test_no_sentence_is_too_long_to_be_read_once(page: Path) -> None:
+    for sentence in sentences_of(page.read_text()):
+        assert len(sentence.split()) <= LONGEST_SENTENCE, sentence
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().split()) <= LONGEST_README
+
+
+def sentences_of(page: str) -> Iterator[str]:
+    """The sentences of a page, without code, tables, formulas and generated parts.
+
+    A formula, a name in code and the target of a link count as one word or none.
+    """
+    text = re.sub(r"^---\n.*?^---\n", "", page, count=1, flags=re.MULTILINE | re.DOTALL)
+    text = without_code(PART.sub("", text))
+    text = re.sub(r"^\$\$.*?^\$\$", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^(\||#|!|<!--).*$", "\n", text, flags=re.MULTILINE)
+    text = re.sub(r"`[^`]*`|\$[^$\n]+\$", "x", text)
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    for block in re.split(r"\n\s*\n|\n(?=\s*(?:\*|\d+\.) )", text):
+        yield from re.split(r"(?<=[.!?])\s+", " ".join(block.split()))
 
 
 def without_code(text: str) -> str:
@@ -135,9 +163,8 @@ def test_examples_of_settings_are_settings() -> None:
 
 
 def test_the_api_page_has_every_public_name() -> None:
-    listed = re.findall(
-        r"^::: calibgraph\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE
-    )
+    parts = PART.finditer((ROOT / "docs/api.md").read_text())
+    listed = " ".join(part["arguments"] for part in parts).split()
     assert sorted(listed) == sorted(calibgraph.__all__)
 
 
@@ -155,9 +182,15 @@ def test_generated_tables_have_rows(name: str) -> None:
         assert len({row.replace(r"\|", "").count("|") for row in rows}) == 1, "cells are missing"
 
 
-def test_pages_name_tables_that_exist() -> None:
-    named = {name for page in PAGES for name in PLACEHOLDER.findall(page.read_text())}
+def test_every_generated_part_has_its_place() -> None:
+    named = {part["name"] for page in PAGES for part in PART.finditer(page.read_text())}
     assert named == set(GENERATED)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_generated_parts_are_what_the_code_gives(page: Path) -> None:
+    text = page.read_text()
+    assert text == with_generated_parts(text), "run python -m docs.tables"
 
 
 @pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -89,15 +90,61 @@ def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
     )
 
 
-def test_a_guess_that_sees_nothing_is_named_with_what_it_may_be() -> None:
+def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None:
     rig = load_rig(SAMPLE)
     T = rig.T_camera_lidar["left"].copy()
-    T[:3, 3] *= 1000.0  # 350 m
+    T[:3, 3] *= 1000.0
     found = diagnose([SAMPLE], rig.moved_to({"left": T}))
     assert found.points_in_image["left"] == 0
-    (error,) = texts(found, "error")
-    assert error.startswith("left: by the guess, no point of the cloud lies in the image; some ")
-    assert "a translation in millimetres" in error
+    assert texts(found, "error") == [
+        "the images of left fit far better if the guess has a translation in millimetres: correct "
+        "it",
+        "left: by the guess, no point of the cloud lies in the image",
+    ]
+    assert texts(found, "warning") == [
+        "left: the camera is 351 m from the LiDAR: lengths in millimetres or centimetres?"
+    ]
+
+
+def change_clouds(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    for path in (folder / "lidar").iterdir():
+        np.save(path, change(np.load(path)))
+
+
+def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> None:
+    change_clouds(folder, lambda cloud: cloud * np.float32([-1, -1, 1, 1][: cloud.shape[1]]))
+    errors = texts(diagnose([folder]), "error")
+    assert errors[0] == (
+        "the images fit far better if the LiDAR's axes are turned by 180 deg about z (its x "
+        "points backward): correct it"
+    )
+    assert all("no point of the cloud lies in the image" in error for error in errors[1:])
+
+
+@pytest.mark.parametrize(
+    ("scale", "expected"),
+    [
+        (1000, "9.33e+03 m is above 1e+03 m: are the clouds in millimetres?"),
+        (100, "933 m is above 200 m: are the clouds in centimetres?"),
+    ],
+)
+def test_clouds_in_other_units_are_named_with_their_distance(
+    folder: Path, scale: float, expected: str
+) -> None:
+    change_clouds(folder, lambda cloud: cloud * np.float32([scale] * 3 + [1])[: cloud.shape[1]])
+    assert texts(diagnose([folder]), "warning") == [f"median distance of the points {expected}"]
+
+
+def test_clouds_joined_with_a_wrong_extrinsic_are_named_with_how_far_apart(folder: Path) -> None:
+    def join(cloud: np.ndarray) -> np.ndarray:
+        moved = cloud.copy()
+        moved[:, 0] += 0.3
+        return np.concatenate([cloud, moved])
+
+    change_clouds(folder, join)
+    (warning,) = texts(diagnose([folder]), "warning")
+    assert "holds the same surfaces twice, 0.0" in warning
+    assert "deg and 0.3 m apart: clouds joined with a wrong extrinsic" in warning
 
 
 def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(

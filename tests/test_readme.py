@@ -20,13 +20,14 @@ def example(page: str) -> str:
 
 
 FIRST = example("README.md")
+ARRAYS = example("docs/library.md")
 OWN_MATCHER = example("docs/your_matcher.md")
 TRACKER = example("docs/tracking.md")
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
 def arrays_of_sample() -> dict[str, object]:
-    """What the first example takes from the reader's program."""
+    """What the example with arrays takes from the reader's program."""
     dataset = calibgraph.load_dataset(SAMPLE)
     cameras = dataset.rig.cameras
     return {
@@ -49,8 +50,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(folder: Path) -> calibgraph.Calibration:
-    """The sample in memory, as the first example calibrates it, from 2 deg and 0.2 m."""
-    names: dict[str, object] = arrays_of_sample()
+    """The sample as the README's example calibrates it, from 2 deg and 0.2 m."""
+    names: dict[str, object] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         exec(compile(FIRST, "README.md", "exec"), names)
@@ -67,6 +68,19 @@ def test_the_sample_is_calibrated(result: calibgraph.Calibration, folder: Path) 
     assert result.verdict.status == "PASS", result.verdict.reasons
     assert len(result.rounds) == len(LEVELS) - 3  # the search has done the first
     assert (folder / "out" / "python" / "calibration.yaml").is_file()
+
+
+@pytest.mark.slow
+def test_arrays_give_the_numbers_of_the_folder(
+    monkeypatch: pytest.MonkeyPatch, result: calibgraph.Calibration, folder: Path
+) -> None:
+    monkeypatch.chdir(folder)
+    names = arrays_of_sample()
+    exec(compile(ARRAYS, "library.md", "exec"), names)
+    same = names["result"]
+    assert isinstance(same, calibgraph.Calibration)
+    for name, T in result.T_camera_lidar.items():
+        np.testing.assert_allclose(same.T_camera_lidar[name], T, atol=1e-9)
 
 
 def test_the_table_of_the_last_round_repeats_the_solve(result: calibgraph.Calibration) -> None:
@@ -119,7 +133,7 @@ def true_matches(
 
 
 def test_the_rig_example_is_a_rig(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "data.md").read_text()
+    page = (ROOT / "docs" / "files.md").read_text()
     text = re.search(r"(format: calibgraph-rig/1\n.*?\n)relative_poses", page, re.DOTALL)
     assert text is not None
     (tmp_path / "rig.yaml").write_text(text[1])

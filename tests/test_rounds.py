@@ -9,8 +9,7 @@ import pytest
 import calibgraph
 from calibgraph import Config, CorrespondenceError, perturb, simulate_correspondences
 from calibgraph.model.geometry import pose_difference
-from calibgraph.rounds import _solve_some
-from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.joint import solve_joint, solve_without_failing
 from tests.conftest import SAMPLE
 from tests.matching.structure.data import with_noise_images
 
@@ -50,9 +49,9 @@ def test_a_camera_whose_matches_do_not_agree_is_held_and_the_others_are_solved()
     other = np.flatnonzero(table.camera_index != table.cameras.index("left"))
     table = replace(table, pixels_px=pixels).select(np.sort(np.r_[own[:7], other]))
     with pytest.raises(CorrespondenceError, match="within the gate"):
-        solve_joint(truth, table, Config(), hold=True)
-    solution = _solve_some(truth, table, Config(), "full")
-    assert solution.held == ("left",)
+        solve_joint(truth, table, Config())
+    solution = solve_without_failing(truth, table, Config())
+    assert solution.held == solution.config.excluded_cameras == ("left",)
     for name in ("front_left", "front_right"):
         T = solution.T_camera_lidar[name]
         assert pose_difference(T, truth.cameras[name].T_camera_lidar)[0] < 0.1

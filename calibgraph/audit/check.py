@@ -84,7 +84,7 @@ def check(
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
     deployed = rig.model_copy(update={"relative_poses": ()})
     data = _open(dataset, deployed, full)
-    matching = Matching(keep_frames(data), deployed, full, _config(full, seed), report)
+    matching = Matching(keep_frames(data), deployed, full, Config(seed=seed), report)
     try:
         run = tie_cameras(match_from_deployed(matching, watch), report)
         with watch("checks"):
@@ -106,12 +106,6 @@ def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
     """The frames that the matcher is given."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     return data if matcher.most_frames is None else data.spread_out(matcher.most_frames)
-
-
-def _config(matcher: FullMatcher, seed: int) -> Config:
-    """The preset ``auto``, for the Stage 1 of the matcher."""
-    config = Config().changed(seed=seed)
-    return config.changed(stage1="rig", learnt_weights=False) if matcher.stage1 == "rig" else config
 
 
 def _judge(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from calibgraph.errors import CorrespondenceError
@@ -12,11 +12,12 @@ from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun, RoundSummary
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_difference
+from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.progress import Progress, Stopwatch
-from calibgraph.rounds import find_same_places, summarize_round
-from calibgraph.solver.joint import solve_joint
+from calibgraph.rounds import find_stationary, summarize_round
+from calibgraph.solver.joint import solve_without_failing
 from calibgraph.trust.thresholds import threshold
 
 _REACH_DEG, _REACH_CM = 0.7, 20.0
@@ -42,9 +43,9 @@ class Matching:
     progress: Progress
 
     @cached_property
-    def places(self) -> dict[str, list[list[int]]]:
-        """Which frames are of one place, as metadata of a table."""
-        return find_same_places(self.data, self.deployed)
+    def places(self) -> Places:
+        """During which frames the vehicle stands."""
+        return find_stationary(self.data, self.deployed)
 
 
 def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
@@ -80,9 +81,9 @@ def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> 
     for index in rounds:
         with watch("match"):
             table = matcher.match(data, estimate, round_index=index, progress=matching.progress)
-            table = replace(table, metadata={**table.metadata, **matching.places})
+            table = table.with_places(matching.places)
         with watch("solve"):
-            solution = solve_joint(estimate, table, config, hold=True)
+            solution = solve_without_failing(estimate, table, config)
         summaries.append(summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return MatchingRun(data, matcher, matching.deployed, table, solution, tuple(summaries), watch)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
@@ -18,7 +18,7 @@ import typer
 
 from calibgraph.cli import outputs, remote
 from calibgraph.cli.bag import bag
-from calibgraph.cli.benchmark import bench, paper, tune
+from calibgraph.cli.benchmark import bench, paper
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
@@ -26,7 +26,9 @@ from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
+from calibgraph.cli.former_options import with_present_options
 from calibgraph.cli.guess import guess
+from calibgraph.cli.init import init
 from calibgraph.cli.inspect import evaluate, perturb, report
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.pick import pick
@@ -97,13 +99,13 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     perturb: outputs.guess,
     bag: outputs.rig_of_bag,
     doctor: outputs.pictures,
+    init: outputs.nothing,
     guess: outputs.rig_guess,
     export: outputs.exported,
     import_: outputs.imported,
     simulate: outputs.nothing,
     weights: outputs.weights,
     train: outputs.training,
-    tune: outputs.settings,
     track: outputs.result,
     pick: outputs.picked,
     fleet: outputs.nothing,
@@ -133,7 +135,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
-    sys.argv[1:] = list(_repeat_weights_option(sys.argv[1:]))
+    sys.argv[1:] = _repeat_weights_option(with_present_options(sys.argv[1:]))
     try:
         _require_utf8(sys.argv[1:])
         code = _run_app()
@@ -198,7 +200,7 @@ def _flush(stream: TextIO | None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _repeat_weights_option(arguments: list[str]) -> Iterator[str]:
+def _repeat_weights_option(arguments: Iterable[str]) -> Iterator[str]:
     """Expand ``--weights a.tar b.tar`` to ``--weights a.tar --weights b.tar``."""
     in_list, previous = False, ""
     for argument in arguments:

@@ -40,8 +40,9 @@ def bag(
     as_json: JsonOption = False,
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static."""
-    from calibgraph.io.bags.rig import doubtful_axes, rig_of_bag
+    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
     from calibgraph.io.formats.words import describe_rig
+    from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
 
     with checked_arguments():
@@ -51,13 +52,16 @@ def bag(
     if not as_json:
         for name, kind, count in topics:
             print_plain(terminal(), f"{name}  {kind}  {count}")
-    rig = rig_of_bag(path, options, relative_sigmas=sigmas)
+    read = read_bag_rig(path, options)
+    rig = read.to_rig(sigmas)
     if out is not None:
         rig.save(out, first_line=yaml_mark("bag"))
+    notes = [*doubtful_axes(rig), *read.notes]
+    notes += [f"warning: {line}" for line in find_implausible(rig)]
     if as_json:
-        _print_json(topics, rig, out)
+        _print_json(topics, rig, notes, out)
         return
-    for line in (*describe_rig(rig), *doubtful_axes(rig)):
+    for line in (*describe_rig(rig), *notes):
         print_plain(terminal(), line)
     if out is not None:
         print_plain(terminal(), f"{out}: written")
@@ -85,7 +89,8 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
         FileError: if the path is no bag.
     """
     from calibgraph.errors import FileError
-    from calibgraph.io.bags.messages import Bag, is_bag
+    from calibgraph.io.bags.messages import Bag
+    from calibgraph.io.bags.storage import is_bag
 
     if not is_bag(path):
         raise FileError(path, "is no ROS bag; expected a .bag, .mcap or .db3 file, or the folder "
@@ -94,7 +99,9 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
     return [(each.name, each.type, each.count) for each in topics]
 
 
-def _print_json(topics: list[tuple[str, str, int]], rig: Rig, out: Path | None) -> None:
+def _print_json(
+    topics: list[tuple[str, str, int]], rig: Rig, notes: list[str], out: Path | None
+) -> None:
     from calibgraph.report.as_json import print_json
 
     keys = ("topic", "type", "messages")
@@ -102,6 +109,7 @@ def _print_json(topics: list[tuple[str, str, int]], rig: Rig, out: Path | None) 
         {
             "topics": [dict(zip(keys, each, strict=True)) for each in topics],
             "rig": rig.model_dump(mode="json"),
+            "notes": notes,
             "out": None if out is None else str(out),
         }
     )

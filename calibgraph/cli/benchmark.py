@@ -1,15 +1,14 @@
-"""The commands that measure accuracy and search for settings: bench, tune."""
+"""The command that measures accuracy: bench."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.options import JsonOption, SeedOption
+from calibgraph.cli.options import SeedOption
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 from calibgraph.errors import CalibrationError
 
@@ -125,90 +124,3 @@ def _parse_counts(option: str, text: str) -> list[int]:
     if not found or min(found) < 1:
         raise ValueError(f"{option} {text}: give whole numbers from 1 on, like 10,100")
     return found
-
-
-def _parse_numbers(option: str, text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} {text}: give numbers, like 0.5,1,2") from None
-
-
-_CANDIDATES = "Candidates"
-
-
-def tune(
-    data: DataArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Settings to write.")],
-    samples: Annotated[int, typer.Option(min=1, help="Candidates to try.")] = 50,
-    frames: Annotated[int, typer.Option(min=1, help="Frames of a draw.")] = 10,
-    draws: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Draws for tuning, and as many for the test. (default: 5; of recordings 3)",
-        ),
-    ] = None,
-    preset: PresetOption = None,
-    prior_weight: Annotated[
-        str, typer.Option("--lambda", metavar="X,X", help="lambda.", rich_help_panel=_CANDIDATES)
-    ] = "0,0.1,0.5,1,2,5,10",
-    relative_prior_weight: Annotated[
-        str, typer.Option("--mu", metavar="X,X", help="mu.", rich_help_panel=_CANDIDATES)
-    ] = "0,1,2,5,10,20",
-    loss_scale_px: Annotated[
-        str,
-        typer.Option(
-            "--delta", metavar="X,X", help="delta, in pixels.", rich_help_panel=_CANDIDATES
-        ),
-    ] = "1,2,4,8,16",
-    gate_px: Annotated[
-        str,
-        typer.Option("--tau", metavar="X,X", help="tau, in pixels.", rich_help_panel=_CANDIDATES),
-    ] = "2,3,5,8,16,32",
-    rotation_deg: RotationOption = 20.0,
-    translation_m: TranslationOption = 1.5,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Search for lambda, mu, delta and tau at random, as the paper does, and test the best.
-
-    The score is E_R / 1 deg + E_t / 10 cm, the mean over cameras and draws. Tuning and test draws
-    share no frame. FILE.yaml is read by --config.
-    """
-    from calibgraph.evaluation.sources import Displacement, source_from
-    from calibgraph.evaluation.tune import Candidates, tune
-
-    with checked_arguments(), progress_bar() as progress:
-        candidates = Candidates(
-            _parse_numbers("--lambda", prior_weight),
-            _parse_numbers("--mu", relative_prior_weight),
-            _parse_numbers("--delta", loss_scale_px),
-            _parse_numbers("--tau", gate_px),
-        )
-        source = source_from(data, Displacement(rotation_deg, translation_m))
-        tuned = tune(
-            source,
-            base=_paper_settings(source.preset if preset is None else preset, seed),
-            frames=frames,
-            samples=samples,
-            draws=draws or min(5, source.default_draws),
-            candidates=candidates,
-            seed=seed,
-            progress=progress,
-        )
-    if not math.isfinite(tuned.best.tuning):
-        raise CalibrationError(
-            f"{data}: no candidate found extrinsics in every draw; calibgraph calibrate "
-            "reports why; more --frames may help"
-        )
-    tuned.save(out)
-    if as_json:
-        from calibgraph.report.as_json import print_json
-
-        print_json(tuned.to_mapping())
-    else:
-        from calibgraph.cli.tables import print_tuned
-
-        print_tuned(terminal(), tuned)
-        print_plain(terminal(), f"{out}: written")

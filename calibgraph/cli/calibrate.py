@@ -13,12 +13,12 @@ from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
 from calibgraph.cli.options import (
     BootstrapOption,
+    CameraMatchesOption,
     CommonCmOption,
     CommonDegOption,
     ConfigOption,
     ConfigSeedOption,
     DatasetArgument,
-    EngineOption,
     JsonOption,
     OutOption,
     PresetOption,
@@ -117,19 +117,21 @@ def solve(
     preset: PresetOption = None,
     config: ConfigOption = None,
     out: OutOption = Path("calibration"),
+    camera_matches: CameraMatchesOption = None,
     seed: ConfigSeedOption = None,
     bootstrap: BootstrapOption = None,
     tolerance_deg: ToleratedDegOption = None,
     tolerance_cm: ToleratedCmOption = None,
     common_deg: CommonDegOption = None,
     common_cm: CommonCmOption = None,
-    engine: EngineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256
-    from calibgraph.fleet.sharded.solve import solve_table, table_files
+    from calibgraph.io.camera_match_tables import load_camera_matches
+    from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
+    from calibgraph.pipeline import solve
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
@@ -141,14 +143,15 @@ def solve(
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
+        if camera_matches is not None and remote.SERVER.get() is not None:
+            raise ValueError("--camera-matches stays here: a server takes correspondences alone")
     if remote.SERVER.get() is not None:
         remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
         _print_and_exit(*remote_result, as_json=as_json)
         return
-    with progress_bar("solving") as progress, checked_arguments():
-        result = solve_table(
-            load_rig(rig), correspondences, settings, checked_terms, engine, progress=progress
-        )
+    with progress_bar("solving"), checked_arguments():
+        seen = None if camera_matches is None else load_camera_matches(camera_matches)
+        result = solve(load_rig(rig), correspondences, settings, checked_terms, camera_matches=seen)
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
         written = write_result(result, out)

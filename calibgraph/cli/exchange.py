@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,8 @@ from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from calibgraph.model.rig import Rig
 
 _LIST = "list"
 
@@ -85,8 +88,13 @@ def export(
         typer.Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
     ] = None,
     camera_frame: Annotated[
-        str, typer.Option(metavar="TEXT", help="Frame id of optical frames; {camera} is the name.")
-    ] = "{camera}_optical_frame",
+        str | None,
+        typer.Option(
+            metavar="TEXT",
+            help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
+            "the rig, or {camera}_optical_frame)",
+        ),
+    ] = None,
     lidar_pose: Annotated[
         str | None,
         typer.Option(
@@ -100,9 +108,14 @@ def export(
     ] = False,
 ) -> None:
     """Write a calibration in the format of another program, with its direction as a comment."""
+    import numpy as np
+
     from calibgraph.io.formats.export import export_calibration
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.model.plausibility import MAX_DISTANCE_M
 
     with checked_arguments():
+        T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         written = export_calibration(
             source,
             out,
@@ -110,9 +123,16 @@ def export(
             cameras=camera or None,
             lidar_frame=lidar_frame,
             camera_frame=camera_frame,
-            T_base_lidar=None if lidar_pose is None else _parse_pose(lidar_pose),
+            T_base_lidar=T_base_lidar,
             even_if_failed=even_if_failed,
         )
+        rig = load_rig(source)
+    rig = rig.model_copy(
+        update={"cameras": {name: rig.cameras[name] for name in camera or rig.cameras}}
+    )
+    if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
+        print_plain(terminal(), f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
+    print_doubts(rig)
     for path in written:
         print_plain(terminal(), f"{path}: written ({format})")
 
@@ -121,7 +141,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
     """The (4, 4) of six numbers.
 
     Raises:
-        ValueError: if they are not six.
+        ValueError: if they are not six, or an angle is in degrees.
     """
     from calibgraph.io.rotations import pose_of_angles
 
@@ -131,7 +151,10 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
         raise ValueError(
             f"--lidar-pose {text!r}: give six numbers, X Y Z ROLL PITCH YAW"
         ) from error
-    return pose_of_angles((x, y, z), (roll, pitch, yaw))
+    try:
+        return pose_of_angles((x, y, z), (roll, pitch, yaw))
+    except ValueError as error:
+        raise ValueError(f"--lidar-pose {text!r}: {error}") from error
 
 
 def import_(
@@ -141,35 +164,51 @@ def import_(
     lidar_frame: LidarFrameOption = None,
     camera_frame: CameraFrameOption = None,
     size: SizeOption = None,
-    relative_sigma_deg: Annotated[
-        float, typer.Option(min=0.001, help="Of relative poses (T_cn_cnm1): 1 sigma per axis.")
+    tie_deg: Annotated[
+        float,
+        typer.Option(
+            min=0.001, metavar="DEG", help="Sigma per axis of relative poses (Kalibr's T_cn_cnm1)."
+        ),
     ] = 0.1,
-    relative_sigma_cm: Annotated[
-        float, typer.Option(min=0.001, help="Likewise, of their translation.")
-    ] = 0.5,
+    tie_m: Annotated[
+        float, typer.Option(min=1e-5, metavar="M", help="The sigma in translation, per axis.")
+    ] = 0.005,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
-    from calibgraph.io.formats.rig_import import import_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.io.formats.words import describe_rig
     from calibgraph.outputs import yaml_mark
 
     named = [parse_file(text) for text in files]
     with checked_arguments():
-        rig = import_rig(
+        parts = read_rig_parts(
             [path for _, path in named],
             names={path: name for name, path in named if name},
             rename=parse_names("--rename", rename),
             lidar_frame=lidar_frame,
             camera_frames=parse_names("--camera-frame", camera_frame),
+        )
+        rig = parts.to_rig(
             size_px=None if size is None else parse_size(size),
-            relative_sigma_deg=relative_sigma_deg,
-            relative_sigma_cm=relative_sigma_cm,
+            relative_sigma_deg=tie_deg,
+            relative_sigma_cm=100.0 * tie_m,
         )
     rig.save(out, first_line=yaml_mark("import"))
+    print_doubts(rig, parts.notes)
     for sentence in describe_rig(rig):
         print_plain(terminal(), sentence)
     cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
     print_plain(terminal(), f"{out}: {cameras}; check the sentences above against the vehicle")
+
+
+def print_doubts(rig: Rig, notes: Sequence[str] = ()) -> None:
+    """Print what was assumed of files, and the values of a rig that cannot be right."""
+    from calibgraph.model.plausibility import find_implausible
+
+    for note in notes:
+        print_plain(terminal(), f"note: {note}")
+    for line in find_implausible(rig):
+        print_plain(terminal(), f"warning: {line}")
 
 
 def parse_file(text: str) -> tuple[str, Path]:

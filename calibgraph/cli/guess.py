@@ -17,24 +17,31 @@ from calibgraph.cli.exchange import (
     parse_file,
     parse_names,
     parse_size,
+    print_doubts,
 )
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+
+MountOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=WORDS",
+        help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
+        "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
+        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
+    ),
+]
+ForwardOption = Annotated[
+    str,
+    typer.Option(metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."),
+]
 
 
 def guess(
     files: FilesArgument,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
-    mount: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=WORDS",
-            help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
-            "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
-            "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
-        ),
-    ] = None,
-    data: Annotated[
+    mount: MountOption = None,
+    dataset: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="DATASET",
@@ -48,12 +55,7 @@ def guess(
             metavar="NAME", help="Search for this camera although a file has an extrinsic."
         ),
     ] = None,
-    forward: Annotated[
-        str,
-        typer.Option(
-            metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
-        ),
-    ] = "+x",
+    forward: ForwardOption = "+x",
     rename: RenameOption = None,
     lidar_frame: LidarFrameOption = None,
     camera_frame: CameraFrameOption = None,
@@ -78,7 +80,7 @@ def guess(
         found = guess_rig(
             parts,
             mountings=parse_names("--mount", mount),
-            data=data or None,
+            data=dataset or None,
             search=search or (),
             forward=forward,
             size_px=None if size is None else parse_size(size),
@@ -90,6 +92,7 @@ def guess(
         from calibgraph.report.as_json import print_json
 
         print_json(found.to_mapping())
+    print_doubts(found.rig, parts.notes)
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")

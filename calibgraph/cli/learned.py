@@ -57,7 +57,7 @@ def train(
         Path,
         typer.Option(metavar="FILE", help="Weights to write; their settings are written beside."),
     ],
-    settings: Annotated[
+    config: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
@@ -109,14 +109,14 @@ def train(
     from calibgraph.matching.cmrnext.training.scenes import load_trusted_dataset, split
     from calibgraph.matching.cmrnext.training.settings import load_settings
 
-    given = {"settings": settings, "seed": seed, "from": start}
+    given = {"config": config, "seed": seed, "from": start}
     with checked_arguments():
         for option, value in given.items():
             if resume and value is not None:
                 raise ValueError(
                     f"--{option}: --resume goes on with the settings in {out}; leave out"
                 )
-        chosen = TrainSettings() if settings is None else load_settings(settings)
+        chosen = TrainSettings() if config is None else load_settings(config)
         chosen = chosen if seed is None else chosen.changed(seed=seed)
     trusted = load_rig(rig) if rig else None
     data = [load_trusted_dataset(folder, trusted) for folder in dataset]

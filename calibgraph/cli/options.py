@@ -19,12 +19,11 @@ DatasetArgument = Annotated[
 RigOption = Annotated[
     Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
 ]
-EngineOption = Annotated[
-    str | None,
+CameraMatchesOption = Annotated[
+    Path | None,
     typer.Option(
-        metavar="local|processes|ray",
-        help="Who holds the files of a folder: this process, one process per core (default), or "
-        "actors of a Ray cluster (RAY_ADDRESS, else a new local one).",
+        metavar="FILE",
+        help="Features that cameras have in common: camera_matches.parquet of a result.",
     ),
 ]
 MatcherOption = Annotated[

@@ -118,11 +118,6 @@ def pictures(given: Given) -> list[Output]:
     return [Output(path, "doctor, as far as can be seen") for path in found]
 
 
-def settings(given: Given) -> list[Output]:
-    """Settings of the solve."""
-    return [_marked_yaml(given["out"], "tune")]
-
-
 def weights(given: Given) -> list[Output]:
     """Converted weights, if they are wanted."""
     from calibgraph.outputs import Output

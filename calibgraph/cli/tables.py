@@ -23,7 +23,6 @@ from calibgraph.model.summary import Summary
 
 if TYPE_CHECKING:
     from calibgraph.evaluation.paper import Report, Row
-    from calibgraph.evaluation.tune import TuningResult
     from calibgraph.matching.cmrnext.training.validation import Validation
 
 _DETAILS = "report.html or calibration.yaml"
@@ -233,16 +232,3 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
         return ["-", "-"]
     worst = max(found, key=lambda interval: interval.median)
     return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
-
-
-def print_tuned(console: Console, tuned: TuningResult) -> None:
-    """Print the scores of the best settings, the paper's and ``auto``."""
-    table = empty_table("E_R / 1 deg + E_t / 10 cm, mean over cameras and draws", "settings")
-    add_number_columns(table, "lambda", "mu", "delta", "tau", "tuning", "test")
-    for row in (tuned.best, *tuned.others):
-        c = row.config
-        values = (c.prior_weight, c.relative_prior_weight, c.loss_scale_px, c.gate_px)
-        cells = ["by spread" if value is None else f"{value:g}" for value in values]
-        test = "-" if row.test is None else f"{row.test:.4f}"
-        table.add_row(escape(row.name), *cells, f"{row.tuning:.4f}", test)
-    console.print(table)

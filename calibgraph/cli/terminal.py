@@ -1,10 +1,12 @@
-"""Output for humans, all of it on stderr: plain lines and a progress bar."""
+"""Output for humans, all of it on stderr: plain lines, and progress as a bar or as lines."""
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from calibgraph.progress import Progress
+
+LINE_EVERY_S = 5.0
+"""The least time before the first line of progress and between two: short work is silent."""
 
 
 def terminal() -> Console:
@@ -34,19 +39,75 @@ def print_plain(console: Console, text: str) -> None:
 
 @contextmanager
 def progress_bar(first: str = "starting") -> Iterator[Progress]:
-    """A progress bar on stderr, removed when the work is done; none if stderr is no terminal.
+    """Progress on stderr: a bar that is removed in the end, or lines if stderr is no terminal.
+
+    Warnings that the work logs are printed, a line each.
 
     Args:
         first: description until the callback is called for the first time.
     """
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    console = terminal()
+    if not console.is_terminal:
+        with _printed_warnings(console):
+            yield progress_lines(lambda line: print_plain(console, line))
+        return
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    console = terminal()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    left = (TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, *left, console=console, transient=True) as bar:
         task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
-        )
+        with _printed_warnings(bar.console):
+            yield lambda what, done, total: bar.update(
+                task, description=what, completed=done, total=total
+            )
+
+
+def progress_lines(
+    print_line: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+) -> Progress:
+    """A progress callback that prints a line per stage, and not more often than is readable.
+
+    Args:
+        print_line: takes a line: the seconds so far, the stage, and the steps that are done.
+        clock: the time [s].
+    """
+    start = printed = clock()
+
+    def progress(what: str, done: int, total: int) -> None:
+        nonlocal printed
+        now = clock()
+        if now - printed >= LINE_EVERY_S:
+            printed = now
+            print_line(f"{now - start:5.0f} s  {what}, {done} of {total}")
+
+    return progress
+
+
+@contextmanager
+def _printed_warnings(console: Console) -> Iterator[None]:
+    """Warnings that are logged meanwhile are printed."""
+    logger, lines = logging.getLogger("calibgraph"), _WarningLines(console)
+    logger.addHandler(lines)
+    try:
+        yield
+    finally:
+        logger.removeHandler(lines)
+
+
+class _WarningLines(logging.Handler):
+    """Prints warnings as lines above a progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.WARNING)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one."""
+        print_plain(self._console, f"{record.levelname.lower()}: {record.getMessage()}")

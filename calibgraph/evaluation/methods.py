@@ -159,7 +159,7 @@ def run_methods(
         trf: whether to run the paper's solver.
     """
     for config in (prepared.theirs, prepared.ours):
-        if config.stage1 == "pnp":
+        if config.stage1 != "rig":
             prepared.draw.stage1(config)
     for row, method in METHODS.items():
         if (row in TRF_TERMS and not trf) or (row == ORACLE and not prepared.draw.simulated):

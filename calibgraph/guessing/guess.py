@@ -28,8 +28,8 @@ Source = Literal["words", "pair", "file", "search"]
 FILE_DEG, FILE_M = 3.0, 0.05
 """Of extrinsics in files, as a URDF's: drawings, and how exactly cameras are put up; chosen."""
 FOUND_DEG, FOUND_M = 1.0, 0.15
-"""Of cameras that the search found: they are nearer in docs/accuracy.md, where one place's frames
-err together."""
+"""Of cameras that the search found: they are nearer in benchmarks/notes/accuracy.md, where the
+frames of one place err together."""
 SIGMAS = 2.0  # of the guess, which the search of a calibration has to reach
 
 
@@ -202,7 +202,7 @@ def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Seq
 def _nothing_known(name: str) -> RigError:
     return RigError(
         f"camera {name!r}: nothing says where it is; describe it with --mount {name}=WORDS "
-        f"({GRAMMAR}), add a URDF or a sensor kit, or give --data to search over all headings",
+        f"({GRAMMAR}), add a URDF or a sensor kit, or give --dataset to search over all headings",
         camera=name,
     )
 

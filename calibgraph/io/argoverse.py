@@ -17,9 +17,10 @@ from calibgraph.files import checked_model
 from calibgraph.io.feather import read_feather
 from calibgraph.io.frame_files import FrameFiles, files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ def is_argoverse(folder: Path) -> bool:
     return (folder / _POSES).is_file() and (folder / _LIDAR).is_dir()
 
 
-def load_argoverse_rig(log: Path) -> Rig:
+def read_argoverse_rig(log: Path) -> RigRead:
     """The rig of a log: T_camera_lidar of the vehicle's frame; its images are undistorted.
 
     Raises:
@@ -50,11 +51,8 @@ def load_argoverse_rig(log: Path) -> Rig:
     """
     poses = _by_name(log / _POSES, (*_QUATERNION, *_PLACE))
     lenses = _by_name(log / _LENSES, (*_LENS, *_SIZE))
-    cameras = {
-        name: _camera(log, name, lenses, poses)
-        for name in sorted(each.name for each in (log / _CAMERAS).glob("*/"))
-    }
-    return checked_model(Rig, {"lidar": VEHICLE, "cameras": cameras}, log)
+    names = sorted(each.name for each in (log / _CAMERAS).glob("*/"))
+    return rig_of_complete(VEHICLE, names, lambda name: _camera(log, name, lenses, poses), log)
 
 
 def _camera(
@@ -62,7 +60,8 @@ def _camera(
 ) -> Camera:
     for path, table in ((_LENSES, lenses), (_POSES, poses)):
         if name not in table:
-            raise FileError(log / path, f"has no row of {name!r}; found {', '.join(table)}")
+            found = ", ".join(table) or "none"
+            raise IncompleteCamera(log / path, f"has no row of {name!r}; found {found}")
     lens = lenses[name]
     content = {
         **{column: lens[column] for column in _SIZE},

@@ -11,15 +11,16 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from calibgraph.errors import DatasetError
-from calibgraph.io.clouds import check_points, with_intensity
+from calibgraph.errors import DatasetError, FileError
+from calibgraph.io.cloud_notes import describe_cloud
+from calibgraph.io.clouds import check_points, cloud_of_array
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
+from calibgraph.io.point_fields import RawCloud
 from calibgraph.model.rig import Camera, Rig
 
-_XYZ = 3
 _COLOURS = (3, 4)  # channels
 
 
@@ -52,79 +53,107 @@ class ArrayFrame(Frame):
 
 def dataset_from_arrays(
     rig: Rig,
-    clouds: Sequence[NDArray[Any]],
-    images: Mapping[str, Sequence[NDArray[np.uint8]]],
+    clouds: Sequence[ArrayLike],
+    images: Mapping[str, Sequence[ArrayLike]],
 ) -> Dataset:
-    """A dataset of arrays, to be calibrated without files. The arrays are not copied if they fit.
+    """A dataset of arrays, to be calibrated without files. Images are not copied if they fit.
 
     Args:
         rig: lenses and the guess.
-        clouds: per frame (n, 3) x y z or (n, 4) x y z intensity [m] in the LiDAR frame, finite but
-            for rows of NaN without a return.
+        clouds: per frame (n, 3) x y z or (n, 4) x y z intensity [m] in the LiDAR frame, or an array
+            with such named fields; finite but for rows of NaN or zeros without a return.
         images: per camera and frame, (height, width, 3) BGR or (height, width) gray, uint8.
 
     Raises:
         DatasetError: if cameras, frames, shapes or values do not fit together.
     """
-    if images.keys() != rig.cameras.keys():
-        given = ", ".join(images) or "no camera"
-        raise DatasetError(f"images are of {given}, the rig has {', '.join(rig.cameras)}")
+    if not isinstance(images, Mapping) or images.keys() != rig.cameras.keys():
+        given = ", ".join(map(str, images)) if isinstance(images, Mapping) else "no camera by name"
+        raise DatasetError(
+            f"images are of {given or 'no camera'}, the rig has {', '.join(rig.cameras)}"
+        )
+    frames = _count(clouds, "clouds")
     for name, of_camera in images.items():
-        if len(of_camera) != len(clouds):
+        if (count := _count(of_camera, f"images[{name!r}]")) != frames:
             raise DatasetError(
-                f"{len(clouds)} clouds, but {len(of_camera)} images; give one each per frame",
+                f"{frames} clouds, but {count} images of {name}; give one each per frame",
                 camera=name,
             )
-    if not len(clouds):
+    if not frames:
         raise DatasetError("no frame given")
     root = Path("arrays") / uuid.uuid4().hex[:8]  # caches tell frames apart by their paths
-    frames = tuple(
-        _frame(root, number, rig, cloud, {name: images[name][number] for name in rig.cameras})
-        for number, cloud in enumerate(clouds)
+    first = _cloud(clouds[0], 0)
+    return Dataset(
+        rig=rig,
+        frames=tuple(_frame(root, number, rig, clouds, images) for number in range(frames)),
+        folders=(root,),
+        notes=tuple(describe_cloud("clouds[0]", first)),
     )
-    return Dataset(rig=rig, frames=frames, folders=(root,))
+
+
+def _count(values: Sequence[ArrayLike], name: str) -> int:
+    """The number of frames in a list of arrays."""
+    if isinstance(values, np.ndarray) and values.ndim == 2:  # noqa: PLR2004
+        found = f"one array of shape {values.shape}"
+    elif hasattr(values, "__len__") and hasattr(values, "__getitem__"):
+        return len(values)
+    else:
+        found = f"of type {type(values).__name__}"
+    raise DatasetError(f"{name} is {found}, expected a list with an array per frame")
 
 
 def _frame(
-    root: Path, number: int, rig: Rig, cloud: NDArray[Any], images: Mapping[str, NDArray[np.uint8]]
+    root: Path,
+    number: int,
+    rig: Rig,
+    clouds: Sequence[ArrayLike],
+    images: Mapping[str, Sequence[ArrayLike]],
 ) -> ArrayFrame:
     name = f"{number:06d}"
-    path = root / "lidar" / name
     return ArrayFrame(
         index=number,
         name=name,
-        cloud_path=path,
+        cloud_path=root / "lidar" / name,
         image_paths={camera: root / camera / name for camera in images},
-        cloud=_cloud(cloud, path, number),
+        cloud=_cloud(clouds[number], number).points,
         images={
-            camera: _image(image, rig.cameras[camera], camera, number)
-            for camera, image in images.items()
+            camera: _image(images[camera][number], rig.cameras[camera], camera, number)
+            for camera in rig.cameras
         },
     )
 
 
-def _cloud(cloud: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
-    if cloud.ndim != 2 or cloud.shape[1] < _XYZ or cloud.dtype.kind not in "fiu":  # noqa: PLR2004
-        raise DatasetError(
-            f"cloud {number} has shape {cloud.shape} of {cloud.dtype}, expected (n, 3) or (n, 4) "
-            "numbers",
-            frame=number,
-        )
-    intensity = cloud[:, _XYZ] if cloud.shape[1] > _XYZ else None
-    return check_points(with_intensity(cloud[:, :_XYZ], intensity), path)
+def _cloud(cloud: ArrayLike, number: int) -> RawCloud:
+    """The points that are returns."""
+    name = f"clouds[{number}]"
+    try:
+        found = cloud_of_array(_array(cloud, name), name)
+        return found._replace(points=check_points(found.points, name))
+    except FileError as error:
+        raise DatasetError(str(error), frame=number) from None
 
 
-def _image(image: NDArray[np.uint8], camera: Camera, name: str, number: int) -> NDArray[np.uint8]:
-    gray = image.ndim == 2  # noqa: PLR2004
+def _array(values: ArrayLike, name: str) -> NDArray[Any]:
+    """Values as an array; lists, too."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{name}: {error}; give an array") from None
+
+
+def _image(image: ArrayLike, camera: Camera, name: str, number: int) -> NDArray[np.uint8]:
+    where = f"images[{name!r}][{number}]"
+    pixels = _array(image, where)
+    gray = pixels.ndim == 2  # noqa: PLR2004
     shape = (camera.height_px, camera.width_px)
-    known = gray or (image.ndim == len(_COLOURS) + 1 and image.shape[2] in _COLOURS)
-    if image.dtype != np.uint8 or not known or image.shape[:2] != shape:
+    known = gray or (pixels.ndim == len(_COLOURS) + 1 and pixels.shape[2] in _COLOURS)
+    if pixels.dtype != np.uint8 or not known or pixels.shape[:2] != shape:
         raise DatasetError(
-            f"image {number} has shape {image.shape} of {image.dtype}, expected {(*shape, 3)} or "
+            f"{where} has shape {pixels.shape} of {pixels.dtype}, expected {(*shape, 3)} or "
             f"{shape} of uint8, as the rig gives its size",
             camera=name,
             frame=number,
         )
     return np.asarray(
-        cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if gray else image[:, :, :3], np.uint8
+        cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if gray else pixels[:, :, :3], np.uint8
     )

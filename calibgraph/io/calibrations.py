@@ -163,6 +163,7 @@ class _Parts(BaseModel):
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
     rounds: tuple[dict[str, Any], ...]
+    warnings: tuple[str, ...] = ()
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
@@ -215,7 +216,7 @@ _OF_SOME_CAMERAS = (
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
     "counts", "timings_s", "terms", "prior_share", "error_sources", "inputs", "versions",
-    "date",
+    "date", "warnings",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
 from calibgraph.model.correspondences import Correspondences, as_confidence
+from calibgraph.model.places import Places
 from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
@@ -46,23 +47,66 @@ def load_correspondences(path: Path | str) -> Correspondences:
         raise FileError(path, str(error)) from error
 
 
-def parts_of_file(path: Path) -> Iterator[Correspondences]:
-    """The table of a file in parts, in order: of Parquet some rows at a time; a CSV file whole.
+def table_files(table: Path) -> list[Path]:
+    """The files of a table: itself, or the Parquet files of a folder, by name.
 
-    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
+    Raises:
+        FileError: if there is none.
+    """
+    if not table.is_dir():
+        return [require_file(table)]
+    paths = sorted(table.rglob("*.parquet"))
+    if not paths:
+        raise FileError(table, "holds no .parquet file; write the correspondences into some")
+    return paths
+
+
+def parts_of_table(table: Path) -> Iterator[Correspondences]:
+    """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
+
+    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers. The
+    metadata is that of the first file of a folder, with the places that any of its files names.
+
+    Args:
+        table: its file, or a folder of Parquet files.
 
     Raises:
         FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
             counted from the beginning of the file.
     """
+    paths = table_files(table)
+    places = _merged_places(paths) if len(paths) > 1 else None
+    for path in paths:
+        for part in _parts_of_file(path):
+            yield part if places is None else part.with_places(places)
+
+
+def _parts_of_file(path: Path) -> Iterator[Correspondences]:
     rows = 0
-    for part in _arrow_parts(require_file(path)):
+    for part in _arrow_parts(path):
         try:
             yield from_arrow(part)
         except CorrespondenceError as error:
             raise FileError(path, str(error.after(rows))) from error
         rows += len(part)
     require_rows(path, rows)
+
+
+def _merged_places(paths: Sequence[Path]) -> Places:
+    """The places that any of the files names."""
+    merged = Places()
+    for path in paths:
+        with arrow_reads(path), open_parquet(path) as file:
+            metadata = _metadata_of(file.schema_arrow)
+        try:
+            merged = merged.merge(Places.from_metadata(metadata))
+        except CorrespondenceError as error:
+            raise FileError(path, str(error)) from error
+    return merged
+
+
+def _metadata_of(schema: pa.Schema) -> Any:
+    return json.loads((schema.metadata or {}).get(b"matcher", b"{}"))
 
 
 def _arrow_parts(path: Path) -> Iterator[pa.Table]:
@@ -200,7 +244,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
-        metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
+        metadata=_metadata_of(table.schema),
     )
 
 

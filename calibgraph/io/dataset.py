@@ -16,13 +16,16 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
+from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
+from calibgraph.io.cloud_notes import read_cloud_notes
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
 from calibgraph.io.formats.words import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
@@ -37,7 +40,8 @@ class Dataset:
         frames: in order of time.
         folders: their sources.
         recorded: all frames of the folders, where only some of them were selected.
-        notes: what was found in a bag or in tables and what was left out of it, a line each.
+        notes: what was found in the first cloud, a bag or tables, and what was left out, a line
+            each.
     """
 
     rig: Rig
@@ -111,21 +115,38 @@ def load_dataset(
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
-    rigs = [rig if rig is not None else load_rig(path, bag) for path in paths]
-    for path, other in zip(paths, rigs, strict=True):
-        _require_same_lenses(paths[0], rigs[0], path, other)
-    from_bag = rig is None and is_bag(paths[0])
-    notes = (*describe_rig(rigs[0]), *doubtful_axes(rigs[0])) if from_bag else ()
-    data = Dataset(rig=rigs[0], frames=(), folders=paths, notes=notes)
-    for path in paths:
-        prefix = f"{path.name}/" if len(paths) > 1 else ""
+    bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
+    bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
+    data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
+    notes = (f"{path}: has no clouds; it serves the other bags" for path in sorted(bare))
+    data = replace(data, notes=(*data.notes, *notes))
+    for path in data.folders:
+        prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         if is_bag(path):
-            data = _with_bag(data, path, prefix, bag or BagOptions())
+            data = _with_bag(data, path, prefix, bag)
         else:
             data = _with_folder(data, path, prefix, complete=frames is None)
     if data.recorded == data.frames:
         data = replace(data, recorded=())
-    return data if frames is None else _complete(data.select(frames))
+    data = data if frames is None else _complete(data.select(frames))
+    of_clouds = (note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path))
+    return replace(data, notes=(*of_clouds, *data.notes))
+
+
+def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
+    """The rig of all sources, which may differ in their extrinsics, and notes on it.
+
+    Raises:
+        FileError, DatasetError: if a rig is missing, or the rigs differ.
+    """
+    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
+    first = read[0].rig
+    for path, other in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other.rig)
+    notes = [note for each in read for note in each.notes]
+    if rig is None and is_bag(paths[0]):
+        notes = [*describe_rig(first), *doubtful_axes(first), *notes]
+    return Dataset(rig=first, frames=(), folders=paths, notes=tuple(dict.fromkeys(notes)))
 
 
 def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:
@@ -224,7 +245,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +14,49 @@ from calibgraph.errors import FileError
 from calibgraph.files import require_file
 
 
-def read_feather(
-    path: Path, columns: Sequence[str], optional: Sequence[str] = ()
-) -> dict[str, NDArray[Any]]:
+def feather_columns(path: Path) -> tuple[str, ...]:
+    """The names of all columns of a file.
+
+    Raises:
+        FileError: if it cannot be read.
+    """
+    with _damage_named(path):
+        return tuple(_read_table(path).column_names)
+
+
+def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Columns of a file, as arrays of one length.
 
     Args:
         path: of the file.
         columns: that it must have.
-        optional: that it may have.
 
     Raises:
         FileError: if it cannot be read, a column is missing, or a value is.
     """
-    import pyarrow as pa
-    from pyarrow import feather
-
-    require_file(path)
-    try:
-        table = feather.read_table(path, memory_map=False)
+    with _damage_named(path):
+        table = _read_table(path)
         for name in columns:
             if name not in table.column_names:
                 found = ", ".join(table.column_names)
                 raise FileError(path, f"column {name!r} is missing; found {found}")
-        wanted = [*columns, *(name for name in optional if name in table.column_names)]
-        return {name: _array(path, table, name) for name in wanted}
+        return {name: _array(path, table, name) for name in columns}
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    import pyarrow as pa
+
+    try:
+        yield
     except (pa.ArrowException, OSError, ValueError) as error:
         raise FileError(path, f"cannot be read as Feather ({error}); is it complete?") from error
+
+
+def _read_table(path: Path) -> Any:
+    from pyarrow import feather
+
+    return feather.read_table(require_file(path), memory_map=False)
 
 
 def _array(path: Path, table: Any, name: str) -> NDArray[Any]:

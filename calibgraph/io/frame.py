@@ -57,6 +57,11 @@ class Frame:
         """For which the cloud is corrected; None if it is as recorded."""
         return None
 
+    @property
+    def is_corrected(self) -> bool:
+        """Whether its cloud is corrected for motion."""
+        return False
+
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
         return load_cloud(self.cloud_path)
@@ -103,6 +108,11 @@ class MovingFrame(Frame):
     def motion(self) -> ScanMotion:
         """During the scan."""
         return self._found_motion
+
+    @property
+    def is_corrected(self) -> bool:
+        """It is."""
+        return True
 
     @cached_property
     def _found_motion(self) -> ScanMotion:

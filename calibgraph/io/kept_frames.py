@@ -45,6 +45,11 @@ class KeptFrame(Frame):
         """For which the cloud is corrected."""
         return self.frame.motion
 
+    @property
+    def is_corrected(self) -> bool:
+        """Whether its cloud is corrected for motion."""
+        return self.frame.is_corrected
+
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""
         return self.derive("cloud", lambda: keep(self.frame.load_cloud()))

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.images import image_size
+from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
+from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.model.rig import Camera, Rig
 
 Array = NDArray[np.float64]
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"
-
-_ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 
 
 def camera_folders(sequence: Path) -> dict[str, Path]:
@@ -26,6 +26,11 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
 
 
 def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
+    """The rig of a KITTI odometry sequence; see :func:`read_kitti_rig`."""
+    return read_kitti_rig(sequence, shift_along_x_only=shift_along_x_only).rig
+
+
+def read_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> RigRead:
     """The rig of a KITTI odometry sequence, from its own calibration.
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
@@ -44,20 +49,21 @@ def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
     folders = camera_folders(sequence)
     if not folders:
         raise FileError(sequence, "has no image folder (image_0 .. image_3)")
-    cameras = {}
-    for name, folder in folders.items():
-        for needed in (f"P{name[-1]}", "Tr"):
-            if needed not in matrices:
-                raise FileError(path, f"line {needed!r} is missing")
-        T_rectified_lidar = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
-        cameras[name] = camera_of_projection(
-            matrices[f"P{name[-1]}"],
-            T_rectified_lidar,
-            first_image_size(folder),
-            f"{path}: P{name[-1]}",
-            along_x_only=shift_along_x_only,
+    if "Tr" not in matrices:
+        raise FileError(path, "line 'Tr' is missing")
+    T_rectified_lidar = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
+
+    def read(name: str) -> Camera:
+        line = f"P{name[-1]}"
+        if line not in matrices:
+            raise IncompleteCamera(path, f"line {line!r} is missing")
+        size = first_image_size(folders[name])
+        where = f"{path}: {line}"
+        return camera_of_projection(
+            matrices[line], T_rectified_lidar, size, where, along_x_only=shift_along_x_only
         )
-    return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
+
+    return rig_of_complete(CLOUD_FOLDER, folders, read, sequence)
 
 
 def camera_of_projection(
@@ -81,21 +87,15 @@ def camera_of_projection(
         FileError: if P is no such matrix, or the transform is none.
     """
     K = P[:, :3]
-    if not (np.isfinite(P).all() and K[0, 0] > 0 and K[1, 1] > 0):
+    intrinsics = intrinsics_of_matrix(K, where)
+    if not np.isfinite(P).all():
         raise FileError(where, f"is no projection matrix of a camera: {P.tolist()}")
-    plain = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
-    if not np.allclose(K, plain, rtol=0, atol=_ROUNDED):
-        raise FileError(
-            where,
-            f"begins with {K.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; undo its scale, "
-            "and undistort the skew",
-        )
     shift = np.eye(4)
     shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
     content = {
         "width_px": size_px[0],
         "height_px": size_px[1],
-        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "intrinsics_px": intrinsics,
         "T_camera_lidar": shift @ T_rectified_lidar,
     }
     return checked_model(Camera, content, f"{where} and the LiDAR's pose")
@@ -124,5 +124,5 @@ def first_image_size(folder: Path) -> tuple[int, int]:
     """
     images = sorted(folder.glob("*.png"))
     if not images:
-        raise FileError(folder, "holds no .png image")
+        raise IncompleteCamera(folder, "holds no .png image")
     return image_size(images[0])

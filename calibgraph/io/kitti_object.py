@@ -17,8 +17,9 @@ from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.frame_files import FrameFiles, files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
+from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.kitti import CALIBRATION_NAME, CLOUD_FOLDER, camera_folders, camera_of_projection
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ def is_kitti_object(folder: Path) -> bool:
     return has_all and not (folder / CALIBRATION_NAME).exists()
 
 
-def load_kitti_object_rig(folder: Path) -> Rig:
+def read_kitti_object_rig(folder: Path) -> RigRead:
     """The rig of the calibration that most frames have.
 
     Camera k projects by P_k R0_rect Tr_velo_to_cam, so T_camera_lidar is
@@ -50,11 +51,11 @@ def load_kitti_object_rig(folder: Path) -> Rig:
     folders = camera_folders(folder)
     if not folders:
         raise FileError(folder, "has no image folder (image_0 .. image_3)")
-    cameras = {
-        name: _camera(path, lines, _image(images, stem), rectify @ T)
-        for name, images in folders.items()
-    }
-    return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
+
+    def read(name: str) -> Camera:
+        return _camera(path, lines, _image(folders[name], stem), rectify @ T)
+
+    return rig_of_complete(CLOUD_FOLDER, folders, read, folder)
 
 
 def kitti_object_frames(folder: Path, cameras: Sequence[str]) -> list[FrameFiles]:
@@ -115,6 +116,8 @@ def _image(folder: Path, stem: str) -> Path:
 
 def _camera(path: Path, lines: dict[str, str], image: Path, T_rectified_lidar: Array) -> Camera:
     name = f"P{image.parent.name[-1]}"
+    if name not in lines:
+        raise IncompleteCamera(path, f"line {name!r} is missing")
     P = _matrix(path, lines, name)
     return camera_of_projection(P, T_rectified_lidar, image_size(image), f"{path}: {name}")
 

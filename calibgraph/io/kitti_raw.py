@@ -13,8 +13,9 @@ from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.frame_files import FrameFiles, files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.kitti import camera_of_projection, first_image_size
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ def kitti_raw_frames(drive: Path, cameras: Sequence[str]) -> list[FrameFiles]:
     ]
 
 
-def load_kitti_raw_rig(drive: Path) -> Rig:
+def read_kitti_raw_rig(drive: Path) -> RigRead:
     """The rig of a drive, from the calibration in it or in the folder of its date.
 
     Camera k projects by P_rect_0k R_rect_00 [R | T], so T_camera_lidar is
@@ -69,12 +70,16 @@ def load_kitti_raw_rig(drive: Path) -> Rig:
     if not folders:
         raise FileError(drive, "has no image folder (image_00 .. image_03)")
     T = rectify @ T_camera0_lidar
-    found = {name: _camera(cameras, name, folder, T) for name, folder in folders.items()}
-    return Rig(lidar=_CLOUDS, cameras=found)
+    return rig_of_complete(
+        _CLOUDS, folders, lambda name: _camera(cameras, name, folders[name], T), drive
+    )
 
 
 def _camera(calibration: _Values, name: str, folder: Path, T_rectified_lidar: Array) -> Camera:
     number = name.removeprefix("image_")
+    for line in (f"S_rect_{number}", f"P_rect_{number}"):
+        if line not in calibration:
+            raise IncompleteCamera(calibration.path, f"line {line!r} is missing")
     size = first_image_size(folder)
     rectified = tuple(_value(calibration, f"S_rect_{number}", (2,)).astype(int))
     if size != rectified:
@@ -95,7 +100,8 @@ class _Values(dict[str, list[float]]):
         self.path = path
         for line in read_text(path).splitlines():
             name, _, values = line.partition(":")
-            with suppress(ValueError):  # a date
+            self[name.strip()] = []  # of a date
+            with suppress(ValueError):
                 self[name.strip()] = [float(value) for value in values.split()]
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, FileError
+from calibgraph.io.point_fields import RawCloud, make_cloud
 
 _CHUNK = 1_000_000
 _HEADER = struct.Struct("<4s90sHIIBH")  # its size, the points' offset, the records before them, ...
@@ -18,8 +17,8 @@ _END_RECORDS = struct.Struct("<QI")  # of version 1.4: where those after the poi
 _END_RECORDS_AT, _WITH_END_RECORDS, _END_RECORD_BYTES = 235, 375, 60
 
 
-def read_las(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(n, 3) points [m] and (n,) intensities of a file of one scan, in the LiDAR frame.
+def read_las(path: Path) -> RawCloud:
+    """The points of a file of one scan, in the LiDAR frame.
 
     Raises:
         CalibrationError: if laspy is missing.
@@ -35,16 +34,17 @@ def read_las(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     try:
         with laspy.open(path) as file:
             expected = file.header.point_count
+            names = tuple(file.header.point_format.dimension_names)
             parts = [
-                np.column_stack([chunk.x, chunk.y, chunk.z, chunk.intensity])
+                make_cloud(chunk.x, chunk.y, chunk.z, chunk.intensity)
                 for chunk in file.chunk_iterator(_CHUNK)
             ]
     except Exception as error:  # laspy's own, those of its decoders, and numpy's
         raise FileError(path, f"cannot be read as LAS ({error}); is it complete?") from error
-    points = np.concatenate(parts) if parts else np.empty((0, 4))
+    points = np.concatenate(parts or [np.empty((0, 4), np.float32)])
     if len(points) != expected:
         raise FileError(path, f"is truncated: {len(points)} of {expected} points; write it again")
-    return points[:, :3], points[:, 3]
+    return RawCloud(points, names)
 
 
 def _require_header(path: Path) -> None:

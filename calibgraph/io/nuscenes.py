@@ -11,17 +11,20 @@ from numpy.typing import NDArray
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.frame_files import FrameFiles
+from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
+from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.io.nuscenes_tables import (
     LIDAR,
     Instant,
     SampleData,
     Tables,
+    describe_no_scan,
     find_tables,
     read_ego_poses,
     read_tables,
 )
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
@@ -33,7 +36,7 @@ def is_nuscenes(path: Path | str) -> bool:
     return find_tables(Path(path)) is not None
 
 
-def load_nuscenes_rig(path: Path) -> Rig:
+def read_nuscenes_rig(path: Path) -> RigRead:
     """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted.
 
     Raises:
@@ -42,28 +45,29 @@ def load_nuscenes_rig(path: Path) -> Rig:
     tables = read_tables(path)
     instants = [each for each in tables.instants if LIDAR in each.taken]
     if not instants:
-        raise FileError(path, f"has no scan of {LIDAR}")
+        raise FileError(path, describe_no_scan(tables))
     _require_one_rig(path, tables, instants)
     taken = {name: one for each in reversed(instants) for name, one in each.taken.items()}
     where = tables.folder / "calibrated_sensor.json"
     T_ego_lidar = tables.calibration_of(taken[LIDAR]).matrix(where)
-    cameras = {
-        name: _camera(tables, taken[name], T_ego_lidar, where)
-        for name in tables.cameras
-        if name in taken
-    }
-    return checked_model(Rig, {"lidar": LIDAR, "cameras": cameras}, path)
+
+    def read(name: str) -> Camera:
+        if name not in taken:
+            raise IncompleteCamera(path, f"has no key frame of {name}")
+        return _camera(tables, taken[name], T_ego_lidar, where)
+
+    return rig_of_complete(LIDAR, tables.cameras, read, path)
 
 
 def _camera(tables: Tables, taken: SampleData, T_ego_lidar: Array, where: Path) -> Camera:
     sensor = tables.calibration_of(taken)
     K = np.array(sensor.camera_intrinsic)
     if len(K) != _MATRIX_ROWS:
-        raise FileError(where, f"record {sensor.token} of a camera has no camera_intrinsic")
+        raise IncompleteCamera(where, f"record {sensor.token} of a camera has no camera_intrinsic")
     content = {
         "width_px": taken.width,
         "height_px": taken.height,
-        "intrinsics_px": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "intrinsics_px": intrinsics_of_matrix(K, f"{where}: {sensor.token}: camera_intrinsic"),
         "T_camera_lidar": invert(sensor.matrix(where)) @ T_ego_lidar,
     }
     return checked_model(Camera, content, f"{where}: {sensor.token}")
@@ -107,7 +111,7 @@ def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
         if LIDAR in each.taken
     ]
     if not frames:
-        raise FileError(path, f"has no scan of {LIDAR}")
+        raise FileError(path, describe_no_scan(tables))
     return frames
 
 

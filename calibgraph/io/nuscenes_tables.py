@@ -184,6 +184,21 @@ def _read_all(folder: Path, _changed_ns: int) -> Tables:
     return Tables(folder, tuple(instants), tuple(cameras), calibrated)
 
 
+def describe_no_scan(tables: Tables) -> str:
+    """Why there is no scan: the tables have none, or none of a key frame."""
+    sensors = _by_token(tables.folder, "sensor", _Sensor)
+    of_lidar = {
+        each.token
+        for each in tables.calibrated.values()
+        if each.sensor_token in sensors and sensors[each.sensor_token].channel == LIDAR
+    }
+    records = _read_list(tables.folder / "sample_data.json")
+    scans = sum(each.get("calibrated_sensor_token") in of_lidar for each in records)
+    if not scans:
+        return f"has no scan of {LIDAR}"
+    return f"has {scans} scans of {LIDAR}, of which none is a key frame; only key frames are read"
+
+
 def read_ego_poses(tables: Tables) -> dict[str, Array] | None:
     """(4, 4) T_world_ego by token, of the samples' images and scans; None without the table.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from calibgraph.io import argoverse, kitti_object, kitti_raw, nuscenes
 from calibgraph.io.frame_files import FrameFiles
-from calibgraph.model.rig import Rig
+from calibgraph.io.incomplete import RigRead
 
 
 @dataclass(frozen=True)
@@ -17,31 +17,31 @@ class PublishedFormat:
 
     Attributes:
         is_one: whether a path is a folder of it.
-        load_rig: its rig, of its own calibration.
+        read_rig: its rig, of its own calibration.
         frames: of a folder and of the rig's cameras, in order; some may lack images.
         describe: what is worth a line in the log, empty if nothing is.
     """
 
     is_one: Callable[[Path], bool]
-    load_rig: Callable[[Path], Rig]
+    read_rig: Callable[[Path], RigRead]
     frames: Callable[[Path, Sequence[str]], list[FrameFiles]]
     describe: Callable[[Path], str] = lambda _: ""
 
 
 _FORMATS = (
     PublishedFormat(
-        nuscenes.is_nuscenes, nuscenes.load_nuscenes_rig, nuscenes.nuscenes_frames,
+        nuscenes.is_nuscenes, nuscenes.read_nuscenes_rig, nuscenes.nuscenes_frames,
         nuscenes.describe_motion,
     ),
     PublishedFormat(
-        kitti_raw.is_kitti_raw, kitti_raw.load_kitti_raw_rig, kitti_raw.kitti_raw_frames
+        kitti_raw.is_kitti_raw, kitti_raw.read_kitti_raw_rig, kitti_raw.kitti_raw_frames
     ),
     PublishedFormat(
-        kitti_object.is_kitti_object, kitti_object.load_kitti_object_rig,
+        kitti_object.is_kitti_object, kitti_object.read_kitti_object_rig,
         kitti_object.kitti_object_frames, kitti_object.describe_calibrations,
     ),
     PublishedFormat(
-        argoverse.is_argoverse, argoverse.load_argoverse_rig, argoverse.argoverse_frames,
+        argoverse.is_argoverse, argoverse.read_argoverse_rig, argoverse.argoverse_frames,
         argoverse.describe_motion,
     ),
 )  # fmt: skip

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_yaml
+from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
-from calibgraph.io.bags.rig import rig_of_bag
+from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
-from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.incomplete import RigRead
+from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
 from calibgraph.io.published import published_format
 from calibgraph.model.result_files import CALIBRATION_FILE
-from calibgraph.model.rig import RIG_FORMAT, Rig
+from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
 
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
+FILL_IN = "FILL_IN"
+"""Stands for a value that the user of ``calibgraph init`` writes."""
 
 
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
@@ -30,20 +35,81 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     Raises:
         FileError, DatasetError: if there is none, or it is malformed.
     """
+    return read_rig(path, bag).rig
+
+
+def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
+    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere.
+
+    Raises:
+        FileError, DatasetError: if there is none, or it is malformed.
+    """
     path = rig_file(path)
     if is_bag(path):
-        return rig_of_bag(path, bag)
+        read = read_bag_rig(path, bag)
+        return RigRead(read.to_rig(), read.notes)
     published = published_format(path)
     if published is not None:
-        return published.load_rig(path)
+        return published.read_rig(path)
     if path.name == CALIBRATION_NAME:
-        return load_kitti_rig(path.parent)
-    content = read_yaml(path)
+        return read_kitti_rig(path.parent)
+    return RigRead(_rig_of_file(path))
+
+
+def _rig_of_file(path: Path) -> Rig:
+    """The rig of a rig file, a result or an export."""
+    content = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
     if is_calibration(content):
         return rig_of_calibration(content, path)
+    if is_exported_rig(content):
+        return _exported_rig(content, path)
     if "format" not in content:
-        raise FileError(path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`")
+        raise FileError(
+            path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`, or make a rig "
+            "of a file of another program with calibgraph import"
+        )  # fmt: skip
+    _require_filled(content, path)
     return checked_model(Rig, content, path)
+
+
+def is_exported_rig(content: dict[str, Any]) -> bool:
+    """Whether the content of a file is of ``calibgraph export --format json``."""
+    return "calibgraph_export" in content and isinstance(content.get("cameras"), dict)
+
+
+def _exported_rig(content: dict[str, Any], path: Path) -> Rig:
+    """The rig of an export: its cameras without their error bars, which are of the result."""
+    kept = Camera.model_fields.keys() - {"covariance"}
+    cameras = {
+        name: {key: value for key, value in camera.items() if key in kept}
+        for name, camera in content["cameras"].items()
+        if isinstance(camera, dict)
+    }
+    return checked_model(Rig, {"lidar": content.get("lidar_frame"), "cameras": cameras}, path)
+
+
+def _require_filled(content: object, path: Path) -> None:
+    """Refuse a rig file in which a placeholder is left.
+
+    Raises:
+        FileError: with the first key that holds one.
+    """
+    keys = list(_placeholders(content, ""))
+    if keys:
+        others = f", and {len(keys) - 1} more keys" if keys[1:] else ""
+        raise FileError(path, f"{keys[0]} is still {FILL_IN}{others}; write the values of your rig")
+
+
+def _placeholders(content: object, key: str) -> Iterator[str]:
+    """The keys whose value is a placeholder."""
+    if isinstance(content, dict):
+        for name, value in content.items():
+            yield from _placeholders(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(content, list):
+        for index, value in enumerate(content):
+            yield from _placeholders(value, f"{key}.{index}")
+    elif content == FILL_IN:
+        yield key
 
 
 def rig_file(path: Path | str) -> Path:

@@ -36,7 +36,11 @@ def image_from_message(message: Any) -> NDArray[np.uint8]:
 
 
 def camera_from_message(
-    message: Any, T_camera_lidar: NDArray[np.float64], *, rectified: bool = False
+    message: Any,
+    T_camera_lidar: NDArray[np.float64],
+    *,
+    rectified: bool = False,
+    frame_of_first: bool = False,
 ) -> Camera:
     """A camera with the lens of a CameraInfo.
 
@@ -45,15 +49,16 @@ def camera_from_message(
         T_camera_lidar: (4, 4) the guess, to the camera's optical frame that the message names, as
             tf2's ``lookup_transform(target=camera_optical, source=lidar)``.
         rectified: whether the images are: by R, and of the camera matrix P.
+        frame_of_first: whether the message of a stereo pair's second camera names the frame of the
+            first, so that the baseline in P counts.
 
     Raises:
-        DatasetError: if the camera is not calibrated, or its lens model is unknown.
-        FileError: if a value is no lens's, or the transform is none.
+        FileError: if the camera is not calibrated, its lens model is unknown, a value is no lens's,
+            or the transform is none.
     """
     where = _where(message)
     lens = lens_of(message, where, rectified=rectified)
-    T_image_frame = np.eye(4)
-    T_image_frame[:3, :3] = lens.R_image_frame
+    T_image_frame = lens.T_image_frame(with_baseline=frame_of_first)
     return checked_model(
         Camera, {**lens.content, "T_camera_lidar": T_image_frame @ T_camera_lidar}, where
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import gtsam
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.rig import ROUNDING
 
 Array = NDArray[np.float64]
+
+_TURN_RAD = 2 * math.pi + ROUNDING
 
 
 def quaternion_xyzw(T: Array) -> list[float]:
@@ -31,15 +34,24 @@ def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
     Raises:
         ValueError: if the quaternion has another length.
     """
-    length = float(np.linalg.norm(xyzw))
+    length = math.hypot(*xyzw)
     if not abs(length - 1.0) <= ROUNDING:
         raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
     return _pose(xyz_m, Rotation.from_quat(xyzw).as_matrix())
 
 
 def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
-    """(4, 4) of a translation and roll, pitch, yaw about fixed axes."""
+    """(4, 4) of a translation and roll, pitch, yaw about fixed axes.
+
+    Raises:
+        ValueError: if an angle is beyond a turn: of degrees, most are.
+    """
     roll, pitch, yaw = rpy_rad
+    if max(map(abs, rpy_rad)) > _TURN_RAD:
+        raise ValueError(
+            f"roll, pitch, yaw are {roll:g}, {pitch:g}, {yaw:g} rad, beyond 2 pi: are they in "
+            "degrees? give radians, 90 deg is 1.5708"
+        )
     return _pose(xyz_m, gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix())
 
 

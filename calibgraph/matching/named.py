@@ -9,7 +9,8 @@ import numpy as np
 
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.protocol import FullMatcher, Matcher, Stage1Source, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher, to_full_matcher
+from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress

@@ -15,17 +15,15 @@ in this order:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from calibgraph.io.dataset import Dataset
+from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
-
-Stage1Source = Literal["pnp", "rig"]
-"""Source of Stage 1's per-camera estimates T_hat, see :class:`Matcher`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +150,9 @@ class CompletedMatcher:
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
-        """The matcher's own correspondences."""
-        return self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
+        """The matcher's own correspondences; its source of Stage 1 in their metadata."""
+        table = self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
+        return replace(table, metadata={STAGE1: self.stage1, **table.metadata})
 
     def release(self) -> None:
         """Drop what the matcher keeps from round to round."""

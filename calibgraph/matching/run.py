@@ -47,6 +47,7 @@ class MatchingRun:
         watch: seconds per stage.
         missed_rounds: number of rounds that the time limit cut off.
         out_of_time: whether the time limit has passed.
+        warnings: about the dataset and its guess.
         rematch: the test from a displaced start; None if it was not made.
     """
 
@@ -59,4 +60,5 @@ class MatchingRun:
     watch: Stopwatch
     missed_rounds: int = 0
     out_of_time: bool = False
+    warnings: tuple[str, ...] = ()
     rematch: Rematch | None = None

@@ -106,6 +106,7 @@ class Calibration:
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
+        warnings: of ``calibrate``: about the dataset and its guess, found before the search.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
             its last round.
         camera_matches: what cameras see in common, with the surfaces that were used; None if it was
@@ -132,6 +133,7 @@ class Calibration:
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
+    warnings: tuple[str, ...] = ()
     correspondences: Correspondences | None = None
     camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
@@ -284,6 +286,7 @@ class Calibration:
             "counts": self.counts,
             "frames_used": list(self.frames),
             "rounds": list(self.rounds),
+            "warnings": list(self.warnings),
             "initial_rig": self.initial_rig.model_dump(),
             "stage1_T_camera_lidar": self.stage1_T_camera_lidar,
             "terms": self.terms,

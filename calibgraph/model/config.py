@@ -14,6 +14,7 @@ from factors import LossName
 
 Terms = Literal["stage1", "reprojection", "priors", "full"]
 TERMS: tuple[Terms, ...] = get_args(Terms)
+Stage1Source = Literal["pnp", "rig"]
 PresetName = Literal["kitti", "walkley", "auto"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
@@ -73,9 +74,12 @@ class Config(StrictNumbers):
         grid_columns, grid_rows: cells of the image in which only the best match is kept.
         matches_max: cap per camera and frame.
         stage1: source of the per-camera estimates T_hat: ``pnp``, one extrinsic per frame,
-            aggregated; or ``rig``, the extrinsics in the rig as they are.
+            aggregated; or ``rig``, the extrinsics in the rig as they are. None: as the table's
+            matcher states, else ``pnp``.
         aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
+        excluded_cameras: whose correspondences take no part. Such a camera is determined by
+            relative poses or common features, else it stays where the rig has it and FAILs.
         tolerance_deg: rotation by which a result may be off: the verdict is about more.
         tolerance_cm: distance by which a camera may be off: the verdict is about more.
         common_deg, common_cm: standard deviation per camera axis of the error that all frames of a
@@ -101,9 +105,10 @@ class Config(StrictNumbers):
     grid_columns: Cells = 40
     grid_rows: Cells = 25
     matches_max: Annotated[int, Field(gt=0)] = 10_000
-    stage1: Literal["pnp", "rig"] = "pnp"
+    stage1: Stage1Source | None = None
     aggregate: Literal["median", "mean", "mode"] = "median"
     pnp_threshold_px: Pixels = 8.0
+    excluded_cameras: tuple[str, ...] = ()
     tolerance_deg: Annotated[float, Field(gt=0, le=180)] = TOLERANCE[0]
     tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
     common_deg: Annotated[float, Field(ge=0, le=180)] | None = None

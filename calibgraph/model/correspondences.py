@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.places import KEYS, Places
 from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
@@ -52,7 +53,7 @@ class Correspondences:
 
     Raises:
         CorrespondenceError: on wrong shapes or values, naming the first bad row, and if the
-            metadata has wrong ``findings``.
+            metadata has wrong ``findings`` or ``places``.
     """
 
     cameras: tuple[str, ...]
@@ -81,7 +82,7 @@ class Correspondences:
             raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
         if not isinstance(self.metadata, dict):
             raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
-        _ = self.findings
+        _ = self.findings, self.places
         self._check_values()
 
     @staticmethod
@@ -152,6 +153,11 @@ class Correspondences:
             return self.select(slice(0, 0))
         return self.select(rows_where(self.camera_index == self.cameras.index(name)))
 
+    def without_cameras(self, names: Collection[str]) -> Correspondences:
+        """The rows of all other cameras."""
+        left_out = [number for number, name in enumerate(self.cameras) if name in names]
+        return self.select(~np.isin(self.camera_index, left_out)) if left_out else self
+
     @property
     def findings(self) -> MatcherFindings:
         """The matcher's findings, from the metadata.
@@ -160,6 +166,20 @@ class Correspondences:
             CorrespondenceError: if a value is not a number in its range.
         """
         return MatcherFindings.from_metadata(self.metadata)
+
+    @property
+    def places(self) -> Places:
+        """Which frames share a place, from the metadata.
+
+        Raises:
+            CorrespondenceError: if they are not lists of frame numbers.
+        """
+        return Places.from_metadata(self.metadata)
+
+    def with_places(self, places: Places) -> Correspondences:
+        """The table with other places in its metadata."""
+        kept = {key: value for key, value in self.metadata.items() if key not in KEYS}
+        return replace(self, metadata={**kept, **places.to_metadata()})
 
     def counts(self) -> dict[str, int]:
         """Rows per camera."""

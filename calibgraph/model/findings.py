@@ -19,6 +19,7 @@ _PER_CAMERA = {
     "missed": "missed",
 }
 _Z_SCORES = ("contrast", "found", "missed")
+STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
     "range_rotation_deg": 180.0,
     "range_translation_m": 100.0,
@@ -46,6 +47,7 @@ class MatcherFindings:
         failed_share: share of the frames without matches (0 to 1).
         found: z-score at the pose where the search found the camera.
         missed: best z-score of the search where it did not find the camera: the camera fails.
+        stage1: ``rig`` if the matches of a single frame determine no pose, else ``pnp``.
         range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
             if unknown.
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
@@ -66,6 +68,7 @@ class MatcherFindings:
     failed_share: Mapping[str, float] = field(default_factory=dict)
     found: Mapping[str, float] = field(default_factory=dict)
     missed: Mapping[str, float] = field(default_factory=dict)
+    stage1: str = "pnp"
     range_rotation_deg: float | None = None
     range_translation_m: float | None = None
     systematic_rotation_rad: float | None = None
@@ -93,6 +96,8 @@ class MatcherFindings:
         for key, largest in _NUMBERS.items():
             if key in metadata:
                 values[key] = _number(key, metadata[key], largest)
+        if STAGE1 in metadata:
+            values[STAGE1] = _source(metadata[STAGE1])
         if not _COMMON & values.keys():
             values = _usual_of(metadata.get("matcher")) | values
         return MatcherFindings(**values)
@@ -167,6 +172,14 @@ def _number(key: str, value: Any, largest: float) -> float:
             f"metadata {key!r} must be a number from 0 to {largest:.3g}, found {number!r}"
         )
     return number
+
+
+def _source(value: Any) -> str:
+    if value not in _SOURCES:
+        raise CorrespondenceError(
+            f"metadata {STAGE1!r} must be {' or '.join(_SOURCES)}, found {value!r:.40}"
+        )
+    return str(value)
 
 
 def _to_float(value: Any) -> Any:

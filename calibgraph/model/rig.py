@@ -27,6 +27,7 @@ from pydantic import (
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
+from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS
 
@@ -123,36 +124,20 @@ def _checked_name(name: str) -> str:
     return name
 
 
-MODELS_OF_OTHERS: dict[str, LensModel] = {
-    "plumb_bob": "pinhole",
-    "radtan": "pinhole",
-    "rational_polynomial": "pinhole",
-    "equidistant": "fisheye",
-    "equi": "fisheye",
-    "kannala_brandt": "fisheye",
-    "omni": "omnidirectional",
-    "omnidir": "omnidirectional",
-    "mei": "omnidirectional",
-    "unified": "omnidirectional",
-    "panorama": "equirectangular",
-    "spherical": "equirectangular",
-}
-"""What ROS, Kalibr and others call the lens models."""
-
-
 def _checked_model(name: Any) -> Any:
     """The name of a lens model, as it is.
 
     Raises:
         ValueError: if it is the name that ROS or Kalibr give to one of ours.
     """
-    ours = MODELS_OF_OTHERS.get(str(name).lower().replace("-", "_"))
-    if ours is not None:
+    ours = find_lens_model(name) if isinstance(name, str) and name else None
+    if ours not in (None, name):
         raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")
     return name
 
 
 CameraName = Annotated[str, AfterValidator(_checked_name)]
+FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$")]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -176,8 +161,9 @@ class Intrinsics(_Model):
 class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
 
-    ``covariance`` is that of a reference with error bars: (6, 6) of xi = (rotation [rad],
-    translation [m]) in T_camera_lidar = exp(xi) T, in the camera's axes.
+    ``frame_id`` is that of its optical frame in ROS, as its bag names it. ``covariance`` is that of
+    a reference with error bars: (6, 6) of xi = (rotation [rad], translation [m]) in T_camera_lidar
+    = exp(xi) T, in the camera's axes.
     """
 
     model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
@@ -185,15 +171,18 @@ class Camera(_Model):
     height_px: Size
     intrinsics_px: Intrinsics
     distortion: tuple[Bounded, ...] = ()
+    frame_id: FrameId | None = None
     T_camera_lidar: Transform
     covariance: PoseCovariance | None = None
 
     @model_serializer(mode="wrap")
-    def _leave_out_no_covariance(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = dump(self)
-        if self.covariance is None:
-            fields.pop("covariance", None)
-        return fields
+        return {
+            name: value
+            for name, value in fields.items()
+            if value is not None or name not in ("covariance", "frame_id")
+        }
 
     @model_validator(mode="after")
     def _image_fits_into_memory(self) -> Self:
@@ -228,7 +217,7 @@ class Camera(_Model):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with some fields changed, not checked; the lens follows the intrinsics."""
         copy = super().model_copy(update=update, deep=deep)
-        if update and update.keys() - {"T_camera_lidar", "covariance"}:
+        if update and update.keys() - {"T_camera_lidar", "covariance", "frame_id"}:
             copy.__dict__.pop("lens", None)
         return copy
 

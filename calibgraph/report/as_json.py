@@ -45,6 +45,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
         "summary": result.summary.to_mapping(),
+        "warnings": list(result.warnings),
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel
 
+from calibgraph.service.job_task import Step
 from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.requests import JobKind
-from calibgraph.service.runner import Step
 
 
 class Progress(BaseModel):

@@ -14,6 +14,7 @@ MOST_FILES = 100_000
 MOST_RATIO = 100
 """Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
 _ANY_RATIO_BYTES = 10**8
+_MOST_NOTES = 20
 _CHUNK = 2**20
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
 _LAYOUT = re.compile(
@@ -100,7 +101,10 @@ def _targets(names: list[str], where: str) -> dict[str, str]:
     for target in left_out:
         if _DATA.match(target) or len(left_out) == len(targets):
             raise _unexpected(target, where)
+    for target in left_out[:_MOST_NOTES]:
         print(f"{where}: {ascii(target[:100])} is no part of a dataset and is left out")
+    if len(left_out) > _MOST_NOTES:
+        print(f"{where}: {len(left_out)} files are left out in all")
     kept = {name: target for name, target in targets.items() if _LAYOUT.fullmatch(target)}
     if len({name.lower() for name in names}) < len(names):
         raise FileError(where, "holds a name twice")

@@ -54,3 +54,17 @@ class JobOutcome:
     cannot_tell: bool | None = None
     error_kind: ErrorKind | None = None
     error: str | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a job is.
+
+    Attributes:
+        stage: what it does.
+        done, total: steps of the stage.
+    """
+
+    stage: str
+    done: int
+    total: int

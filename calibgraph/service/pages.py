@@ -10,9 +10,9 @@ from typing import Any
 
 from calibgraph.report.kit import load_template
 from calibgraph.service.answers import utc
+from calibgraph.service.job_task import Step
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.requests import JobKind
-from calibgraph.service.runner import Step
 
 _MINUTE_S = 60
 _Row = tuple[str, str, str]

@@ -10,14 +10,13 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.bell import progress_of
-from calibgraph.service.folders import DataFolder
-from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobTask
+from calibgraph.service.folders import DataFolder, remove_folder
+from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobTask, Step
 from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
@@ -31,20 +30,6 @@ _JOBS_PER_CHILD = 200
 _LOOK_EVERY_S = 1.0
 _EXPIRE_EVERY_S = 60.0
 _RETRY_AFTER_S = 2.0  # when the table cannot be used
-
-
-@dataclass(frozen=True)
-class Step:
-    """How far a job is.
-
-    Attributes:
-        stage: what it does.
-        done, total: steps of the stage.
-    """
-
-    stage: str
-    done: int
-    total: int
 
 
 @dataclass
@@ -305,8 +290,3 @@ class Runner:
 
 _MOST_DEATHS = min(5, MOST_STARTS)
 """Deaths of a job's process, while one server runs, after which they are its own fault."""
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder and all that is in it."""
-    shutil.rmtree(folder, ignore_errors=True)

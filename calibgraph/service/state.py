@@ -11,7 +11,7 @@ from sqlalchemy import Engine
 from calibgraph.errors import CalibrationError
 from calibgraph.service.bell import Bell
 from calibgraph.service.database import open_database
-from calibgraph.service.folders import DataFolder
+from calibgraph.service.folders import DataFolder, remove_folder
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root, open_roots
@@ -63,7 +63,11 @@ class Service:
         self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
 
     def start(self) -> None:
-        """Begin to run jobs, in the event loop."""
+        """Remove what an earlier server left, and begin to run jobs, in the event loop."""
+        known = self.tracker_table.ids()
+        for left in self.folder.trackers.iterdir():
+            if left.name not in known:  # a server was killed while it made or removed it
+                remove_folder(left)
         self.bell.open()
         self.runner.start()
 

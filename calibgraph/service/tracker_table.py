@@ -60,6 +60,11 @@ class TrackerTable:
         with self._engine.connect() as connection:
             return [TrackerRecord(**row) for row in connection.execute(query).mappings()]
 
+    def ids(self) -> set[str]:
+        """Of all trackers."""
+        with self._engine.connect() as connection:
+            return set(connection.execute(select(trackers.c.id)).scalars())
+
     def count(self, tenant: str) -> int:
         """How many a tenant has."""
         query = select(func.count()).where(trackers.c.tenant == tenant)

@@ -161,7 +161,7 @@ def _open3d() -> Any:
         import open3d
     except ImportError as error:
         raise CalibrationError(
-            f"simulating sensors needs open3d: pip install 'calibgraph[pointcloud]', on Debian or "
+            f"simulating sensors needs open3d: pip install 'calibgraph[simulation]', on Debian or "
             f"Ubuntu also apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 ({error})"
         ) from error
     return open3d

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
+from calibgraph.model.places import Places
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.cloud_bends import bend_evidence, shifts_of_pairs
 from calibgraph.solver.component_sizes import Sizes, sizes_of
@@ -23,7 +24,6 @@ from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarch
 from calibgraph.solver.hierarchy_poses import start_poses
 from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.pair_refinement import pair_sigmas
-from calibgraph.solver.repeats import split_places
 from calibgraph.solver.within_place import WEAK, within_place
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
     """The numbers of the frames of each place, over all cameras."""
     blocks = [block.frame_numbers for block in inliers.blocks.values()]
     frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
-    return split_places(metadata, frames)
+    return Places.from_metadata(metadata).split(frames)
 
 
 def error_model(

@@ -6,22 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from calibgraph.errors import CorrespondenceError
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
-from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.error_model import weigh_errors
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
-from calibgraph.solver.repeats import number_by_place
-from calibgraph.solver.solution import Solution, count_places
+from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
-from calibgraph.solver.start import best_start, require_determined
+from calibgraph.solver.start import best_start, require_determined, require_known
 
 
 # fmt: off
@@ -33,7 +34,6 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
     camera_matches: CameraMatches | None = None,
-    hold: bool = False,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -47,7 +47,6 @@ def solve_joint(
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
         camera_matches: what cameras see in common, with surfaces; from the correspondences' frames.
-        hold: leave cameras that nothing determines where the rig has them, in place of an error.
 
     Raises:
         FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
@@ -55,11 +54,15 @@ def solve_joint(
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
+    require_known(rig, config.excluded_cameras)
 
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
+        if config.stage1 is None:
+            config = config.changed(stage1=kept.table.findings.stage1)
         tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
-        held = require_determined(rig, kept.counts, tied, hold=hold)       # Preprocessing
+        held = require_determined(                                         # Preprocessing
+            rig, kept.counts, tied, config.excluded_cameras)
 
     with watch("stage1"):
         pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
@@ -90,6 +93,24 @@ def solve_joint(
 # fmt: on
 
 
+def solve_without_failing(
+    rig: Rig, table: Correspondences, config: Config, terms: Terms = "full"
+) -> Solution:
+    """The joint solve; cameras whose correspondences determine no pose become excluded ones.
+
+    Raises:
+        CorrespondenceError: if that is so of all cameras.
+    """
+    while True:
+        try:
+            return solve_joint(rig, table, config, terms)
+        except CorrespondenceError as error:
+            excluded = config.excluded_cameras
+            if error.camera not in rig.cameras or error.camera in excluded:
+                raise
+            config = config.changed(excluded_cameras=(*excluded, error.camera))
+
+
 def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     """Refine a solution with what its cameras see in common, which is no part of the paper.
 
@@ -101,10 +122,10 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         The same optimum where no pair of cameras has enough in common.
     """
     alone, watch = solution.without_pairs(), Stopwatch()
-    frame = number_by_place(solution.correspondences.metadata, matches.frame)
-    by_place = replace(matches, frame=frame)
+    stops = solution.correspondences.places
+    by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
-        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_place)
+        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_stop)
     with watch("error_model"):
         errors, optimum = weigh_errors(
             inliers, optimum, alone.scales, solution.correspondences.metadata, alone.held
@@ -163,6 +184,13 @@ def count_correspondences(
             "repeated_frames": kept.repeated_frames[name],
             "frames_used": 0 if used is None else used.frames,
             "frames_without_pnp": pairwise[name].failed_frames if name in pairwise else 0,
-            **count_places(kept.table.metadata, used),
+            **count_places(kept.table.places, used),
         }
     return counts
+
+
+def count_places(places: Places, used: CameraBlock | None) -> dict[str, int]:
+    """The count of the places that a camera's correspondences are from, if places are named."""
+    if places.places is None:
+        return {}
+    return {"places": 0 if used is None else len(places.split(used.frame_numbers))}

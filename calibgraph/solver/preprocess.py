@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.io.correspondence_tables import parts_of_file
+from calibgraph.io.correspondence_tables import parts_of_table
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.rig import Rig
@@ -44,16 +44,16 @@ class Preprocessed:
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
     """Depth filter, confidence filter, best match per grid cell, cap per camera and frame.
 
-    The table may be a file larger than memory, which is read in parts: memory is needed for one row
-    group of it and for what the grid keeps, at most one match of each cell, camera and frame, in
-    whatever order the rows are. A CSV file is read whole.
+    The table may be a file or a folder larger than memory, which is read in parts: memory is needed
+    for one row group of it and for what the grid keeps, at most one match of each cell, camera and
+    frame, in whatever order the rows are. A CSV file is read whole.
 
     Raises:
         CorrespondenceError: if the table names a camera that the rig does not have, or states
             another common error than the settings.
         FileError: as of :func:`calibgraph.load_correspondences`.
     """
-    parts = [table] if isinstance(table, Correspondences) else parts_of_file(Path(table))
+    parts = [table] if isinstance(table, Correspondences) else parts_of_table(Path(table))
     return preprocess_parts(rig, parts, config)
 
 
@@ -63,7 +63,8 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
     merged_rows = 0
     for part in parts:
-        best, passed = _filter(rig, with_common_error(part, config), config)
+        usable = with_common_error(part.without_cameras(config.excluded_cameras), config)
+        best, passed = _filter(rig, usable, config)
         counts[:3] += passed
         kept.append(best)
         if sum(map(len, kept)) > 2 * merged_rows + _MERGED_ROWS:

@@ -6,85 +6,20 @@ independent, they would make the error bar too small, down to nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.grid import frame_edges
 
 Numbers = NDArray[np.int64]
 Hashes = NDArray[np.uint64]
 
-SAME_PLACE = "same_place"
-"""Key of a table's metadata: lists of frame numbers, those of one place each."""
-
-PLACES = "places"
-"""The same of frames near each other, which show the same objects."""
-
 REPEATED_SHARE = 0.5
 """Of a frame's points, that are those of another one, to the last bit: two scans have none in
 common."""
 
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
-
-
-def number_by_place(metadata: Mapping[str, Any], frame: Numbers) -> Numbers:
-    """(n,) frame numbers, those of one place replaced by the first of them.
-
-    Raises:
-        CorrespondenceError: if the metadata's ``same_place`` is not a list of lists of numbers.
-    """
-    numbers = frame
-    for place in lists_of_frames(metadata, SAME_PLACE):
-        numbers = np.where(np.isin(frame, place), np.int64(place[0]), numbers)
-    return numbers
-
-
-def frames_of_one_place(metadata: Mapping[str, Any], frame: Numbers) -> float:
-    """How many frames share what a place shares, in the mean over frames.
-
-    Args:
-        metadata: of a table; frames in none of its ``places`` are all of one place.
-        frame: (f,) numbers of a camera's frames.
-
-    Raises:
-        CorrespondenceError: if ``places`` is not a list of lists of numbers.
-    """
-    counts = [len(place) for place in split_places(metadata, frame)]
-    return float(np.square(counts).sum() / max(1, len(frame)))
-
-
-def split_places(metadata: Mapping[str, Any], frame: Numbers) -> list[Numbers]:
-    """The numbers of a camera's frames, place by place; arguments as of `frames_of_one_place`."""
-    lists = lists_of_frames(metadata, PLACES)
-    place_of = {number: place for place, numbers in enumerate(lists) for number in numbers}
-    place = np.array([place_of.get(number, len(lists)) for number in frame.tolist()], np.int64)
-    order = np.argsort(place, kind="stable")
-    edges = np.flatnonzero(np.diff(place[order])) + 1
-    return [part for part in np.split(frame[order], edges) if len(part)]
-
-
-def lists_of_frames(metadata: Mapping[str, Any], key: str) -> list[list[int]]:
-    """The lists under a key of a table's metadata; none if it is not there.
-
-    Raises:
-        CorrespondenceError: if they are not lists of frame numbers.
-    """
-    places = metadata.get(key, [])
-    good = isinstance(places, list) and all(
-        isinstance(place, list) and place and all(type(number) is int for number in place)
-        for place in places
-    )
-    if not good:
-        raise CorrespondenceError(
-            f"{key} of the table's metadata must be lists of frame numbers, as in "
-            f"[[0, 1, 2], [7, 8]], found {places!r:.60}"
-        )
-    return list(places)
 
 
 def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:
@@ -104,7 +39,7 @@ def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:
     numbers = table.frame[edges[:-1]]
     if _have_repeats(hashes):
         numbers = numbers[_first_of_same_content(hashes, np.diff(edges))]
-    return number_by_place(table.metadata, np.repeat(numbers, np.diff(edges)))
+    return table.places.merge_stationary(np.repeat(numbers, np.diff(edges)))
 
 
 def _have_repeats(hashes: Hashes) -> bool:

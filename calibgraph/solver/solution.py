@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +13,11 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.factor_graph import Optimum
 from calibgraph.solver.objective import Objective, Scales, Transforms
-from calibgraph.solver.repeats import PLACES, split_places
 
 Array = NDArray[np.float64]
-
-
-def count_places(metadata: Mapping[str, Any], used: CameraBlock | None) -> dict[str, int]:
-    """The count of the places that a camera's correspondences are from, if places are named."""
-    if PLACES not in metadata:
-        return {}
-    frames = np.empty(0, dtype=np.int64) if used is None else used.frame_numbers
-    return {"places": len(split_places(metadata, frames))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,18 +78,6 @@ class Solution:
     def solved_rig(self) -> Rig:
         """The rig with the estimated extrinsics."""
         return self.rig.moved_to(self.T_camera_lidar)
-
-    def with_places(self, places: list[list[int]]) -> Solution:
-        """The solution with the frames of each place named and counted."""
-        table = self.correspondences
-        table = replace(table, metadata={**table.metadata, PLACES: places})
-        counts = {
-            name: {**of_camera, **count_places(table.metadata, self.inliers.blocks.get(name))}
-            for name, of_camera in self.counts.items()
-        }
-        return replace(
-            self, correspondences=table, counts=counts, errors=None, errors_before_pairs=None
-        )
 
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""

@@ -80,8 +80,7 @@ def require_determined(
     rig: Rig,
     counts: Mapping[str, Mapping[str, int]],
     tied_by_images: Sequence[tuple[str, str]] = (),
-    *,
-    hold: bool = False,
+    excluded: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Check that every camera has correspondences, or is tied to one that has.
 
@@ -89,13 +88,13 @@ def require_determined(
         rig: with its relative poses.
         counts: per camera, correspondences left after each filter.
         tied_by_images: the pairs of cameras that see enough in common.
-        hold: accept cameras that have neither, as long as there are others.
+        excluded: cameras that may have neither, as long as there are others.
 
     Returns:
         The cameras that have neither.
 
     Raises:
-        CorrespondenceError: naming the first of them, if they are not accepted.
+        CorrespondenceError: naming the first of them that may not.
     """
     tied = {name for name, count in counts.items() if count["capped"] >= MIN_MATCHES}
     for _ in rig.cameras:
@@ -103,24 +102,40 @@ def require_determined(
         tied |= {p.b for p in rig.relative_poses if p.a in tied}
         tied |= {name for pair in tied_by_images if tied & set(pair) for name in pair}
     held = tuple(name for name in counts if name not in tied)
-    if not (hold and tied):
-        for name in held:
-            count = counts[name]
-            left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
-            raise CorrespondenceError(
-                f"camera {name!r} has {count['capped']} usable correspondences, at least "
-                f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
-                f"(left after each filter: {left}): {_advice(count)}{_advice_for_others(tied)}",
-                camera=name,
-            )
+    for name in held:
+        if name in excluded and tied:
+            continue
+        count = counts[name]
+        left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
+        raise CorrespondenceError(
+            f"camera {name!r} has {count['capped']} usable correspondences, at least "
+            f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
+            f"(left after each filter: {left}): {_advice(count)}{_advice_for_others(tied)}",
+            camera=name,
+        )
     return held
+
+
+def require_known(rig: Rig, names: Sequence[str]) -> None:
+    """Check the cameras that the settings exclude.
+
+    Raises:
+        ValueError: if the rig lacks one.
+    """
+    for name in names:
+        if name not in rig.cameras:
+            known = ", ".join(rig.cameras)
+            raise ValueError(f"excluded_cameras names {name!r}; the rig has {known}")
 
 
 def _advice_for_others(tied: set[str]) -> str:
     """How to calibrate the cameras that have enough."""
     if not tied:
         return ""
-    return f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file"
+    return (
+        f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file, or "
+        "name it in excluded_cameras of the settings"
+    )
 
 
 def _advice(count: Mapping[str, int]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.repeats import PLACES, lists_of_frames
+from calibgraph.model.places import PLACES
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
@@ -130,8 +130,7 @@ def _place_of(table: Correspondences) -> str:
     if not len(table):
         return ""
     number = int(table.frame[0])
-    lists = lists_of_frames(table.metadata, PLACES)
-    return next((str(place[0]) for place in lists if number in place), "")
+    return table.places.name_of(number)
 
 
 def _place_name(place: object) -> str:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from calibgraph.model.plausibility import find_implausible
+from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.cross_validation import (
@@ -84,7 +86,9 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
     cameras = evidence.solution.cameras
     of_run = [check(evidence) for check in RUN_CHECKS]
     checks = concatenate([assess(evidence.solution), *of_run], cameras)
-    return concatenate([_intended_guess_checks(evidence, checks), checks], cameras)
+    convention = _intended_guess_checks(evidence, checks)
+    implausible = _implausible_checks(evidence.run.guess, checks)
+    return concatenate([convention, implausible, checks], cameras)
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
@@ -98,6 +102,19 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
     error = likely_intended_guess(evidence.run.dataset, evidence.run.guess)
     if error is None:
         return {}
-    text = f"the images fit better if the guess is {error}: correct it and calibrate again"
+    text = f"{error}: correct it and calibrate again"
     check = Check("convention of the guess", "FAIL", text)
     return {name: [check] for name in checks}
+
+
+def _implausible_checks(guess: Rig, checks: Checks) -> Checks:
+    """Values of a rig that may explain why checks of a camera FAIL; they decide nothing."""
+    found: dict[str, list[Check]] = {}
+    for line in find_implausible(guess):
+        name, _, text = line.partition(": ")
+        of_camera = checks.get(name, ())
+        if any(check.status == "FAIL" for check in of_camera):
+            decided = any(check.decisive for check in of_camera)
+            check = Check("values of the rig", "FAIL" if decided else "WARN", text)
+            found.setdefault(name, []).append(check)
+    return found

@@ -31,7 +31,6 @@ from calibgraph.solver.error_shares import (
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
@@ -228,9 +227,9 @@ class Evidence:
         self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
     ) -> Array:
         """(6 N, 6 N) covariance of a solution by the error that all frames share, if as usual."""
-        metadata = self.solution.correspondences.metadata
+        places = self.solution.correspondences.places
         repeats = {
-            name: frames_of_one_place(metadata, block.frame_numbers)
+            name: places.frames_per_place(block.frame_numbers)
             for name, block in inliers.blocks.items()
         }
         T_camera_lidar = {name: self.solution.T_camera_lidar[name] for name in inliers.cameras}

@@ -45,7 +45,7 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
     degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
     metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
     error = convention_error_between(guess, result)
-    advice = "" if error is None else f"it seems to be {error}"
+    advice = "" if error is None else f"it seems that {error}"
     return [
         replace(rotation, warn=max(rotation.warn, range_deg)).check(degrees, advice=advice),
         replace(translation, warn=max(translation.warn, range_m)).check(metres, advice=advice),

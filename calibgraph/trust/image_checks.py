@@ -70,7 +70,7 @@ def check_images(
         Checks of every camera.
     """
     evidence = measure_image_evidence(
-        dataset, rig, places=table.metadata, seed=seed, progress=progress
+        dataset, rig, places=table.places, seed=seed, progress=progress
     )
     offsets = time_offsets(dataset, rig, table)
     of_time = {

@@ -11,7 +11,6 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,6 +23,7 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
 from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
@@ -71,7 +71,7 @@ def measure_image_evidence(
     dataset: Dataset,
     rig: Rig,
     *,
-    places: Mapping[str, Any] | None = None,
+    places: Places = NOWHERE,
     seed: int = 0,
     extrinsics_only: bool = False,
     progress: Progress | None = None,
@@ -81,7 +81,7 @@ def measure_image_evidence(
     Args:
         dataset: images and clouds.
         rig: lenses, and the extrinsics in question.
-        places: metadata of its correspondences: the frames of each place, and repeated ones.
+        places: which frames share one.
         seed: of the search for the lens.
         extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
             take most of the time.
@@ -92,7 +92,7 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_camera, scorer, seed, places or {})
+        measure = partial(_measure_camera, scorer, seed, places)
         if extrinsics_only:
             measure = partial(_measure_extrinsic, scorer)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
@@ -111,7 +111,7 @@ def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageE
 
 
 def _measure_camera(
-    scorer: FrameScorer, seed: int, places: Mapping[str, Any], name: str, camera: Camera
+    scorer: FrameScorer, seed: int, places: Places, name: str, camera: Camera
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)

@@ -16,7 +16,6 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.augmented_fit import AugmentedFit, linearize_block
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.repeats import frames_of_one_place
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter, check_parameter
@@ -41,11 +40,11 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals, and how much depends on the focal length."""
     solution = evidence.of_correspondences.solution
     cameras = solution.solved_rig.cameras
-    findings, metadata = evidence.findings, solution.correspondences.metadata
+    findings, places = evidence.findings, solution.correspondences.places
 
     def of_camera(name: str) -> list[Check]:
         block = evidence.fitted_blocks[name]
-        of_place = findings.place_variance * frames_of_one_place(metadata, block.frame_numbers)
+        of_place = findings.place_variance * places.frames_per_place(block.frame_numbers)
         scale, tolerance = solution.scales[name], solution.config.tolerance
         return check_intrinsics(cameras[name], block, scale, of_place, tolerance=tolerance)
 

@@ -9,10 +9,7 @@ axis). Across that side, a principal point cannot be told from a rotation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,10 +19,10 @@ from calibgraph.matching.structure.consensus import maximize_score, sum_scores
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.error_components import error_components
+from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
 from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
-from calibgraph.solver.repeats import frames_of_one_place, number_by_place
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import NAMES, LensParameter
 
@@ -59,7 +56,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     scores: ShiftScores,
     *,
     seed: int,
-    places: Mapping[str, Any] = MappingProxyType({}),
+    places: Places = NOWHERE,
 ) -> LensEvidence:
     """Find the lens that fits the images best, with the pose free: a search, then two fits.
 
@@ -69,10 +66,10 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
         camera: at the result.
         scores: of the camera at the level ``WIDE``.
         seed: of the search.
-        places: metadata of correspondences, which name the frames of each place, and repeated ones.
+        places: which frames share one.
     """
     frames = np.unique(scores.frame)
-    copies = len(frames) / len(np.unique(number_by_place(places, frames)))
+    copies = len(frames) / len(np.unique(places.merge_stationary(frames)))
     searched = 0 if camera.model == "equirectangular" else _TO_CENTRE  # the format determines it
     best, gain = _search(camera, scores, searched, seed)
     gain /= math.sqrt(copies)  # chance agreement of copies repeats
@@ -110,9 +107,7 @@ def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[
     return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
 
 
-def _shape(
-    camera: Camera, scores: ShiftScores, seed: int, places: Mapping[str, Any]
-) -> list[LensParameter]:
+def _shape(camera: Camera, scores: ShiftScores, seed: int, places: Places) -> list[LensParameter]:
     """Changes of the logarithm of fx / fy and of the skew.
 
     Measured apart from the others, which they would make less certain, and without a finer fit: on
@@ -162,7 +157,7 @@ def change_lens(camera: Camera, change: Array) -> Camera:
 
 
 def _fit_at_peaks(
-    camera: Camera, scores: ShiftScores, start: Array, places: Mapping[str, Any]
+    camera: Camera, scores: ShiftScores, start: Array, places: Places
 ) -> AugmentedFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
     if not len(scores.counts):
@@ -170,10 +165,10 @@ def _fit_at_peaks(
     lens = len(start) - 6
     extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))
     table = extract_correspondences(extended, start, "camera")
-    table = replace(table, frame=number_by_place(places, table.frame))
+    table = replace(table, frame=places.merge_stationary(table.frame))
     jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
     variance = error_components().matchers["structure"].place_variance
-    shared = variance * frames_of_one_place(places, np.unique(table.frame))
+    shared = variance * places.frames_per_place(np.unique(table.frame))
     return fit_augmented(camera, table, jacobian_px, shared_variance=shared)
 
 

@@ -16,7 +16,7 @@ from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 
-_COUNTED = "`benchmarks/verdicts.py`: chosen on its set tune, counted on its set count."
+_COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
 
@@ -246,7 +246,7 @@ LIMITS: tuple[Limit, ...] = (
           "is this near to the result, and as near as the next row."),
     Limit("convention_translation", 2.5, "m", "See the row above."),
     Limit("convention_gain", 1.3, "times", "A convention error explains a failed guess if, undone, "
-          "the z-score exceeds the guess's by this factor, and the FAIL limit of `z_score`."),
+          "the z-score exceeds the guess's by this factor, and what chance gives."),
 )
 # fmt: on
 

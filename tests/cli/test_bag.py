@@ -49,6 +49,27 @@ def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> N
     }  # fmt: skip
 
 
+def test_the_notes_about_a_bag_are_printed_and_in_the_json(call: Call, tmp_path: Path) -> None:
+    make = Messages("mcap")
+    written = sample_messages(make)
+    for each in written:
+        if each.topic == "/left/camera_info":  # of an image twice as large
+            each.content.k[[0, 2, 4, 5]] *= 2
+    lost = make.transforms([("base", "gps", np.eye(4))])
+    lost.transforms[0].transform.rotation.w = 0.0
+    written.append(Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, lost))
+    bag = write_bag(tmp_path, "mcap", written)
+    code, _, err = call("bag", bag)
+    assert code == 0
+    assert "the transform of frame 'gps' on /tf_static" in err
+    assert "warning: left: principal point" in err
+    code, stdout, err = call("bag", bag, "--json")
+    assert (code, err) == (0, "")
+    gps, left = json.loads(stdout)["notes"]
+    assert "'gps'" in gps
+    assert left.startswith("warning: left: principal point")
+
+
 @pytest.mark.slow
 def test_a_bag_is_calibrated_and_reported(call: Call, tmp_path: Path, table: Path) -> None:
     bag, out = sample_bag(tmp_path, "ros1", raw=True), tmp_path / "out"

@@ -1,4 +1,4 @@
-"""Wrong arguments of bench and tune."""
+"""Wrong arguments of bench."""
 
 from __future__ import annotations
 
@@ -17,9 +17,6 @@ from tests.conftest import Call
         (("bench", "paper", "kitti", "--frames", "ten"), "--frames ten: give whole numbers"),
         (("bench", "paper", "kitti", "--preset", "auto"), "--preset auto: give the paper's"),
         (("bench", "paper", "kitti", "--preset", "x"), "unknown preset 'x'"),
-        (("tune", "kitti", "--lambda", "a"), "--lambda a: give numbers"),
-        (("tune", "kitti", "--tau", "-1"), "gate_px"),
-        (("tune", "kitti", "--frames", "10001"), "10001 frames: at most 10000"),
         (("bench", "paper", "kitti", "--frames", "10001"), "10001 frames: at most 10000"),
     ],
 )

@@ -11,14 +11,21 @@ import pytest
 import yaml
 
 from calibgraph import MatcherErrors, export_calibration, load_rig, simulate_correspondences, solve
-from calibgraph.cli.exchange import export, import_, parse_names
+from calibgraph.cli.exchange import import_, parse_names
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.formats.rig_export import CAMERA_FRAME
 from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, make_pair
 from tests.io.formats.readers import READERS
-from tests.io.formats.test_import import CAMERA_INFO, KALIBR, KOIDE, SENTENCE, URDF, write
+from tests.io.formats.test_import import (
+    CAMERA_INFO,
+    KALIBR,
+    KOIDE,
+    SENSOR_KIT,
+    SENTENCE,
+    URDF,
+    write,
+)
 
 
 def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> None:
@@ -153,11 +160,68 @@ def test_a_camchain_becomes_a_rig_that_evaluate_takes(call: Call, tmp_path: Path
 def test_defaults_on_the_command_line_are_the_librarys() -> None:
     """They are written twice, so that --help imports nothing heavy."""
     of_import = inspect.signature(import_).parameters
-    assert of_import["relative_sigma_deg"].default == RELATIVE_SIGMA_DEG
-    assert of_import["relative_sigma_cm"].default == RELATIVE_SIGMA_CM
-    assert inspect.signature(export).parameters["camera_frame"].default == CAMERA_FRAME
+    assert of_import["tie_deg"].default == RELATIVE_SIGMA_DEG
+    assert of_import["tie_m"].default == RELATIVE_SIGMA_CM / 100
 
 
 def test_a_name_that_is_given_twice_is_refused() -> None:
     with pytest.raises(ValueError, match="--mount cam0=...: given 2 times; give it once"):
         parse_names("--mount", ["cam0=front", "cam1=left", "cam0=rear"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('rpy="0 0 0"', 'rpy="0 0 90"'),
+        ('rpy="-1.5707963267948966 0 -1.5707963267948966"', 'rpy="-90 0 -90"'),
+        ('rpy="0 0 0"', 'rpy="0 -45.5 0"'),
+    ],
+)
+def test_degrees_in_a_urdf_are_asked(call: Call, tmp_path: Path, old: str, new: str) -> None:
+    assert old in URDF
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF.replace(old, new))
+    message = error_line(*call("import", info, car, "--out", tmp_path / "rig.yaml"))
+    assert "beyond 2 pi: are they in degrees?" in message
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_degrees_in_a_sensor_kit_and_in_lidar_pose_are_asked(call: Call, tmp_path: Path) -> None:
+    kit = SENSOR_KIT.replace("z: 0.8, roll: 0.0, pitch: 0.0, yaw: 0.0", "z: 0.8, roll: 0.0, pitch: "
+                             "0.0, yaw: 90.0")  # fmt: skip
+    info, path = write(tmp_path, info__yaml=CAMERA_INFO, kit__yaml=kit)
+    message = error_line(*call("import", info, path, "--out", tmp_path / "rig.yaml"))
+    assert "velodyne_top_base_link: roll, pitch, yaw are 0, 0, 90 rad" in message
+    arguments = ("--format", "autoware", "--lidar-pose", "0 0 2 0 0 90")
+    message = error_line(*call("export", SAMPLE, "--out", tmp_path / "out.yaml", *arguments))
+    assert "--lidar-pose '0 0 2 0 0 90': roll, pitch, yaw are 0, 0, 90 rad" in message
+    assert not (tmp_path / "out.yaml").exists()
+
+
+def test_angles_of_a_turn_are_radians(call: Call, tmp_path: Path) -> None:
+    turned = URDF.replace('rpy="0 0 0"', 'rpy="0 0 6.2832"')
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=turned)
+    assert call("import", info, car, "--out", tmp_path / "rig.yaml")[0] == 0
+
+
+def test_millimetres_are_warned_of_by_import_and_export(call: Call, tmp_path: Path) -> None:
+    far = URDF.replace('xyz="1.4 0.1 1.8"', 'xyz="400 100 -200"')
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=far)
+    said = "warning: front: the camera is 458 m from the LiDAR: lengths in millimetres"
+    code, _, err = call("import", info, car, "--out", tmp_path / "rig.yaml")
+    assert (code, err.count(said)) == (0, 1)
+    pose = ("--lidar-pose", "0 0 1800 0 0 0")
+    code, _, err = call("export", tmp_path / "rig.yaml", "--format", "autoware", "--out",
+                        tmp_path / "kit.yaml", *pose)  # fmt: skip
+    assert (code, err.count(said)) == (0, 1)
+    assert "warning: --lidar-pose '0 0 1800 0 0 0': lengths in millimetres?" in err
+
+
+def test_import_and_guess_note_what_they_assume(call: Call, tmp_path: Path) -> None:
+    info = CAMERA_INFO.replace("distortion_model: plumb_bob\n", "").replace(
+        "cols: 5, data: [-0.1, 0.02, 0.001, -0.002, 0.003]", "cols: 4, data: [-0.1, 0.02, 0.01, 0]"
+    )
+    path, car = write(tmp_path, info__yaml=info, car__urdf=URDF)
+    for command in ("import", "guess"):
+        code, _, err = call(command, path, car, "--out", tmp_path / f"{command}.yaml")
+        assert code == 0, err
+        assert err.splitlines()[0].startswith(f"note: {path}: distortion_coefficients has four")

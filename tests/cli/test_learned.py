@@ -93,7 +93,7 @@ def test_missing_torch_is_reported_in_one_line(call: Call, monkeypatch: pytest.M
 def test_training_runs_on_the_command_line(tmp_path: Path, call: Call) -> None:
     out, settings = tmp_path / "net.tar", tmp_path / "small.yaml"
     settings.write_text("steps: 1\nwidth: 8\ncrop_px: [128, 192]\niterations: 1\nbatch: 1\n")
-    given = ("train", SAMPLE, "--out", out, "--settings", settings)
+    given = ("train", SAMPLE, "--out", out, "--config", settings)
     code, _, text = call(*given, "--seed", 3)
     assert code == 0
     assert "held out: flow error" in text
@@ -116,11 +116,11 @@ def test_training_refuses_misuse_in_one_line(tmp_path: Path, call: Call) -> None
     good = tmp_path / "good.yaml"
     good.write_text("steps: 1\n")
     for arguments, message in (
-        ((SAMPLE, "--out", tmp_path / "c.tar", "--settings", wrong), "width 12"),
-        ((SAMPLE, "--out", tmp_path / "mine.tar", "--settings", beside), "is read by this"),
+        ((SAMPLE, "--out", tmp_path / "c.tar", "--config", wrong), "width 12"),
+        ((SAMPLE, "--out", tmp_path / "mine.tar", "--config", beside), "is read by this"),
         ((SAMPLE, "--out", tmp_path / "mine.tar"), "was not written by calibgraph train"),
-        ((SAMPLE, "--out", out, "--settings", tmp_path / "none.yaml"), "no such file"),
-        ((SAMPLE, "--out", out, "--settings", good, "--resume"), "--settings: --resume goes on"),
+        ((SAMPLE, "--out", out, "--config", tmp_path / "none.yaml"), "no such file"),
+        ((SAMPLE, "--out", out, "--config", good, "--resume"), "--config: --resume goes on"),
         ((SAMPLE, "--out", out, "--seed", 0, "--resume"), "--seed: --resume goes on"),
         ((SAMPLE, "--out", out, "--seed", 2**31), "seed: .*less than 2147483648"),
         ((tmp_path / "nothing", "--out", out), "nothing"),

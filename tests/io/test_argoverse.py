@@ -12,6 +12,7 @@ import pytest
 from pyarrow import feather
 
 from calibgraph import CalibrationError, load_dataset, load_rig
+from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.io.rotations import quaternion_xyzw
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
@@ -118,7 +119,7 @@ def test_a_sweep_without_an_image_of_a_camera_is_left_out(tmp_path: Path) -> Non
         ("calibration/egovehicle_SE3_sensor.feather",
          {"sensor_name": ["front_left"], **{n: [0.0] for n in
           ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}}, "has length 0, expected 1"),
-        (f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "y": [2.0]}, "column 'z' is missing"),
+        (f"sensors/lidar/{START_NS}.feather", {"x": [1.0], "y": [2.0]}, "expected one z"),
         (f"sensors/lidar/{START_NS}.feather", {"x": [None], "y": [2.0], "z": [1.0]}, "1 empty"),
         ("sensors/lidar/first.feather", {"x": [1.0]}, "its name is no stamp"),
         (f"sensors/lidar/{10**24}.feather", {"x": [1.0]}, "its name is no stamp"),
@@ -149,3 +150,26 @@ def test_images_that_are_far_in_time_do_not_pair(log: Path, tmp_path: Path) -> N
         path.rename(path.with_stem(str(int(path.stem) + 10**12)))
     with pytest.raises(CalibrationError, match="no sweep has an image of every camera"):
         load_dataset(copy)
+
+
+@pytest.mark.parametrize("table", ["intrinsics.feather", "egovehicle_SE3_sensor.feather"])
+def test_a_camera_without_lens_or_pose_is_left_out_with_a_note(
+    log: Path, tmp_path: Path, table: str
+) -> None:
+    copy = Path(shutil.copytree(log, tmp_path / "log"))
+    path = copy / "calibration" / table
+    feather.write_feather(feather.read_table(path).slice(0, 1), path)
+    data = load_dataset(copy)
+    assert list(data.rig.cameras) == ["front_left"] == list(load_rig(copy).cameras)
+    assert len(data.frames) == 6
+    said = f"{table}: has no row of 'front_right'; found front_left: camera 'front_right' is left"
+    assert sum(said in note for note in data.notes) == 1
+    assert said in read_rig_parts([copy]).notes[0]
+
+
+def test_a_log_without_any_complete_camera_is_refused(log: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(log, tmp_path / "log"))
+    path = copy / "calibration" / "intrinsics.feather"
+    feather.write_feather(feather.read_table(path).slice(0, 0), path)
+    with pytest.raises(CalibrationError, match="has no row of 'front_left'; found none"):
+        load_rig(copy)

@@ -29,8 +29,8 @@ def test_frames_hold_what_was_given() -> None:
     assert data.neighbour(data.frames[0], 1) is data.frames[1]
 
 
-def test_clouds_of_three_columns_and_of_doubles_and_without_returns_are_taken() -> None:
-    given = np.vstack([CLOUD[:, :3], [[np.nan] * 3]]).astype(np.float64)
+def test_clouds_of_three_columns_and_of_doubles_are_taken() -> None:
+    given = CLOUD[:, :3].astype(np.float64)
     found = dataset(cloud=given).frames[0].load_cloud()
     np.testing.assert_array_equal(found[:, :3], CLOUD[:, :3])
     assert found.dtype == np.float32
@@ -55,14 +55,28 @@ def test_equal_arrays_have_equal_hashes_under_names_of_their_own() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"cloud": CLOUD[:, :2]}, r"cloud 0 has shape \(2, 2\) of float32, expected \(n, 3\)"),
-        ({"cloud": CLOUD[0]}, r"cloud 0 has shape \(4,\)"),
-        ({"cloud": CLOUD.astype(object)}, "cloud 0 has shape .* of object"),
-        ({"cloud": CLOUD[:0]}, "holds no point"),
-        ({"cloud": np.full((2, 3), np.inf)}, "not finite"),
-        ({"image": IMAGE.astype(float)}, r"image 0 has shape \(6, 8, 3\) of float64, expected"),
-        ({"image": IMAGE[:, :7]}, r"image 0 has shape \(6, 7, 3\) of uint8, expected \(6, 8, 3\)"),
-        ({"image": IMAGE[None]}, "image 0 has shape"),
+        ({"cloud": CLOUD[:, :2]}, r"clouds\[0\]: has shape \(2, 2\), expected \(n, 3\)"),
+        ({"cloud": CLOUD[0]}, r"clouds\[0\]: has shape \(4,\)"),
+        ({"cloud": CLOUD.astype(object)}, r"clouds\[0\]: has shape .* of object"),
+        ({"cloud": CLOUD[:0]}, r"clouds\[0\]: holds no point"),
+        ({"cloud": np.full((2, 3), np.inf)}, r"clouds\[0\]: point 0 is not finite"),
+        ({"cloud": np.zeros((9, 4))}, r"clouds\[0\]: all of its 9 points lie at the origin"),
+        ({"cloud": np.tile(CLOUD, (9, 1)).T}, r"clouds\[0\]: .*\(4, 18\).* is it transposed\?"),
+        ({"cloud": np.tile(CLOUD, (99, 1)).T}, r"clouds\[0\]: .*is it transposed\?"),
+        ({"cloud": [[1.0, 2.0, 3.0], [4.0, 5.0]]}, r"clouds\[0\]: .*; give an array"),
+        ({"cloud": [["a", "b", "c"]]}, r"clouds\[0\]: has shape \(1, 3\) of <U1"),
+        ({"cloud": None}, r"clouds\[0\]: has shape \(\) of object"),
+        ({"cloud": CLOUD * 1e6}, r"clouds\[0\]: holds a coordinate of 6e\+06, expected metres"),
+        ({"cloud": CLOUD.astype(complex)}, r"clouds\[0\]: has shape .* of complex128"),
+        (
+            {"image": IMAGE.astype(float)},
+            r"images\['front'\]\[0\] has shape \(6, 8, 3\) of float64, expected",
+        ),
+        (
+            {"image": IMAGE[:, :7]},
+            r"images\['front'\]\[0\] has shape \(6, 7, 3\) of uint8, expected \(6, 8, 3\)",
+        ),
+        ({"image": IMAGE[None]}, r"images\['front'\]\[0\] has shape"),
         ({"rig": Rig(cameras={"rear": SMALL})}, "images are of front, the rig has rear"),
     ],
 )
@@ -71,8 +85,50 @@ def test_what_does_not_fit_is_refused(given: dict[str, Any], message: str) -> No
         dataset(**given)
 
 
+def test_lists_are_taken_as_arrays() -> None:
+    data = dataset(cloud=CLOUD.tolist())
+    np.testing.assert_array_equal(data.frames[0].load_cloud(), CLOUD)
+
+
+def test_fields_of_arrays_are_known_by_their_names() -> None:
+    named = np.zeros(2, [("Reflectivity", "u1"), ("z", "f8"), ("y", "f8"), ("x", "f8"), ("t", "O")])
+    for column, name in enumerate(("x", "y", "z")):
+        named[name] = CLOUD[:, column]
+    named["Reflectivity"] = 3, 4
+    expected = np.column_stack([CLOUD[:, :3], [3, 4]])
+    np.testing.assert_array_equal(dataset(cloud=named).frames[0].load_cloud(), expected)
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_points_without_a_return_are_left_out(nothing: float) -> None:
+    given = np.vstack([[[nothing, nothing, nothing, 9.0]], CLOUD, [[nothing] * 4]])
+    np.testing.assert_array_equal(dataset(cloud=given).frames[0].load_cloud(), CLOUD)
+
+
+def test_clouds_without_intensity_are_noted() -> None:
+    (note,) = dataset(cloud=CLOUD[:, :3]).notes
+    assert note.startswith("clouds[0]: no intensity among its fields x y z; the error bars become")
+    assert dataset().notes == ()
+
+
 def test_numbers_of_clouds_and_images_must_agree() -> None:
     with pytest.raises(CalibrationError, match="2 clouds, but 1 images"):
         dataset_from_arrays(RIG, [CLOUD, CLOUD], {"front": [IMAGE]})
     with pytest.raises(CalibrationError, match="no frame given"):
         dataset_from_arrays(RIG, [], {"front": []})
+
+
+@pytest.mark.parametrize(
+    ("clouds", "images", "message"),
+    [
+        (CLOUD, {"front": [IMAGE]}, r"clouds is one array of shape \(2, 4\), expected a list"),
+        (iter([CLOUD]), {"front": [IMAGE]}, "clouds is of type list_iterator, expected a list"),
+        ([CLOUD], {"front": IMAGE[:, :, 0]}, r"images\['front'\] is one array"),
+        ([CLOUD], {"front": None}, r"images\['front'\] is of type NoneType"),
+        ([CLOUD], [IMAGE], "images are of no camera by name, the rig has front"),
+    ],
+)
+def test_arguments_that_are_no_lists_are_one_line(clouds: Any, images: Any, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message) as caught:
+        dataset_from_arrays(RIG, clouds, images)
+    assert "\n" not in str(caught.value)

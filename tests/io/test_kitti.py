@@ -49,12 +49,12 @@ def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2: is no projection matrix"),
-        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2: is no projection matrix"),
-        ("P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0", "undo its scale"),
-        ("P2: 700 80 600 0 0 700 180 0 0 0 1 0", "undistort the skew"),
+        ("P2: 0 0 0 0 0 0 0 0 0 0 0 0", "P2: is no camera matrix"),
+        ("P2: -7 0 6 0 0 7 2 0 0 0 1 0", "P2: is no camera matrix"),
+        ("P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0", "undo its scale: divide by 2"),
+        ("P2: 700 80 600 0 0 700 180 0 0 0 1 0", "its skew is 80 px"),
         ("P3: 700 0 600 0 0 700 180 0 0 0 1 0\nP3: 7 0 6 0 0 7 2 0 0 0 1 0", "P3 is given twice"),
-        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2: is no projection matrix"),
+        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2: is no camera matrix"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and the LiDAR's pose: T_camera_lidar"),
         ("Tr: 1 0 0", "expected 12 numbers"),
         ("\xff\xfe", "is not a text file"),
@@ -69,3 +69,13 @@ def test_a_wrong_kitti_calibration_is_one_line(tmp_path: Path, line: str, said: 
     with pytest.raises(FileError, match=re.escape(said)) as caught:
         load_dataset(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_a_camera_without_its_line_is_left_out_with_a_note(tmp_path: Path) -> None:
+    folder = written_kitti(tmp_path / "00")
+    path = folder / "calib.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("P3")]
+    path.write_text("\n".join(lines))
+    data = load_dataset(folder)
+    assert list(data.rig.cameras) == ["image_2"]
+    assert data.notes == (f"{path}: line 'P3' is missing: camera 'image_3' is left out",)

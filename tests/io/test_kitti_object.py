@@ -68,7 +68,7 @@ def test_one_calibration_leaves_nothing_out(training: Path) -> None:
     [
         (("R0_rect", "R0_rect: 1 0 0"), "line 'R0_rect': expected 9 numbers"),
         (("Tr_velo_to_cam", ""), "line 'Tr_velo_to_cam' is missing"),
-        (("P2", "P2: " + " ".join(["nan"] * 12)), "is no projection matrix"),
+        (("P2", "P2: " + " ".join(["nan"] * 12)), "is no camera matrix"),
     ],
 )
 def test_a_wrong_calibration_is_one_line(
@@ -87,3 +87,12 @@ def test_a_cloud_without_calibration_is_named(training: Path) -> None:
     (training / "calib" / "000002.txt").unlink()
     with pytest.raises(FileError, match="the cloud 000002 needs its calibration"):
         load_dataset(training)
+
+
+def test_a_camera_without_its_line_is_left_out_with_a_note(training: Path) -> None:
+    for path in (training / "calib").glob("*.txt"):
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("P3")]
+        path.write_text("\n".join(lines))
+    data = load_dataset(training)
+    assert list(data.rig.cameras) == ["image_2"]
+    assert "line 'P3' is missing: camera 'image_3' is left out" in data.notes[0]

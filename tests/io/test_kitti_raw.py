@@ -93,3 +93,18 @@ def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
     (tmp_path / "calib_velo_to_cam.txt").unlink()
     with pytest.raises(FileError, match="calib_velo_to_cam.txt: no such file"):
         load_rig(drive)
+
+
+def test_a_camera_without_calibration_or_images_is_left_out(tmp_path: Path) -> None:
+    drive = written_drive(tmp_path)
+    path = tmp_path / "calib_cam_to_cam.txt"
+    whole = path.read_text()
+    path.write_text("".join(line for line in whole.splitlines(True) if "P_rect_03" not in line))
+    data = load_dataset(drive)
+    assert list(data.rig.cameras) == ["image_02"]
+    assert "line 'P_rect_03' is missing: camera 'image_03' is left out" in data.notes[0]
+    path.write_text(whole)
+    (drive / "image_00" / "data").mkdir(parents=True)
+    data = load_dataset(drive)
+    assert list(data.rig.cameras) == ["image_02", "image_03"]
+    assert "camera 'image_00' is left out" in data.notes[0]

@@ -115,7 +115,7 @@ def test_a_truncated_scan_and_a_missing_image_are_named(given: Dataset, tmp_path
     write_tables(tmp_path, tables)
     scan = tmp_path / "samples/LIDAR_TOP/scene-0001-0.pcd.bin"
     scan.write_bytes(scan.read_bytes()[:-4])
-    with pytest.raises(CalibrationError, match="float32 x y z intensity ring; is it complete"):
+    with pytest.raises(CalibrationError, match="points of 5 float32 .* is it complete"):
         load_dataset(tmp_path).frames[0].load_cloud()
     tables["sample_data"] = [
         each for each in tables["sample_data"] if each["token"] != "scene-0001-2-front_left-data"
@@ -133,3 +133,38 @@ def test_a_calibration_equals_that_of_our_folder(folder: Path, given: Dataset) -
         np.testing.assert_array_equal(one.T_camera_lidar[name], two.T_camera_lidar[name])
         np.testing.assert_array_equal(one.covariance[name], two.covariance[name])
     assert one.verdict.status == two.verdict.status == "PASS"
+
+
+def test_sweeps_without_key_frames_are_counted(given: Dataset, tmp_path: Path) -> None:
+    tables = tables_of(given)
+    for record in tables["sample_data"]:
+        record["is_key_frame"] = False
+    write_tables(tmp_path, tables)
+    scans = 2 * len(given.frames)
+    said = f"has {scans} scans of LIDAR_TOP, of which none is a key frame; only key frames are read"
+    for read in (load_rig, load_dataset):
+        with pytest.raises(CalibrationError, match=said):
+            read(tmp_path)
+    lidar = [each for each in tables["sample_data"] if "LIDAR_TOP" not in each["token"]]
+    write_tables(tmp_path, {**tables, "sample_data": lidar})
+    with pytest.raises(CalibrationError, match="has no scan of LIDAR_TOP"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["matrix", "key frames"])
+def test_a_camera_without_a_part_is_left_out_with_a_note(
+    given: Dataset, tmp_path: Path, missing: str
+) -> None:
+    tables = tables_of(given)
+    left, right = given.rig.cameras
+    if missing == "matrix":
+        for record in tables["calibrated_sensor"]:
+            if record["token"].endswith(right):
+                record["camera_intrinsic"] = []
+    for record in tables["sample_data"] if missing == "key frames" else ():
+        record["is_key_frame"] &= right not in record["token"]
+    write_tables(tmp_path, tables)
+    write_files(tmp_path, given)
+    data = load_dataset(tmp_path)
+    assert list(data.rig.cameras) == [left]
+    assert f"camera {right!r} is left out" in data.notes[0]

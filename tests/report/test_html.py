@@ -99,6 +99,13 @@ def test_a_camera_that_failed_is_left_out_of_the_export(
     assert text.count("not to be deployed") == 1
 
 
+def test_warnings_about_the_data_are_in_the_verdict(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    text = write_page(replace(solved_pair, warnings=("left: blurred <&>",)), tmp_path)
+    assert "left: blurred &lt;&amp;&gt;" in text.split("</section>")[0]
+
+
 def test_the_title_names_the_recording_and_the_date(
     sample_result: Calibration, tmp_path: Path
 ) -> None:

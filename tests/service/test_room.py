@@ -171,9 +171,15 @@ def test_what_a_killed_server_left_goes_at_the_next_start(
         at = client.post("/v1/solves", files=small.files).headers["location"]
         client.delete(at)
         folder = service_folder(client)
-        for left in (f"jobs/{at.rsplit('/')[-1]}/input", "jobs/unknown/input", "arriving/x/input"):
+        for left in (
+            f"jobs/{at.rsplit('/')[-1]}/input",
+            "jobs/unknown/input",
+            "arriving/x/input",
+            "trackers/x",
+        ):
             (folder / left).mkdir(parents=True)
             (folder / left / "recording").write_bytes(bytes(1000))
     app: Any = create_app(Settings(data=tmp_path / "d", jobs_at_once=0))
     with TestClient(app, URL):
-        assert size_of(folder / "jobs") + size_of(folder / "arriving") == 0
+        kept = [size_of(folder / name) for name in ("jobs", "arriving", "trackers")]
+        assert kept == [0, 0, 0]

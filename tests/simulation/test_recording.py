@@ -104,7 +104,7 @@ def test_missing_open3d_says_how_to_install_it(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[pointcloud\]'"):
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[simulation\]'"):
         simulate_street(tmp_path / "out", rig, frames=1)
 
 

@@ -30,7 +30,7 @@ def test_a_table_of_a_rig_that_sees_all_round_is_solved(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fisheye", "omni", "panorama"])
 def test_a_rendered_rig_that_sees_all_round_is_calibrated(name: str, tmp_path: Path) -> None:
-    """Errors of more frames, from near and far, are in docs/simulation.md."""
+    """Errors of more frames, from near and far, are in benchmarks/notes/simulation.md."""
     simulate_street(
         tmp_path / "street", rig_of(name), frames=5, seed=3, rotation_deg=8.0, translation_m=0.5
     )

@@ -229,7 +229,7 @@ def test_one_row_group_of_a_file_is_in_memory(pair: Rig, tmp_path: Path) -> None
     table = simulate_correspondences(pair, frames=24, matches=1000)
     path = saved(table, tmp_path / "table.parquet", row_group_size=2000, compression="none")
     before = pa.total_allocated_bytes()
-    held = [pa.total_allocated_bytes() - before for _ in correspondence_tables.parts_of_file(path)]
+    held = [pa.total_allocated_bytes() - before for _ in correspondence_tables.parts_of_table(path)]
     assert len(held) == 24
     assert max(held) < path.stat().st_size / 4
 

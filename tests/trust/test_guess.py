@@ -19,7 +19,7 @@ def test_an_inverted_guess_is_named(pair: Rig) -> None:
     poses = {name: np.linalg.inv(T) for name, T in pair.T_camera_lidar.items()}
     result = solve(pair.moved_to(poses), simulated(pair))
     assert result.verdict.status == "WARN"
-    assert any("it seems to be inverted" in reason for reason in result.verdict.reasons)
+    assert any("it seems that the guess is inverted" in reason for reason in result.verdict.reasons)
 
 
 def test_a_near_guess_passes(pair: Rig) -> None:

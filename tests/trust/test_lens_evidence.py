@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +13,8 @@ import pytest
 
 import calibgraph
 from calibgraph import Camera, Dataset, Rig
+from calibgraph.model.places import Places
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
-from calibgraph.solver.repeats import SAME_PLACE
 from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
@@ -37,7 +36,7 @@ def truth() -> Camera:
 
 
 def measure(
-    camera: Camera, dataset: Dataset | None = None, same_place: Sequence[int] = (0,)
+    camera: Camera, dataset: Dataset | None = None, stop: tuple[int, ...] = (0,)
 ) -> LensEvidence:
     dataset = dataset or calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
     with ThreadPoolExecutor(2) as pool:
@@ -45,7 +44,7 @@ def measure(
         images = scorer.load_images(NAME, camera)
         scores = scorer.score_together(images, camera, WIDE)
         return measure_lens(
-            scorer, images, camera, scores, seed=0, places={SAME_PLACE: [[*same_place]]}
+            scorer, images, camera, scores, seed=0, places=Places(stationary=(stop,))
         )
 
 
@@ -89,7 +88,7 @@ def test_a_wrong_lens_is_named_and_measured(
 
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
     camera = change_lens(truth, np.array([0.03, 0.0, 0.0, 0.0]))
-    found, apart = measure(camera, same_place=range(6)), measure(camera)
+    found, apart = measure(camera, stop=tuple(range(6))), measure(camera)
     assert found.gain == pytest.approx(apart.gain / math.sqrt(6))
     assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found.parameters)
     assert abs(found.parameters[0].values[0]) > 0.01  # noqa: PLR2004

@@ -73,12 +73,11 @@ def test_copies_do_not_narrow_the_error_bar(pair: Rig) -> None:
 def test_frames_of_one_place_count_as_one_frame(pair: Rig) -> None:
     """Named in the metadata, as by ``calibrate`` where the vehicle stands."""
     table = simulated(pair, frames=10)
-    standing = replace(table, metadata={**table.metadata, "same_place": [[2, 3, 4], [7, 9]]})
+    standing = replace(table, metadata={**table.metadata, "stationary": [[2, 3, 4], [7, 9]]})
     result = solve(pair, standing)
     assert result.counts["left"]["frames"] == 7 and result.counts["left"]["repeated_frames"] == 3
-    wrong = replace(table, metadata={**table.metadata, "same_place": [[2, "3"]]})
-    with pytest.raises(CorrespondenceError, match="same_place"):
-        solve(pair, wrong)
+    with pytest.raises(CorrespondenceError, match="stationary"):
+        replace(table, metadata={**table.metadata, "stationary": [[2, "3"]]})
 
 
 def test_the_part_that_a_place_shares_falls_with_the_number_of_places(pair: Rig) -> None:
@@ -99,4 +98,4 @@ def test_places_that_are_no_lists_of_frames_are_refused(pair: Rig) -> None:
     table = simulated(pair, frames=8)
     for wrong in ([[2, "3"]], [2], "all"):
         with pytest.raises(CorrespondenceError, match="places of the table's metadata"):
-            solve(pair, replace(table, metadata={**table.metadata, "places": wrong}))
+            replace(table, metadata={**table.metadata, "places": wrong})

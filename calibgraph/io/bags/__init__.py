@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
-from calibgraph.io.bags.messages import is_bag as is_bag
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.options import BagOptions as BagOptions
 from calibgraph.io.bags.pictures import picture_of
-from calibgraph.io.bags.point_clouds import points_of, timed_points_of
+from calibgraph.io.bags.point_clouds import points_of, time_fields, timed_points_of
+from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.motion import ScanMotion
 
 
@@ -36,6 +36,19 @@ def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.f
     if not len(cloud):
         raise FileError(path, "holds no point")
     return cloud
+
+
+def scan_duration_s(path: Path) -> float | None:
+    """Seconds between the first and the last point of a cloud in a message; None without times.
+
+    Raises:
+        FileError, DatasetError: if it cannot be read.
+    """
+    content = read_message(path)[1]
+    if not time_fields(content):
+        return None
+    times_s = timed_points_of(content, str(path))[1]
+    return float(np.ptp(times_s)) if len(times_s) else None
 
 
 def load_bag_image(path: Path) -> NDArray[np.uint8]:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import DatasetError
-from calibgraph.model.rig import MODELS_OF_OTHERS
-from factors import LensModel
-from factors.lens import COEFFICIENTS
+from calibgraph.io.lenses import fitted_coefficients, intrinsics_of_matrix, lens_model
 
 Array = NDArray[np.float64]
 
-_MODELS: Mapping[str, LensModel] = {**MODELS_OF_OTHERS, **{model: model for model in COEFFICIENTS}}
+_AS_NONE = ("", "inverse_brown_conrady")
+"""Models of drivers that state zeros for an image without distortion."""
+_SAME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -27,11 +25,26 @@ class CameraLens:
         frame: the frame of the camera, z forward and y down, as the message names it.
         content: the fields of :class:`calibgraph.Camera` apart from the extrinsic.
         R_image_frame: (3, 3) from the frame to the axes of the image, which rectification turns.
+        baseline_m: (3,) by P's fourth column, the origin of the first camera's frame in the axes of
+            this image; zero for a camera that is no second one of a pair.
     """
 
     frame: str
     content: dict[str, Any]
     R_image_frame: Array
+    baseline_m: Array
+
+    def T_image_frame(self, *, with_baseline: bool) -> Array:
+        """(4, 4) from the frame to the image; with the baseline where the frame is the first's."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_image_frame
+        T[:3, 3] = self.baseline_m if with_baseline else 0.0
+        return T
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the axes of the image are not those of the frame."""
+        return bool(np.abs(self.R_image_frame - np.eye(3)).max() > _SAME)
 
 
 def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
@@ -43,21 +56,28 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
         rectified: whether the images are rectified: by R, and of the camera matrix P.
 
     Raises:
-        DatasetError: if the camera is not calibrated, or its lens model is unknown.
+        FileError: if the camera is not calibrated, or its lens model is unknown.
     """
     frame = message.header.frame_id.lstrip("/")
-    K = np.reshape(_field(message, "K"), (3, 3))
-    if rectified:
-        K = np.reshape(_field(message, "P"), (3, 4))[:, :3]
-    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise DatasetError(
-            f"{where}: holds no focal length, so the camera is not calibrated; calibrate its lens, "
-            "or give a rig with it (--rig)"
-        )
+    matrix = "P" if rectified else "K"
+    K = np.reshape(_field(message, matrix), (3, -1))[:, :3]
+    intrinsics_of_matrix(K, f"{where}: {matrix}")
     model, distortion = ("pinhole", []) if rectified else _distortion(message, where)
-    R = np.reshape(_field(message, "R"), (3, 3))
     content = {"model": model, "distortion": distortion, **_on_image(message, K)}
-    return CameraLens(frame, content, R if rectified and R.any() else np.eye(3))
+    R = np.reshape(_field(message, "R"), (3, 3))
+    R = R if R.any() else np.eye(3)
+    baseline_m = stated_baseline(message)
+    if rectified:
+        return CameraLens(frame, content, R, baseline_m)
+    return CameraLens(frame, content, np.eye(3), R.T @ baseline_m)
+
+
+def stated_baseline(message: Any) -> Array:
+    """(3,) t of P = K [I t] [m]; zeros if it is that of no camera."""
+    P = np.reshape(_field(message, "P"), (3, 4))
+    if not (np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
+        return np.zeros(3)
+    return np.asarray(np.linalg.solve(P[:, :3], P[:, 3]), dtype=np.float64)
 
 
 def _field(message: Any, name: str) -> Array:
@@ -82,16 +102,7 @@ def _on_image(message: Any, K: Array) -> dict[str, Any]:
 
 def _distortion(message: Any, where: str) -> tuple[str, list[float]]:
     """Lens model and coefficients; both may be empty for none, and zeros appended."""
-    given = np.trim_zeros(_field(message, "D"), "b").tolist()
-    model = _MODELS.get(message.distortion_model.strip().lower(), None if given else "pinhole")
-    if model is not None and len(given) <= max(COEFFICIENTS[model]):
-        return model, _padded(given, COEFFICIENTS[model])
-    raise DatasetError(
-        f"{where}: distortion model {message.distortion_model!r} with {len(given)} coefficients is "
-        f"unknown; known are {', '.join(_MODELS)}: give a rig with the lens (--rig)"
-    )
-
-
-def _padded(values: list[float], lengths: Sequence[int]) -> list[float]:
-    length = min(each for each in lengths if each >= len(values))
-    return values + [0.0] * (length - len(values))
+    given = _field(message, "D")
+    stated = message.distortion_model.strip()
+    model = lens_model("none" if stated in _AS_NONE and not given.any() else stated, where)
+    return model, list(fitted_coefficients(given.tolist(), model, where))

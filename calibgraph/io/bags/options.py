@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -29,6 +30,8 @@ class BagOptions:
         motion: how clouds are corrected for the motion of the vehicle, to the median stamp of a
             frame's images: by Odometry, by /tf, by registration of neighbouring scans; or
             ``none``: they are as recorded, or corrected already.
+        beside: further bags of the drive, whose static transforms and lenses serve where the bag
+            has none: those that are loaded together with it.
 
     Raises:
         ValueError: if a value is out of range.
@@ -39,6 +42,7 @@ class BagOptions:
     tolerance_s: float = 0.05
     stamps: Stamps = "header"
     motion: Motion = "none"
+    beside: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topics", MappingProxyType(dict(self.topics)))

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.io.point_fields import find_intensity
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_INTENSITY = ("intensity", "reflectivity", "i")
 _TIMES = ("t", "time", "timestamp", "offset_time", "time_offset")  # Ouster, Velodyne, Hesai, Livox
 _STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smaller, since 1970 larger
 _LONGEST_S = 1.0
@@ -102,7 +102,8 @@ def time_fields(message: Any) -> list[str]:
 def _structured(message: Any, where: str, chosen: Sequence[str] = ()) -> NDArray[np.void]:
     """(n,) structured array of fields, by default x, y, z and an intensity, without a copy."""
     fields = {each.name: each for each in message.fields}
-    names = [*chosen] or ["x", "y", "z", *[name for name in _INTENSITY if name in fields][:1]]
+    intensity = find_intensity(fields)
+    names = [*chosen] or ["x", "y", "z", *([intensity] if intensity else [])]
     order = ">" if message.is_bigendian else "<"
     try:
         kind = np.dtype(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,21 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.files import checked_model
-from calibgraph.io.bags.camera_info import CameraLens, lens_of
-from calibgraph.io.bags.messages import Bag
+from calibgraph.io.bags.camera_info import CameraLens, lens_of, stated_baseline
+from calibgraph.io.bags.messages import CAMERA_INFO, Bag, Drive
 from calibgraph.io.bags.options import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
-from calibgraph.io.bags.transforms import Tree, static_tree, transform_between
-from calibgraph.model.geometry import relative_transform
+from calibgraph.io.bags.transforms import Transforms
+from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Camera, RelativePose, Rig
 
 Array = NDArray[np.float64]
 
 _UPWARD = 0.9
 """Vertical part of a camera's axis (64 deg), beyond which it looks up: z is up in body axes."""
+_LEAST_BASELINE_M = 1e-3
+_AT_ONE_PLACE = 0.05
+"""Of a stated baseline: frames of /tf_static that are nearer to each other leave it out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,22 +36,73 @@ class BagCamera:
 
     Attributes:
         lens: from its CameraInfo.
-        T_camera_lidar: (4, 4); None if /tf_static does not connect it with the LiDAR.
+        T_camera_lidar: (4, 4); None if no static transforms connect it with the LiDAR.
+        frame_id: of its image, if the frame has the image's axes and origin.
         where: its CameraInfo, for errors.
     """
 
     lens: CameraLens
     T_camera_lidar: Array | None
+    frame_id: str | None
     where: str
 
 
 @dataclass(frozen=True, eq=False)
 class BagRig:
-    """The LiDAR's frame, the cameras by name, and all frames of /tf_static."""
+    """What a bag holds about its rig; extrinsics may be missing.
 
+    Attributes:
+        path: of the bag.
+        lidar: the LiDAR's frame.
+        cameras: by name.
+        transforms: of the bag and those beside it.
+        notes: what was left out, added or taken from elsewhere, a line each.
+    """
+
+    path: Path
     lidar: str
     cameras: Mapping[str, BagCamera]
-    frames: tuple[str, ...]
+    transforms: Transforms
+    notes: tuple[str, ...]
+
+    def to_rig(self, relative_sigmas: tuple[float, float] | None = None) -> Rig:
+        """The rig; arguments as of :func:`rig_of_bag`.
+
+        Raises:
+            DatasetError: if an extrinsic is missing.
+            FileError: if a value is no camera's.
+        """
+        cameras = {
+            name: checked_model(Camera, self._content(name), camera.where)
+            for name, camera in self.cameras.items()
+        }
+        content = {
+            "lidar": self.lidar,
+            "cameras": cameras,
+            "relative_poses": _relative_poses(cameras, relative_sigmas),
+        }
+        return checked_model(Rig, content, self.path)
+
+    def _content(self, name: str) -> dict[str, Any]:
+        """The fields of a Camera.
+
+        Raises:
+            DatasetError: if the extrinsic is missing.
+        """
+        camera = self.cameras[name]
+        if camera.T_camera_lidar is None:
+            frame = camera.lens.frame
+            raise DatasetError(
+                f"{camera.where}: no static transforms connect the LiDAR's frame {self.lidar!r} "
+                f"with the frame {frame!r} of camera {name!r}: "
+                f"{self.transforms.why_apart(frame, self.lidar)}. If another bag of the drive has "
+                "them, give it too, or write `calibgraph bag OTHER_BAG --out rig.yaml`; else "
+                "describe the mounting to calibgraph guess, or import the bag with a URDF; then "
+                "give the rig (--rig)",
+                camera=name,
+            )
+        extrinsic = {"frame_id": camera.frame_id, "T_camera_lidar": camera.T_camera_lidar}
+        return {**camera.lens.content, **extrinsic}
 
 
 def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
@@ -55,20 +110,25 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
 
     Args:
         path: the bag.
-        options: which topics; those found by type if None.
+        options: which topics, those found by type if None; and the bags beside it.
 
     Raises:
         FileError, DatasetError: if the bag is damaged, or a topic or a lens is missing.
     """
+    options = options or BagOptions()
     bag = Bag(path)
-    chosen = choose_topics(bag, (options or BagOptions()).topics)
+    drive = Drive(bag, options.beside)
+    chosen = choose_topics(bag, options.topics, drive=drive)
     lidar = bag.first(chosen.lidar).header.frame_id.lstrip("/")
-    tree = static_tree(bag)
+    reader = _CameraReader(drive, lidar)
+    cameras = {name: reader.read(name, topics) for name, topics in chosen.cameras.items()}
+    counts = Counter([lidar, *(camera.frame_id for camera in cameras.values())])
     cameras = {
-        name: _read_camera(bag, name, topics, tree, lidar)
-        for name, topics in chosen.cameras.items()
+        name: camera if counts[camera.frame_id] == 1 else replace(camera, frame_id=None)
+        for name, camera in cameras.items()
     }
-    return BagRig(lidar, cameras, tuple(sorted(tree)))
+    notes = (*reader.transforms.notes, *reader.notes)
+    return BagRig(path, lidar, cameras, reader.transforms, notes)
 
 
 def rig_of_bag(
@@ -92,17 +152,7 @@ def rig_of_bag(
     Raises:
         FileError, DatasetError: if the bag is damaged, or a topic, a lens or a transform missing.
     """
-    read = read_bag_rig(Path(path), options)
-    cameras = {
-        name: checked_model(Camera, _content(name, camera, read), camera.where)
-        for name, camera in read.cameras.items()
-    }
-    content = {
-        "lidar": read.lidar,
-        "cameras": cameras,
-        "relative_poses": _relative_poses(cameras, relative_sigmas),
-    }
-    return checked_model(Rig, content, path)
+    return read_bag_rig(Path(path), options).to_rig(relative_sigmas)
 
 
 def doubtful_axes(rig: Rig) -> list[str]:
@@ -114,37 +164,70 @@ def doubtful_axes(rig: Rig) -> list[str]:
     ]
 
 
-def _read_camera(bag: Bag, name: str, topics: CameraTopics, tree: Tree, lidar: str) -> BagCamera:
-    if topics.info is None:
-        raise DatasetError(
-            f"{bag.path}: {topics.image} has no camera_info beside it; give a rig with the lens of "
-            f"camera {name!r} (--rig)",
-            camera=name,
-        )
-    where = f"{bag.path}: {topics.info}"
-    lens = lens_of(bag.first(topics.info), where, rectified=topics.rectified)
-    T_frame_lidar = transform_between(tree, lens.frame, lidar)
-    T_image_frame = np.eye(4)
-    T_image_frame[:3, :3] = lens.R_image_frame
-    T_camera_lidar = None if T_frame_lidar is None else T_image_frame @ T_frame_lidar
-    return BagCamera(lens, T_camera_lidar, where)
+class _CameraReader:
+    """Reads the cameras of a bag of a drive."""
 
+    def __init__(self, drive: Drive, lidar: str) -> None:
+        self._drive, self._lidar = drive, lidar
+        self.transforms = Transforms(drive)
+        self.notes: list[str] = []
 
-def _content(name: str, camera: BagCamera, read: BagRig) -> dict[str, Any]:
-    """The fields of a Camera.
+    def read(self, name: str, topics: CameraTopics) -> BagCamera:
+        """A camera; its extrinsic may be missing.
 
-    Raises:
-        DatasetError: if the extrinsic is missing.
-    """
-    if camera.T_camera_lidar is None:
-        raise DatasetError(
-            f"{camera.where}: /tf_static does not connect the LiDAR's frame {read.lidar!r} with "
-            f"the frame {camera.lens.frame!r} of camera {name!r}; its frames are "
-            f"{', '.join(read.frames) or 'none'}: describe its mounting to calibgraph guess, give "
-            "a rig with the guess (--rig), or import the bag together with a URDF",
-            camera=name,
-        )
-    return {**camera.lens.content, "T_camera_lidar": camera.T_camera_lidar}
+        Raises:
+            DatasetError: if it has no CameraInfo.
+            FileError: if it is not calibrated.
+        """
+        if topics.info is None:
+            raise DatasetError(
+                f"{self._drive.bag.path}: {topics.image} has no camera_info beside it; give a rig "
+                f"with the lens of camera {name!r} (--rig)",
+                camera=name,
+            )
+        bag = next(bag for bag in self._drive if bag.has(topics.info))
+        if bag is not self._drive.bag:
+            self.notes.append(f"{self._drive.bag.path}: {topics.info} is that of {bag.path}")
+        where = f"{bag.path}: {topics.info}"
+        lens = lens_of(bag.first(topics.info), where, rectified=topics.rectified)
+        with_baseline = self._counts_baseline(name, lens, bag, topics.info)
+        T_frame_lidar = self.transforms.between(lens.frame, self._lidar)
+        T_image_frame = lens.T_image_frame(with_baseline=with_baseline)
+        T_camera_lidar = None if T_frame_lidar is None else T_image_frame @ T_frame_lidar
+        if lens.is_turned and not with_baseline:
+            self.notes.append(
+                f"{name}: its images are rectified, and turned by "
+                f"{angle_deg(lens.R_image_frame):.2g} deg against frame {lens.frame!r}; an export "
+                "has a frame of their own"
+            )
+        frame_id = None if lens.is_turned or with_baseline else lens.frame or None
+        return BagCamera(lens, T_camera_lidar, frame_id, where)
+
+    def _counts_baseline(self, name: str, lens: CameraLens, bag: Bag, info: str) -> bool:
+        """Whether the frame of a second camera is at the place of the first, not at its own."""
+        length_m = float(np.linalg.norm(lens.baseline_m))
+        if length_m < _LEAST_BASELINE_M:
+            return False
+        first = self._first_of_pair(lens.frame, length_m, bag, info)
+        stated = f"{name}: P of its camera_info states a baseline of {length_m:.3f} m"
+        if first is None:
+            self.notes.append(f"{stated}; frame {lens.frame!r} is its own, so it is not added")
+        else:
+            self.notes.append(
+                f"{stated}; it is added, as frame {lens.frame!r} is at that of {first}"
+            )
+        return first is not None
+
+    def _first_of_pair(self, frame: str, length_m: float, bag: Bag, info: str) -> str | None:
+        """The CameraInfo without a baseline whose frame is at the place of this one."""
+        for topic in bag.of_type(CAMERA_INFO):
+            message = bag.first(topic.name) if topic.name != info else None
+            if message is None or np.linalg.norm(stated_baseline(message)) >= _LEAST_BASELINE_M:
+                continue
+            T = self.transforms.between(frame, message.header.frame_id.lstrip("/"))
+            if T is not None and np.linalg.norm(T[:3, 3]) < _AT_ONE_PLACE * length_m:
+                return topic.name
+        return None
 
 
 def _relative_poses(

@@ -41,7 +41,10 @@ class RigTopics:
 
 
 def choose_topics(
-    bag: Bag, named: Mapping[str, str], cameras: Sequence[str] | None = None
+    bag: Bag,
+    named: Mapping[str, str],
+    cameras: Sequence[str] | None = None,
+    drive: Iterable[Bag] | None = None,
 ) -> RigTopics:
     """The topics of the LiDAR and the cameras.
 
@@ -49,6 +52,7 @@ def choose_topics(
         bag: the bag.
         named: the topic of ``lidar`` and those of cameras, where they are not left to be found.
         cameras: names that are wanted; those named, or if none is all that have a CameraInfo.
+        drive: the bag, and others whose CameraInfo serve where it has none; the bag alone if None.
 
     Raises:
         DatasetError: if a topic is missing, or there are several to choose from.
@@ -60,18 +64,34 @@ def choose_topics(
     wanted = list(chosen) if cameras is None else list(cameras)
     for name in set(chosen) - set(wanted):
         raise DatasetError(f"--topic {name}: the rig has no such camera, but {', '.join(wanted)}")
-    found = _found_cameras(bag, calibrated=True)
+    infos = _Infos(drive or [bag])
+    found = _found_cameras(bag, infos)
     names = wanted or list(found)
     if set(names) - set(found):  # the rig has the lenses, the bag need not
-        found = {**_found_cameras(bag, calibrated=False), **found}
+        found = {**_found_cameras(bag, None), **found}
     if not names:
-        raise DatasetError(
-            f"{bag.path}: has no image topic with a camera_info beside it; {_listed(bag)}: give a "
-            "rig with the lenses (--rig)"
-        )
+        raise DatasetError(f"{bag.path}: {_why_no_camera(bag, infos)}")
+    images = {name: chosen.get(name) or found.get(name) for name in names}
     return RigTopics(
         lidar=named.get(LIDAR) or _lidar_topic(bag),
-        cameras={name: _camera(bag, name, chosen.get(name) or found.get(name)) for name in names},
+        cameras={name: _camera(bag, name, topic, infos) for name, topic in images.items()},
+    )
+
+
+def _why_no_camera(bag: Bag, infos: _Infos) -> str:
+    """Why no image topic is that of a camera, and what to do."""
+    for topic in _image_topics(bag):
+        if infos.beside(topic):  # so it is depth, by its encoding
+            message = bag.first(topic)
+            encoding = getattr(message, "encoding", None) or message.format
+            name = _short_names([_namespace(topic)])[_namespace(topic)]
+            return (
+                f"{topic} is {encoding}, which is taken for depth; if it is the image of a camera, "
+                f"name it by --topic {name}={topic}"
+            )
+    return (
+        f"has no image topic with a camera_info beside it; {_listed(bag)}: give a rig with the "
+        "lenses (--rig)"
     )
 
 
@@ -86,27 +106,26 @@ def _lidar_topic(bag: Bag) -> str:
     raise DatasetError(f"{bag.path}: {what} the LiDAR's by --topic lidar=/TOPIC")
 
 
-def _camera(bag: Bag, name: str, topic: str | None) -> CameraTopics:
+def _camera(bag: Bag, name: str, topic: str | None, infos: _Infos) -> CameraTopics:
     if topic is None:
         raise DatasetError(
             f"{bag.path}: which topic has the images of camera {name!r}? {_listed(bag)}: name it "
             f"by --topic {name}=/TOPIC",
             camera=name,
         )
-    return CameraTopics(topic, _info_topic(bag, topic))
+    return CameraTopics(topic, infos.beside(topic))
 
 
-def _found_cameras(bag: Bag, *, calibrated: bool) -> dict[str, str]:
+def _found_cameras(bag: Bag, infos: _Infos | None) -> dict[str, str]:
     """The best image topic of each camera, by the camera's name.
 
     Args:
         bag: the bag.
-        calibrated: leave out those without a CameraInfo.
+        infos: leave out those without a CameraInfo of these.
     """
     best: dict[str, str] = {}
-    topics = [each.name for each in bag.of_type(IMAGE, COMPRESSED_IMAGE)]
-    for topic in sorted(topics, key=_rank):
-        if _namespace(topic) in best or (calibrated and _info_topic(bag, topic) is None):
+    for topic in _image_topics(bag):
+        if _namespace(topic) in best or (infos and infos.beside(topic) is None):
             continue
         if not is_depth(bag.first(topic)):
             best[_namespace(topic)] = topic
@@ -114,12 +133,25 @@ def _found_cameras(bag: Bag, *, calibrated: bool) -> dict[str, str]:
     return {names[namespace]: best[namespace] for namespace in sorted(best)}
 
 
-def _info_topic(bag: Bag, image: str) -> str | None:
-    """The CameraInfo beside an image topic, by ROS's convention in the same namespace."""
-    places = (_namespace(image), _base(image))
-    infos = [each.name for each in bag.of_type(CAMERA_INFO)]
-    beside = [info for info in infos if info.rsplit("/", 1)[0] in places]
-    return beside[0] if beside else None
+def _image_topics(bag: Bag) -> list[str]:
+    """Those of images, the best first."""
+    return sorted((each.name for each in bag.of_type(IMAGE, COMPRESSED_IMAGE)), key=_rank)
+
+
+class _Infos:
+    """The CameraInfo topics of some bags."""
+
+    def __init__(self, bags: Iterable[Bag]) -> None:
+        self._bags = bags
+
+    def beside(self, image: str) -> str | None:
+        """That beside an image topic, by ROS's convention in the same namespace."""
+        places = (_namespace(image), _base(image))
+        for bag in self._bags:
+            for info in bag.of_type(CAMERA_INFO):
+                if info.name.rsplit("/", 1)[0] in places:
+                    return info.name
+        return None
 
 
 def _base(topic: str) -> str:
@@ -152,5 +184,6 @@ def _listed(bag: Bag) -> str:
     """The topics of images and clouds, for errors."""
     found = bag.of_type(IMAGE, COMPRESSED_IMAGE, *CLOUDS)
     if not found:
-        return "it has neither images nor PointCloud2"
+        types = Counter(each.type for each in bag.topics.values())
+        return f"it has neither images nor PointCloud2, but {', '.join(sorted(types)) or 'nothing'}"
     return "it has " + ", ".join(f"{each.name} ({each.count})" for each in found)

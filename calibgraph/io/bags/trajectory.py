@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +12,23 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags.frames import BagFrame
-from calibgraph.io.bags.messages import TRANSFORMS, Bag, read_message
+from calibgraph.io.bags.messages import Bag, Drive, read_message
 from calibgraph.io.bags.options import ODOMETRY, BagOptions
 from calibgraph.io.bags.point_clouds import points_of
-from calibgraph.io.bags.transforms import matrix_of, static_tree, transform_between
+from calibgraph.io.bags.transforms import (
+    MOVING,
+    Transforms,
+    pose_matrix,
+    stamp_ns_of,
+    stamped_transforms,
+    values_of,
+)
 from calibgraph.io.motion import ScanMotion, twist_between
 
 Array = NDArray[np.float64]
 MotionOf = Callable[[BagFrame], ScanMotion]
 
-_ODOMETRY_TYPE, _MOVING_TOPIC = "nav_msgs/msg/Odometry", "tf"
+_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _HALF_S = 0.05  # half a turn of a LiDAR at 10 Hz: the velocity is the mean of a scan
 _GAP_S = 0.5
 """Poses farther apart are not interpolated: at 2 m/s^2 the mean is off by 0.25 m/s, 1 cm a scan."""
@@ -176,33 +182,33 @@ def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, 
             f"{bag.path}: has {len(found)} topics of Odometry ({', '.join(found) or 'none'}); name "
             f"one by --topic {ODOMETRY}=/TOPIC, or use --motion tf or scans"
         )
-    tree = static_tree(bag)
-    for message in bag.messages([named or found[0]]):
-        child = message.content.child_frame_id.lstrip("/")
-        T_child_lidar = transform_between(tree, child, lidar)
+    topic, transforms, count = named or found[0], Transforms(Drive(bag, options.beside)), 0
+    for message in bag.messages([topic]):
+        child, pose = message.content.child_frame_id.lstrip("/"), message.content.pose.pose
+        T_child_lidar = transforms.between(child, lidar)
         if T_child_lidar is None:
             raise DatasetError(
-                f"{bag.path}: /tf_static does not connect the LiDAR's frame {lidar!r} with "
-                f"{child!r} of the odometry; use --motion scans"
+                f"{bag.path}: no static transforms connect the LiDAR's frame {lidar!r} with "
+                f"{child!r} of {topic}: {transforms.why_apart(child, lidar)}; use --motion scans"
             )
-        pose = message.content.pose.pose
-        T_world_child = matrix_of(pose.position, pose.orientation)
-        yield _stamp_ns(message.content), T_world_child @ T_child_lidar
+        T_world_child = pose_matrix(*values_of(pose.position, pose.orientation))
+        if T_world_child is not None:
+            count += 1
+            yield stamp_ns_of(message.content), T_world_child @ T_child_lidar
+    if not count:
+        raise DatasetError(
+            f"{bag.path}: no message of {topic} has a pose: their quaternions are 0 0 0 0, or not "
+            "finite; use --motion tf or scans"
+        )
 
 
-def _moving_transforms(bag: Bag, lidar: str, _: BagOptions) -> Iterator[tuple[int, Array]]:
+def _moving_transforms(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
     """Stamps and T_parent_lidar of the /tf transforms of a frame that the LiDAR hangs from."""
-    tree = static_tree(bag)
-    topics = [t.name for t in bag.of_type(TRANSFORMS) if t.name.split("/")[-1] == _MOVING_TOPIC]
-    for message in bag.messages(topics):
-        for each in message.content.transforms:
-            child = each.child_frame_id.lstrip("/")
-            T_child_lidar = transform_between(tree, child, lidar)
+    transforms = Transforms(Drive(bag, options.beside))
+    for each in stamped_transforms(bag, MOVING):
+        if not transforms.moving:  # the vehicle stands
+            yield each.stamp_ns, np.eye(4)
+        elif each.child in transforms.moving and each.T_parent_child is not None:
+            T_child_lidar = transforms.between(each.child, lidar)
             if T_child_lidar is not None:
-                T = matrix_of(each.transform.translation, each.transform.rotation)
-                yield _stamp_ns(each), T @ T_child_lidar
-
-
-def _stamp_ns(stamped: Any) -> int:
-    stamp = stamped.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+                yield each.stamp_ns, each.T_parent_child @ T_child_lidar

@@ -1,4 +1,4 @@
-"""The static transforms of a bag, as a graph of frames.
+"""The static transforms of a drive, as a graph of frames.
 
 A TransformStamped maps the child's coordinates to the parent's: p_parent = T_parent_child p_child,
 with the parent in ``header.frame_id``.
@@ -6,40 +6,180 @@ with the parent in ``header.frame_id``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.io.bags.messages import TRANSFORMS, Bag
+from calibgraph.io.bags.messages import TREES, Bag, Drive
 from calibgraph.model.geometry import invert
 
 Array = NDArray[np.float64]
-Tree = Mapping[str, tuple[str, Array]]
-"""Per child frame its parent and the (4, 4) T_parent_child."""
 
-_STATIC_TOPIC = "tf_static"
+STATIC, MOVING = "tf_static", "tf"
+_LEAST_LENGTH = 1e-6  # of a quaternion that is one
+_SAME = 1e-6  # of the entries of a transform that does not change
 
 
-def static_tree(bag: Bag) -> Tree:
-    """The static transforms of a bag; of several for one child, the last, as tf does."""
-    names = [t.name for t in bag.of_type(TRANSFORMS) if t.name.split("/")[-1] == _STATIC_TOPIC]
-    tree: dict[str, tuple[str, Array]] = {}
-    for message in bag.messages(names):
-        for stamped in message.content.transforms:
-            child, parent = stamped.child_frame_id, stamped.header.frame_id
-            tree[child.lstrip("/")] = (
-                parent.lstrip("/"),
-                matrix_of(stamped.transform.translation, stamped.transform.rotation),
-            )
+class Link(NamedTuple):
+    """A frame's parent and (4, 4) T_parent_child; where it is from, if not from the own bag."""
+
+    parent: str
+    T_parent_child: Array
+    source: str = ""
+
+
+@dataclass
+class _Tree:
+    """Links by child frame; and by child frame, why a transform was left out."""
+
+    links: dict[str, Link] = field(default_factory=dict)
+    invalid: dict[str, str] = field(default_factory=dict)
+    moving: set[str] = field(default_factory=set)
+
+    def widened(self, others: Sequence[_Tree]) -> _Tree:
+        """With what others have of frames that are missing here; of several, the first counts."""
+        trees = [self, *others]
+        links = {child: link for tree in reversed(trees) for child, link in tree.links.items()}
+        invalid = {child: why for tree in reversed(trees) for child, why in tree.invalid.items()}
+        return _Tree(links, invalid, set().union(*(tree.moving for tree in trees)))
+
+
+class Transforms:
+    """The static transforms of a bag.
+
+    Where they do not connect two frames, those of other bags of the drive serve, and then those on
+    /tf that never change, as ROS 1 may have them.
+
+    Args:
+        drive: the bag, whose transforms count first, and others.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._static: list[_Tree] = []
+        self._used: dict[str, set[str]] = {}
+
+    def _trees(self) -> Iterator[_Tree]:
+        """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
+        for number, bag in enumerate(self._drive):
+            if number == 0 and not self._static:
+                self._static.append(_static_tree(bag))
+            elif number == len(self._static):
+                other = _static_tree(bag, f"/{STATIC} of {bag.path}")
+                self._static.append(self._static[-1].widened([other]))
+            yield self._static[number]
+        yield self._unchanging
+
+    @cached_property
+    def _unchanging(self) -> _Tree:
+        *_, static = self._static
+        return static.widened([_unchanging_tree(bag) for bag in self._drive])
+
+    def between(self, target: str, source: str) -> Array | None:
+        """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
+        for tree in self._trees():
+            T_target_source = _between(tree.links, target, source)
+            if T_target_source is not None:
+                ways = (_ancestors(tree.links, frame).keys() for frame in (target, source))
+                for frame in set.__xor__(*map(set, ways)):
+                    self._used.setdefault(tree.links[frame].source, set()).add(frame)
+                return T_target_source
+        return None
+
+    @property
+    def moving(self) -> set[str]:
+        """The frames on /tf that move against their parents."""
+        *_, widest = self._trees()
+        return widest.moving
+
+    @property
+    def notes(self) -> list[str]:
+        """A line for each transform that was left out, and each source beside /tf_static."""
+        left_out = [f"{why}; it is left out" for why in next(self._trees()).invalid.values()]
+        used = [
+            f"{self._drive.bag.path}: the transforms of {_listed(frames)} are from {source}"
+            for source, frames in self._used.items()
+            if source
+        ]
+        return [*left_out, *used]
+
+    def why_apart(self, *frames: str) -> str:
+        """Why frames are not connected, and which frames there are."""
+        *_, tree = self._trees()
+        for frame in frames:
+            *_, top = _ancestors(tree.links, frame)
+            if top in tree.invalid:
+                return f"{tree.invalid[top]}, and {frame!r} hangs by it"
+        moving = f"; {_listed(tree.moving)} move on /{MOVING}" if tree.moving else ""
+        return f"its frames are {_listed({*tree.links})}{moving}"
+
+
+def _listed(frames: set[str]) -> str:
+    return ", ".join(sorted(frames)) or "none"
+
+
+def _static_tree(bag: Bag, source: str = "") -> _Tree:
+    """Of several transforms for one child, the last that is one counts, as in tf."""
+    tree = _Tree()
+    for each in stamped_transforms(bag, STATIC):
+        if each.T_parent_child is None:
+            tree.invalid[each.child] = each.text
+        else:
+            tree.links[each.child] = Link(each.parent, each.T_parent_child, source)
     return tree
 
 
-def transform_between(tree: Tree, target: str, source: str) -> Array | None:
+def _unchanging_tree(bag: Bag) -> _Tree:
+    """The transforms on /tf that are the same in all messages; the frames that are not."""
+    tree = _Tree()
+    source = f"/{MOVING} of {bag.path}, on which they never change"
+    for each in stamped_transforms(bag, MOVING):
+        if each.T_parent_child is None:
+            tree.invalid[each.child] = each.text
+            continue
+        first = tree.links.setdefault(each.child, Link(each.parent, each.T_parent_child, source))
+        change = np.abs(each.T_parent_child - first.T_parent_child).max()
+        if each.parent != first.parent or change > _SAME:
+            tree.moving.add(each.child)
+    for child in tree.moving:
+        del tree.links[child]
+    return tree
+
+
+class StampedTransform(NamedTuple):
+    """A TransformStamped; (4, 4) T_parent_child is None, and the text why, if it is none."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    T_parent_child: Array | None
+    text: str
+
+
+def stamped_transforms(bag: Bag, name: str) -> Iterator[StampedTransform]:
+    """The transforms on all topics of a bag with this last name."""
+    topics = [each.name for each in bag.of_type(*TREES) if each.name.split("/")[-1] == name]
+    for message in bag.messages(topics):
+        for each in message.content.transforms:
+            child = each.child_frame_id.lstrip("/")
+            shift, turn = values_of(each.transform.translation, each.transform.rotation)
+            T = pose_matrix(shift, turn)
+            text = "" if T is not None else (
+                f"{bag.path}: the transform of frame {child!r} on {message.topic} has the "
+                f"translation {shift} and the quaternion {turn}"
+            )  # fmt: skip
+            parent = each.header.frame_id.lstrip("/")
+            yield StampedTransform(parent, child, stamp_ns_of(each), T, text)
+
+
+def _between(links: Mapping[str, Link], target: str, source: str) -> Array | None:
     """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
-    above_target, above_source = _ancestors(tree, target), _ancestors(tree, source)
+    above_target, above_source = _ancestors(links, target), _ancestors(links, source)
     for frame, T_frame_target in above_target.items():
         if frame in above_source:
             T_target_source: Array = invert(T_frame_target) @ above_source[frame]
@@ -47,20 +187,34 @@ def transform_between(tree: Tree, target: str, source: str) -> Array | None:
     return None
 
 
-def _ancestors(tree: Tree, frame: str) -> dict[str, Array]:
+def _ancestors(links: Mapping[str, Link], frame: str) -> dict[str, Array]:
     """(4, 4) T_ancestor_frame of the frame itself and all above it, nearest first."""
     found, T = {frame: np.eye(4)}, np.eye(4)
     above = frame
-    while above in tree and tree[above][0] not in found:
-        above, T_parent_child = tree[above]
+    while above in links and links[above].parent not in found:
+        above, T_parent_child, _ = links[above]
         T = T_parent_child @ T
         found[above] = T
     return found
 
 
-def matrix_of(shift: Any, turn: Any) -> Array:
-    """(4, 4) of a geometry_msgs Vector3 or Point, and a Quaternion."""
+def values_of(shift: Any, turn: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The numbers of a geometry_msgs Vector3 or Point, and of a Quaternion: x y z w."""
+    return (shift.x, shift.y, shift.z), (turn.x, turn.y, turn.z, turn.w)
+
+
+def pose_matrix(shift: Sequence[float], turn: Sequence[float]) -> Array | None:
+    """(4, 4) of a translation and a quaternion x y z w; None if they are none: 0 0 0 0, or NaN."""
+    length = float(np.linalg.norm(turn))
+    if not (np.isfinite([*shift, length]).all() and length > _LEAST_LENGTH):
+        return None
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    T[:3, 3] = shift.x, shift.y, shift.z
+    T[:3, :3] = Rotation.from_quat(turn).as_matrix()
+    T[:3, 3] = shift
     return T
+
+
+def stamp_ns_of(stamped: Any) -> int:
+    """The stamp of a message's header in nanoseconds."""
+    stamp = stamped.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

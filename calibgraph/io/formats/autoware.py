@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
@@ -18,15 +19,15 @@ from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.rig import Finite
 
-_BASE = "sensor_kit_base_link"
+_BASE, _OPTICAL_LINK = "sensor_kit_base_link", "/camera_optical_link"
 
 
 def write_autoware(export: RigExport) -> str:
     """The LiDAR and the ``camera_link`` of each camera under sensor_kit_base_link."""
     T_base_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
     poses = {export.lidar_frame: T_base_lidar} | {
-        f"{frame_id(name)}/camera_link": export.T_base_camera(name) @ T_OPTICAL_LINK
-        for name in export.cameras
+        _link_id(name, frame): export.T_base_camera(name) @ T_OPTICAL_LINK
+        for name, frame in export.optical_frames.items()
     }
     place = (
         f"{_BASE} is put at the LiDAR, as no --lidar-pose was given: take the differences only"
@@ -40,6 +41,12 @@ def write_autoware(export: RigExport) -> str:
         place,
     )
     return commented_yaml(statement, {_BASE: {name: _angles(T) for name, T in poses.items()}})
+
+
+def _link_id(name: str, optical: str) -> str:
+    """The camera_link above an optical frame that is named as Autoware's; else by the camera."""
+    above = optical.removesuffix(_OPTICAL_LINK)
+    return f"{above if above != optical else frame_id(name)}/camera_link"
 
 
 def _angles(T: NDArray[np.float64]) -> dict[str, float]:
@@ -80,5 +87,8 @@ def read_autoware(content: dict[str, Any], path: Path) -> Part:
 
 def _link(parent: str, child: str, pose: Any, path: Path) -> FrameLink:
     p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
-    T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+    try:
+        T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+    except ValueError as error:
+        raise FileError(path, f"{parent}: {child}: {error}") from error
     return FrameLink(parent, child, T)

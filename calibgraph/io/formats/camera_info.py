@@ -1,58 +1,70 @@
-"""ROS camera_info YAML, as camera_calibration writes it: one lens, no extrinsic."""
+"""A CameraInfo message as ``ros2 topic echo`` and ``rostopic echo`` print it."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Annotated, Any
+
+from pydantic import AliasChoices, Field
 
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.lenses import CameraLens, lens_model, listed_coefficients
+from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.formats.part import Part
-from calibgraph.model.rig import Finite, Positive, Size
+from calibgraph.io.lenses import CameraLens
+from calibgraph.model.rig import Finite, Intrinsics, Size
 
-_Nine = tuple[
-    Positive, Finite, Finite, Finite, Positive, Finite, Finite, Finite, Finite
-]  # fmt: skip
-
-
-class _Matrix(StrictNumbers):
-    data: _Nine
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-class _Coefficients(StrictNumbers):
-    data: tuple[Finite, ...] = ()
+def _list_of(name: str, length: int | None) -> Any:
+    """A list of numbers under its name in ROS 1 or 2."""
+    return Field(validation_alias=AliasChoices(name, name.lower()), min_length=length or 0,
+                 max_length=length)  # fmt: skip
 
 
-class _CameraInfo(StrictNumbers):
-    image_width: Size
-    image_height: Size
-    camera_name: str = ""
-    camera_matrix: _Matrix
+class _Header(StrictNumbers):
+    frame_id: str = ""
+
+
+class _Window(StrictNumbers):
+    x_offset: _Count = 0
+    y_offset: _Count = 0
+    height: _Count = 0
+    width: _Count = 0
+
+
+class _Message(StrictNumbers):
+    header: _Header = _Header()
+    height: Size
+    width: Size
     distortion_model: str
-    distortion_coefficients: _Coefficients = _Coefficients()
+    D: Annotated[list[Finite], _list_of("D", None)]
+    K: Annotated[list[Finite], _list_of("K", 9)]
+    R: Annotated[list[Finite], _list_of("R", 9)]
+    P: Annotated[list[Finite], _list_of("P", 12)]
+    binning_x: _Count = 0
+    binning_y: _Count = 0
+    roi: _Window = _Window()
 
 
 def is_camera_info(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is a camera_info."""
-    return "camera_matrix" in content and "image_width" in content
+    """Whether the content of a YAML file is a CameraInfo message."""
+    return {"height", "width", "distortion_model"} <= content.keys() and (
+        {"K", "D", "P"} <= content.keys() or {"k", "d", "p"} <= content.keys()
+    )
 
 
 def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens of the images as recorded (K and D, not the rectified P).
-
-    Args:
-        content: of the file.
-        path: of the file.
-        name: of the camera, instead of the file's ``camera_name``, or its stem if it has none.
+    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame.
 
     Raises:
         FileError: if it is malformed, or the lens is none of ours.
     """
-    info = checked_model(_CameraInfo, content, path)
-    fx, _, cx, _, fy, cy, *_ = info.camera_matrix.data
-    model = lens_model(info.distortion_model, path)
-    coefficients = listed_coefficients(info.distortion_coefficients.data, model, path)
-    size = (info.image_width, info.image_height)
-    lens = CameraLens(model, size, (fx, fy, cx, cy), coefficients)
-    given = info.camera_name.strip("/").replace("/", "_")  # narrow_stereo/left: no folder's name
-    return Part(path, lenses={name or given or path.stem: lens})
+    message = checked_model(_Message, content, path)
+    lens = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
+    size = (lens.content["width_px"], lens.content["height_px"])
+    intrinsics = checked_model(Intrinsics, lens.content["intrinsics_px"], path)
+    camera = name or path.stem
+    found = CameraLens(lens.content["model"], size, intrinsics, tuple(lens.content["distortion"]))
+    return Part(path, {camera: found}, frame_ids={camera: lens.frame} if lens.frame else {})

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
-from calibgraph.io.formats.lenses import CameraLens, fitted_coefficients
 from calibgraph.io.formats.part import Part
+from calibgraph.io.lenses import CameraLens, fitted_coefficients, listed_intrinsics
 from factors import LensModel
 
 _HALF_PIXEL = 0.5
@@ -39,6 +39,13 @@ _MODELS: dict[
     "RADIAL_FISHEYE": (5, "fisheye", _one_focal, 3),
 }
 """Per model: number of parameters, model here, its focal lengths and centre, their number."""
+
+
+def is_colmap(text: str) -> bool:
+    """Whether the first line that is no comment begins as COLMAP's: a number and a model."""
+    lines = (line.split() for line in text.splitlines() if not line.lstrip().startswith("#"))
+    words = next((line for line in lines if line), [""])
+    return words[0].isdecimal() and len(words) > 1 and words[1][0].isalpha()
 
 
 def read_colmap(path: Path) -> Part:
@@ -73,6 +80,6 @@ def _lens(words: list[str], path: Path, number: int) -> tuple[str, CameraLens]:
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise FileError(path, f"{where}: {name} has {count} parameters, found {words[_FIELDS:]}")
     fx, fy, cx, cy = intrinsics(values)
-    shifted = (fx, fy, cx - _HALF_PIXEL, cy - _HALF_PIXEL)
+    shifted = listed_intrinsics((fx, fy, cx - _HALF_PIXEL, cy - _HALF_PIXEL), f"{path}: {where}")
     coefficients = fitted_coefficients(values[start:], model, path)
     return f"camera_{identity}", CameraLens(model, (width, height), shifted, coefficients)

@@ -19,7 +19,7 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.formats.nuscenes import write_nuscenes
 from calibgraph.io.formats.opencv_yaml import write_opencv
 from calibgraph.io.formats.plain import write_json, write_npz
-from calibgraph.io.formats.rig_export import CAMERA_FRAME, Array, RigExport, prepare_export
+from calibgraph.io.formats.rig_export import Array, RigExport, prepare_export
 from calibgraph.io.formats.ros_transforms import (
     write_ros1,
     write_ros2,
@@ -61,7 +61,7 @@ def export_calibration(
     *,
     cameras: Iterable[str] | None = None,
     lidar_frame: str | None = None,
-    camera_frame: str = CAMERA_FRAME,
+    camera_frame: str | None = None,
     T_base_lidar: Array | None = None,
     even_if_failed: bool = False,
 ) -> tuple[Path, ...]:
@@ -73,7 +73,8 @@ def export_calibration(
         format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
         cameras: names of those to write; all if None.
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
-        camera_frame: id of optical frames, with ``{camera}`` for the camera's name.
+        camera_frame: id of optical frames, with ``{camera}`` for the camera's name; that of the
+            rig, as its bag names it, or ``{camera}_optical_frame`` if None.
         T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware) or ego
             (nuscenes); the identity if None.
         even_if_failed: whether to write cameras whose verdict is FAIL.

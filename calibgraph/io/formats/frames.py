@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.formats.part import FrameLink
+from calibgraph.io.formats.part import IMU, FrameLink
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert
 
@@ -94,3 +94,18 @@ def find_camera_frame(tree: FrameTree, camera: str, chosen: Mapping[str, str]) -
         return chosen[camera]
     names = (pattern.format(frame_id(camera)) for pattern in _CAMERA_FRAMES)
     return next((name for name in names if name in tree.names), None)
+
+
+NO_LIDAR_IN_IMU = (
+    "poses of cameras in the IMU are not used, as no file has the LiDAR in the IMU (extrinsic_R, "
+    "extrinsic_T); write --lidar-frame imu if the two frames are one"
+)
+
+
+def tied_links(links: Sequence[FrameLink], lidar_frame: str | None) -> Sequence[FrameLink]:
+    """The links without cameras in an IMU that nothing ties to other frames."""
+    others = [each for each in links if each.child == IMU or
+              (each.parent == IMU and not is_optical(each.child))]  # fmt: skip
+    if others or lidar_frame == IMU:
+        return links
+    return [each for each in links if each.parent != IMU]

@@ -12,18 +12,18 @@ from pydantic import ConfigDict, Field
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented_yaml
-from calibgraph.io.formats.lenses import (
+from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
+from calibgraph.io.formats.part import IMU, FrameLink, Part, RelativeCamera
+from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.io.lenses import (
     CameraLens,
-    carried_coefficients,
-    lens_model,
     listed_coefficients,
-    no_place_for,
+    listed_intrinsics,
+    stated_model,
     unified_coefficients,
 )
-from calibgraph.io.formats.part import Part, RelativeCamera
-from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
-from calibgraph.model.geometry import relative_transform
-from calibgraph.model.rig import Camera, Finite, Positive, Size, Transform
+from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.model.rig import Camera, Finite, Size, Transform
 
 _DERIVED = "computed from T_cam_lidar"
 
@@ -104,15 +104,8 @@ class _Camera(StrictNumbers):
     resolution: tuple[Size, Size] | None = None
     T_cn_cnm1: Transform | None = None
     T_cam_lidar: Transform | None = None
+    T_cam_imu: Transform | None = None
     calibgraph: _Own = _Own()
-
-
-class _Focal(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite]
-
-
-class _Unified(StrictNumbers):
-    intrinsics: tuple[Finite, Positive, Positive, Finite, Finite]
 
 
 class _Camchain(StrictNumbers):
@@ -127,6 +120,8 @@ def is_kalibr(content: dict[str, Any]) -> bool:
 def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     """Lenses, T_cam_lidar where it is given, and T_cn_cnm1 as relative poses.
 
+    T_cam_imu maps IMU to camera coordinates: a file with the LiDAR in the IMU completes it.
+
     Raises:
         FileError: if the file is malformed, or a lens is none of ours.
     """
@@ -135,6 +130,8 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     names = {key: camera.calibgraph.camera or key for key, camera in chain.cameras.items()}
     if len(set(names.values())) < len(names):
         raise FileError(path, f"two cameras have one name: {', '.join(names.values())}")
+    in_imu = {names[key]: camera.T_cam_imu for key, camera in chain.cameras.items()}
+    frames = {name: f"{name}_optical_frame" for name, T in in_imu.items() if T is not None}
     return Part(
         path=path,
         lenses={names[key]: _lens(camera, path) for key, camera in chain.cameras.items()},
@@ -144,6 +141,10 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
             if camera.T_cam_lidar is not None
         },
         relative_poses=tuple(_relative_poses(keys, chain, names)),
+        links=tuple(
+            FrameLink(IMU, frames[name], invert(T)) for name, T in in_imu.items() if T is not None
+        ),
+        frame_ids=frames,
     )
 
 
@@ -162,27 +163,17 @@ def _number(key: str) -> int:
 
 
 def _lens(camera: _Camera, path: Path) -> CameraLens:
-    if camera.camera_model == "omni":
+    names = camera.model_dump(include={"camera_model", "distortion_model"})
+    model = stated_model(names, path) or "pinhole"
+    if model == "omnidirectional":
         return _omnidirectional(camera, path)
-    model = lens_model(camera.distortion_model, path)
-    if camera.camera_model != "pinhole":
-        model = lens_model(camera.camera_model, path)  # raises: ds, eucm
-    focal = checked_model(_Focal, {"intrinsics": camera.intrinsics}, path)
+    intrinsics = listed_intrinsics(camera.intrinsics, f"{path}: intrinsics")
     coefficients = listed_coefficients(camera.distortion_coeffs, model, path)
-    return CameraLens(model, camera.resolution, focal.intrinsics, coefficients)
+    return CameraLens(model, camera.resolution, intrinsics, coefficients)
 
 
 def _omnidirectional(camera: _Camera, path: Path) -> CameraLens:
-    """Kalibr's omni-radtan or omni-none: xi comes before the focal lengths.
-
-    Raises:
-        FileError: if it has another distortion.
-    """
-    if camera.distortion_model not in ("radtan", "none"):
-        raise FileError(
-            path, f"omni-{camera.distortion_model} is no lens here; calibrate it as omni-radtan"
-        )
-    xi, *focal = checked_model(_Unified, {"intrinsics": camera.intrinsics}, path).intrinsics
-    coefficients = unified_coefficients(xi, camera.distortion_coeffs, path)
-    fx, fy, cx, cy = focal
-    return CameraLens("omnidirectional", camera.resolution, (fx, fy, cx, cy), coefficients)
+    """Kalibr's omni-radtan or omni-none: xi comes before the focal lengths."""
+    intrinsics = listed_intrinsics(camera.intrinsics[1:], f"{path}: intrinsics after xi")
+    coefficients = unified_coefficients(camera.intrinsics[0], camera.distortion_coeffs, path)
+    return CameraLens("omnidirectional", camera.resolution, intrinsics, coefficients)

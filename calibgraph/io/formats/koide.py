@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import StrictNumbers, checked_model, read_text
+from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import stated_json
-from calibgraph.io.formats.lenses import (
-    CameraLens,
-    carried_coefficients,
-    lens_model,
-    listed_coefficients,
-    no_place_for,
-    unified_coefficients,
-)
+from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.lenses import (
+    CameraLens,
+    listed_coefficients,
+    listed_intrinsics,
+    stated_model,
+    unified_coefficients,
+)
 from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera as RigCamera
 from calibgraph.model.rig import Finite, Positive
-
-_MAX_BYTES = 8 * 2**20
 
 
 def write_koide(export: RigExport) -> str:
@@ -66,14 +63,6 @@ class _Camera(StrictNumbers):
     distortion_coeffs: tuple[Finite, ...] = ()
 
 
-class _Focal(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite]
-
-
-class _Unified(StrictNumbers):
-    intrinsics: tuple[Positive, Positive, Finite, Finite, Finite]
-
-
 class _Panorama(StrictNumbers):
     intrinsics: tuple[Positive, Positive]
 
@@ -93,18 +82,24 @@ class _Calibration(StrictNumbers):
     results: _Results = _Results()
 
 
-def read_koide(path: Path, name: str) -> Part:
+def is_koide(content: dict[str, Any]) -> bool:
+    """Whether the content of a JSON file is a calib.json."""
+    return isinstance(content.get("camera"), dict) and "intrinsics" in content["camera"]
+
+
+def read_koide(content: dict[str, Any], path: Path, name: str | None) -> Part:
     """The lens and the result, or else an initial guess; without image size.
 
     Args:
-        path: of calib.json.
+        content: of calib.json.
+        path: of it.
         name: of the camera, unless the file was written here.
 
     Raises:
         FileError: if the file is malformed, or the lens is none of ours.
     """
-    found = checked_model(_Calibration, _content(path), path)
-    name = str(found.meta.get("camera", name))
+    found = checked_model(_Calibration, content, path)
+    name = str(found.meta.get("camera", name or path.stem))
     r = found.results
     pose = r.T_lidar_camera or r.init_T_lidar_camera or r.init_T_lidar_camera_auto
     try:
@@ -115,25 +110,16 @@ def read_koide(path: Path, name: str) -> Part:
 
 
 def _lens(camera: _Camera, path: Path) -> CameraLens:
-    model, values = lens_model(camera.camera_model, path), camera.model_dump()
+    values = camera.model_dump()
+    model = stated_model(values, path) or "pinhole"
     given = camera.distortion_coeffs
     if model == "equirectangular":  # width and height in place of focal lengths
         width, height = checked_model(_Panorama, values, path).intrinsics
-        intrinsics = (width / (2 * math.pi), height / math.pi, width / 2, height / 2)
-        return CameraLens(model, None, intrinsics, ())
+        focal = (width / (2 * math.pi), height / math.pi, width / 2, height / 2)
+        return CameraLens(model, None, listed_intrinsics(focal, path), ())
     if model == "omnidirectional":
-        *focal, xi = checked_model(_Unified, values, path).intrinsics
-        fx, fy, cx, cy = focal
-        return CameraLens(model, None, (fx, fy, cx, cy), unified_coefficients(xi, given, path))
-    intrinsics = checked_model(_Focal, values, path).intrinsics
+        intrinsics = listed_intrinsics(camera.intrinsics[:-1], f"{path}: intrinsics before xi")
+        coefficients = unified_coefficients(camera.intrinsics[-1], given, path)
+        return CameraLens(model, None, intrinsics, coefficients)
+    intrinsics = listed_intrinsics(camera.intrinsics, f"{path}: intrinsics")
     return CameraLens(model, None, intrinsics, listed_coefficients(given, model, path))
-
-
-def _content(path: Path) -> Any:
-    text = read_text(path)
-    if len(text) > _MAX_BYTES:
-        raise FileError(path, f"{len(text)} characters are too many for a calib.json")
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileError(path, f"is not valid JSON: {error}") from error

@@ -23,8 +23,10 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
 """What ``calibgraph export --format`` writes."""
 
 IMPORT_FORMATS: Final = (
-    "Kalibr camchain, ROS camera_info, OpenCV FileStorage, Autoware sensor kit, tf2 TFMessage "
-    "(.yaml), URDF (.urdf, .xml), COLMAP cameras.txt, koide3 calib.json, KITTI calib.txt in its "
-    "sequence, a ROS bag, a rig file or result of calibgraph"
+    "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
+    "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, Autoware.AI, parameters of "
+    "VINS, LVI-SAM, FAST-LIVO and R3LIVE, multical, Basalt and SensorsCalibration (.json), URDF, "
+    "COLMAP cameras.txt, koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
+    "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
 )
 """What ``calibgraph import`` reads."""

@@ -9,9 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.formats.lenses import CameraLens
+from calibgraph.io.formats.rig_export import frame_id
+from calibgraph.io.lenses import CameraLens
 
 Array = NDArray[np.float64]
+
+ONLY_CAMERA = ""
+"""Stands for the camera of a file that names none: the only one of all files."""
+
+IMU = "imu"
+"""The frame of the IMU in files that give poses in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,9 @@ class Part:
         T_camera_lidar: (4, 4) by camera.
         relative_poses: between cameras, measured independently of T_camera_lidar.
         links: frames in their parents.
+        frame_ids: of optical frames, by camera.
+        lidar: the LiDAR's frame; None if the file does not name it.
+        notes: what was assumed or left out, a line each.
     """
 
     path: Path
@@ -51,9 +61,19 @@ class Part:
     T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
     relative_poses: tuple[RelativeCamera, ...] = ()
     links: tuple[FrameLink, ...] = ()
+    frame_ids: Mapping[str, str] = field(default_factory=dict)
+    lidar: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it holds no lens, no extrinsic and no frame."""
+        return not (self.lenses or self.T_camera_lidar or self.links)
 
     def rename(self, names: Mapping[str, str]) -> Part:
-        """The same with other names of some cameras; frames keep theirs."""
+        """The same with other names of some cameras; frames keep theirs, but for ONLY_CAMERA's."""
+        only = frame_id(names.get(ONLY_CAMERA, ONLY_CAMERA))
+        frames = {f"_{axes}": f"{only}_{axes}" for axes in ("optical", "optical_frame")}
         return replace(
             self,
             lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
@@ -62,4 +82,16 @@ class Part:
                 replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
                 for pair in self.relative_poses
             ),
+            links=tuple(
+                replace(
+                    link,
+                    parent=frames.get(link.parent, link.parent),
+                    child=frames.get(link.child, link.child),
+                )
+                for link in self.links
+            ),
+            frame_ids={
+                names.get(name, name): frames.get(frame, frame)
+                for name, frame in self.frame_ids.items()
+            },
         )

@@ -30,6 +30,8 @@ def write_json(export: RigExport) -> str:
 
 def _content(export: RigExport, name: str) -> dict[str, Any]:
     camera, covariance = export.cameras[name], export.ros_covariance(name)
+    if camera.frame_id is not None:
+        camera = camera.model_copy(update={"frame_id": export.optical_frames[name]})
     return {
         **camera.model_dump(),
         "optical_frame": export.optical_frames[name],

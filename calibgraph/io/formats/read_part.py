@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text, require_file
+from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
+from calibgraph.io.formats.basalt import is_basalt, read_basalt
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
-from calibgraph.io.formats.colmap import read_colmap
+from calibgraph.io.formats.camera_maps import read_camera_maps
+from calibgraph.io.formats.colmap import is_colmap, read_colmap
+from calibgraph.io.formats.documents import (
+    YAML_SUFFIXES,
+    content_of_storage,
+    read_documents,
+    read_xml,
+)
 from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
-from calibgraph.io.formats.koide import read_koide
-from calibgraph.io.formats.lenses import CameraLens
+from calibgraph.io.formats.kitti_lines import is_kitti_lines, read_kitti_lines
+from calibgraph.io.formats.koide import is_koide, read_koide
 from calibgraph.io.formats.names import IMPORT_FORMATS
-from calibgraph.io.formats.opencv_yaml import is_opencv, read_opencv
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2
 from calibgraph.io.formats.urdf import read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
-from calibgraph.io.rigs import load_rig
-from calibgraph.model.rig import Camera, Rig
-from calibgraph.yaml_text import parse_yaml
+from calibgraph.io.lenses import CameraLens
+from calibgraph.io.rigs import is_exported_rig, read_rig
+from calibgraph.model.rig import Camera, Intrinsics
 
 _MAX_BYTES = 32 * 2**20
+_COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:
@@ -42,59 +50,98 @@ def read_part(path: Path, name: str | None) -> Part:
     if is_bag(path):
         return _part_of_bag(path)
     if path.is_dir() or path.name == CALIBRATION_NAME:
-        return _part_of_rig(load_rig(path), path)
+        return _part_of_rig(path)
     suffix = require_file(path).suffix.lower()
     if path.stat().st_size > _MAX_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
     if suffix in (".urdf", ".xml", ".xacro"):
-        return read_urdf(path)
-    if suffix == ".json":
-        return read_koide(path, name or path.stem)
+        root = read_xml(path)
+        if root.tag != "opencv_storage":
+            return read_urdf(root, path)
+        return _read_content([content_of_storage(root)], path, name)
     if suffix == ".txt":
-        return read_colmap(path)
-    if suffix in (".yaml", ".yml"):
-        return _read_yaml(path, name)
+        return _read_lines(path, name)
+    if suffix in (*YAML_SUFFIXES, ".json"):
+        return _read_content(read_documents(path), path, name)
     raise FileError(path, f"its format is not known; known are {IMPORT_FORMATS}")
 
 
-def _read_yaml(path: Path, name: str | None) -> Part:
+def _read_lines(path: Path, name: str | None) -> Part:
+    """What a text file of lines holds."""
     text = read_text(path)
-    if is_opencv(text):
-        return read_opencv(path, name or path.stem)
-    content = parse_yaml(text, path)
-    if "format" in content:
-        return _part_of_rig(load_rig(path), path)
+    if is_colmap(text) or path.name == _COLMAP_NAME:
+        return read_colmap(path)
+    if is_kitti_lines(text):
+        return read_kitti_lines(path, name)
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    raise FileError(
+        path, f"its line {first[:40]!r} is of no known format; known are {IMPORT_FORMATS}"
+    )
+
+
+def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> Part:
+    """What the mappings of a file hold."""
+    content = documents[0]
+    if is_tf2(content):
+        return read_tf2(documents, path)
     if is_camera_info(content):
-        return read_camera_info(content, path, name)
-    for matches, read in (
-        (is_kalibr, read_kalibr), (is_tf2, read_tf2), (is_autoware, read_autoware)
-    ):  # fmt: skip
+        documents = [content, *(each for each in documents if _message(each) != _message(content))]
+    if len(documents) > 1:
+        raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
+    for matches, read in _READERS:
         if matches(content):
-            return read(content, path)
-    keys = ", ".join(str(key) for key in list(content)[:5])
-    raise FileError(path, f"its keys ({keys}) are of no known format; known are {IMPORT_FORMATS}")
+            return read(content, path, name)
+    found = read_camera_maps(content, path, name)
+    if found is None:
+        keys = ", ".join(str(key) for key in list(content)[:5])
+        raise FileError(
+            path, f"its keys ({keys}) are of no known format; known are {IMPORT_FORMATS}"
+        )
+    return found
+
+
+def _message(content: dict[str, Any]) -> dict[str, Any]:
+    """A message without its header, whose stamp changes."""
+    return {**content, "header": None}
+
+
+def _is_rig(content: dict[str, Any]) -> bool:
+    return "format" in content or is_exported_rig(content)
+
+
+_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ...] = (
+    (is_camera_info, read_camera_info),
+    (_is_rig, lambda _, path, __: _part_of_rig(path)),
+    (is_kalibr, lambda content, path, _: read_kalibr(content, path)),
+    (is_koide, read_koide),
+    (is_basalt, lambda content, path, _: read_basalt(content, path)),
+    (is_autoware, lambda content, path, _: read_autoware(content, path)),
+)
 
 
 def _part_of_bag(path: Path) -> Part:
     """Lenses from camera_info, and the extrinsics that /tf_static has."""
-    cameras = read_bag_rig(path).cameras
+    read = read_bag_rig(path)
+    cameras = read.cameras
     found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
     return Part(
         path,
-        lenses={name: _lens_of_bag(camera.lens.content) for name, camera in cameras.items()},
+        lenses={name: _lens_of_bag(camera.lens.content, path) for name, camera in cameras.items()},
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
+        frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
+        lidar=read.lidar,
+        notes=tuple(read.notes),
     )
 
 
-def _lens_of_bag(content: Mapping[str, Any]) -> CameraLens:
-    k = content["intrinsics_px"]
+def _lens_of_bag(content: Mapping[str, Any], path: Path) -> CameraLens:
     size = (content["width_px"], content["height_px"])
-    return CameraLens(
-        content["model"], size, (k["fx"], k["fy"], k["cx"], k["cy"]), tuple(content["distortion"])
-    )
+    intrinsics = checked_model(Intrinsics, content["intrinsics_px"], path)
+    return CameraLens(content["model"], size, intrinsics, tuple(content["distortion"]))
 
 
-def _part_of_rig(rig: Rig, path: Path) -> Part:
+def _part_of_rig(path: Path) -> Part:
+    rig, notes = read_rig(path)
     return Part(
         path,
         lenses={name: _lens(camera) for name, camera in rig.cameras.items()},
@@ -103,10 +150,12 @@ def _part_of_rig(rig: Rig, path: Path) -> Part:
             RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
             for p in rig.relative_poses
         ),
+        frame_ids={name: each.frame_id for name, each in rig.cameras.items() if each.frame_id},
+        lidar=rig.lidar,
+        notes=notes,
     )
 
 
 def _lens(camera: Camera) -> CameraLens:
-    k = camera.intrinsics_px
     size = (camera.width_px, camera.height_px)
-    return CameraLens(camera.model, size, (k.fx, k.fy, k.cx, k.cy), camera.distortion)
+    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion)

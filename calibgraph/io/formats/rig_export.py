@@ -117,7 +117,7 @@ def prepare_export(
     *,
     cameras: Iterable[str] | None,
     lidar_frame: str | None,
-    camera_frame: str,
+    camera_frame: str | None,
     T_base_lidar: Array | None,
 ) -> RigExport:
     """Collect what exporters need; arguments as of :func:`calibgraph.export_calibration`.
@@ -131,7 +131,10 @@ def prepare_export(
     for name in names:
         if name not in rig.cameras:
             raise ValueError(f"camera {name!r}: the rig has {', '.join(rig.cameras)}")
-    frames = {name: frame_id(camera_frame.replace("{camera}", name)) for name in names}
+    frames = {
+        name: frame_id(_camera_frame(rig.cameras[name], camera_frame).replace("{camera}", name))
+        for name in names
+    }
     lidar = frame_id(rig.lidar if lidar_frame is None else lidar_frame)
     if len({lidar, *frames.values()} - {""}) <= len(frames):
         raise ValueError(
@@ -146,6 +149,11 @@ def prepare_export(
         optical_frames=frames,
         T_base_lidar=T_base_lidar,
     )
+
+
+def _camera_frame(camera: Camera, given: str | None) -> str:
+    """That given, else that of the rig, else one by the camera's name."""
+    return (camera.frame_id or CAMERA_FRAME) if given is None else given
 
 
 def frame_id(name: str) -> str:

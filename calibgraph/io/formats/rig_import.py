@@ -12,10 +12,16 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import FrameTree, find_camera_frame, find_lidar_frame
-from calibgraph.io.formats.lenses import CameraLens
-from calibgraph.io.formats.part import Array, Part, RelativeCamera
+from calibgraph.io.formats.frames import (
+    NO_LIDAR_IN_IMU,
+    FrameTree,
+    find_camera_frame,
+    find_lidar_frame,
+    tied_links,
+)
+from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
+from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
 
@@ -75,6 +81,8 @@ class RigParts:
         T_camera_lidar: (4, 4) of the cameras that have one.
         pairs: relative poses.
         frames: names of the frames.
+        frame_ids: of optical frames, by camera.
+        notes: what was assumed or left out in the files, a line each.
     """
 
     path: Path
@@ -83,6 +91,8 @@ class RigParts:
     T_camera_lidar: Mapping[str, Array]
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
+    frame_ids: Mapping[str, str]
+    notes: Sequence[str]
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
         """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
@@ -106,7 +116,10 @@ class RigParts:
         content: dict[str, Any] = {
             "lidar": self.lidar,
             "cameras": {
-                name: _camera(name, lens, T.get(name), size_px, self.frames)
+                name: {
+                    **_camera(name, lens, T.get(name), size_px, self),
+                    "frame_id": self.frame_ids.get(name),
+                }
                 for name, lens in self.lenses.items()
             },
             "relative_poses": [_relative_pose(pair, *sigmas) for pair in self.pairs],
@@ -130,13 +143,33 @@ def read_rig_parts(
     parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
-    tree = FrameTree(link for part in parts for link in part.links)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
-    T_camera_lidar |= _by_frames(tree, missing, lidar_frame, camera_frames or {})
+    links = [link for part in parts for link in part.links]
+    tied = tied_links(links, lidar_frame)
+    tree = FrameTree(tied)
+    frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
+    lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
+    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
+    chosen = {**in_tree, **(camera_frames or {})}
+    of_tree = lidar if lidar_frame or lidar in tree.names else None
+    notes = [note for part in parts for note in part.notes]
+    notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
+    try:
+        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
+    except CalibrationError as error:
+        raise CalibrationError("; ".join([str(error), *notes])) from error
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    lidar = lidar_frame or "lidar"
-    return RigParts(parts[0].path, lidar, lenses, T_camera_lidar, pairs, tree.names)
+    return RigParts(
+        path=parts[0].path,
+        lidar=lidar or "lidar",
+        lenses=lenses,
+        T_camera_lidar=T_camera_lidar,
+        pairs=pairs,
+        frames=tree.names,
+        frame_ids=frame_ids,
+        notes=notes,
+    )
 
 
 def _read_all(
@@ -149,6 +182,13 @@ def _read_all(
     """
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
+    lenses = sorted({name for part in read for name in part.lenses})
+    if len(lenses) == 1:
+        read = [part.rename({ONLY_CAMERA: lenses[0]}) for part in read]
+    for part in read:
+        if ONLY_CAMERA in part.T_camera_lidar and len(lenses) > 1:
+            raise FileError(part.path, f"names no camera; there are {', '.join(lenses)}: give it "
+                            "as NAME=FILE")  # fmt: skip
     known = {name for part in read for name in (*part.lenses, *part.T_camera_lidar)}
     if not any(part.lenses for part in read):
         raise CalibrationError(
@@ -233,7 +273,7 @@ def _camera(
     lens: CameraLens,
     T_camera_lidar: Array | None,
     size_px: tuple[int, int] | None,
-    frames: Sequence[str],
+    parts: RigParts,
 ) -> dict[str, Any]:
     """The content of a rig file for a camera.
 
@@ -247,19 +287,19 @@ def _camera(
             camera=name,
         )
     if T_camera_lidar is None:
-        listed = f" (its frames are {', '.join(frames)})" if frames else ""
+        listed = f" (its frames are {', '.join(parts.frames)})" if parts.frames else ""
+        notes = "".join(f"; {note}" for note in parts.notes)
         raise RigError(
             f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
             "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
-            "describe its mounting to calibgraph guess",
+            f"describe its mounting to calibgraph guess{notes}",
             camera=name,
         )
-    fx, fy, cx, cy = lens.intrinsics_px
     return {
         "model": lens.model,
         "width_px": size[0],
         "height_px": size[1],
-        "intrinsics_px": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        "intrinsics_px": lens.intrinsics_px,
         "distortion": lens.distortion,
         "T_camera_lidar": T_camera_lidar,
     }

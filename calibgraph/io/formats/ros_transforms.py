@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from calibgraph.errors import FileError
+import numpy as np
+
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
-from calibgraph.model.rig import Finite
 
 _DIRECTION = (
     "each transform is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar"
+    "p_lidar = T * p_camera, the inverse of T_camera_lidar; a frame has one parent: take other "
+    "transforms to these optical frames out of the robot's description"
 )
 
 
@@ -100,13 +101,13 @@ def _stamped(export: RigExport, name: str) -> dict[str, Any]:
 
 
 class _Vector(StrictNumbers):
-    x: Finite
-    y: Finite
-    z: Finite
+    x: float
+    y: float
+    z: float
 
 
 class _Quaternion(_Vector):
-    w: Finite
+    w: float
 
 
 class _Transform(StrictNumbers):
@@ -129,24 +130,40 @@ class _Message(StrictNumbers):
 
 
 def is_tf2(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is a TFMessage."""
-    return "transforms" in content
+    """Whether the content of a YAML file is a TFMessage, or a single TransformStamped."""
+    return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
 
 
-def read_tf2(content: dict[str, Any], path: Path) -> Part:
-    """The frames of a TFMessage.
+def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
+    """The frames of TFMessages and TransformStampeds; the last of several for a child.
+
+    A frame whose numbers are no transform is left out with a note: others may do without it.
 
     Raises:
-        FileError: if it is malformed.
+        FileError: if one is malformed.
     """
-    message = checked_model(_Message, content, path)
-    try:
-        return Part(path, links=tuple(_link(stamped) for stamped in message.transforms))
-    except ValueError as error:
-        raise FileError(path, str(error)) from error
+    links: dict[str, FrameLink] = {}
+    notes: list[str] = []
+    for content in documents:
+        listed = content if "transforms" in content else {"transforms": [content]}
+        for stamped in checked_model(_Message, listed, path).transforms:
+            try:
+                link = _link(stamped)
+                links[link.child] = link
+            except ValueError as error:
+                notes.append(f"{path}: frame {stamped.child_frame_id!r} is left out: {error}")
+    return Part(path, links=tuple(links.values()), notes=tuple(notes))
 
 
 def _link(stamped: _Stamped) -> FrameLink:
+    """The frame of a message.
+
+    Raises:
+        ValueError: if its numbers are no transform.
+    """
     t, q = stamped.transform.translation, stamped.transform.rotation
+    if not np.isfinite([t.x, t.y, t.z]).all():
+        raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")
     T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-    return FrameLink(stamped.header.frame_id, stamped.child_frame_id, T)
+    parent, child = (name.lstrip("/") for name in (stamped.header.frame_id, stamped.child_frame_id))
+    return FrameLink(parent, child, T)

@@ -6,12 +6,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text
 from calibgraph.io.formats.comments import commented_xml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
@@ -19,7 +16,8 @@ from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
 
 _DIRECTION = (
     "each joint's origin is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar; rpy about fixed x, y, z"
+    "p_lidar = T * p_camera, the inverse of T_camera_lidar; rpy about fixed x, y, z; a frame has "
+    "one parent: take other joints to these optical frames out of the robot's description"
 )
 
 
@@ -41,16 +39,12 @@ def _text(values: list[float] | NDArray[np.float64]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def read_urdf(path: Path) -> Part:
+def read_urdf(root: ElementTree.Element, path: Path) -> Part:
     """The frames of a URDF: its joints at their zero position.
 
     Raises:
-        FileError: if it is not XML, not a URDF, or not expanded.
+        FileError: if it is not a URDF, or not expanded.
     """
-    try:
-        root = fromstring(read_text(path), forbid_dtd=True)
-    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
-        raise FileError(path, f"is not a URDF: {error}") from error
     if root.tag != "robot":
         raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
     if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):
@@ -65,7 +59,11 @@ def _link(joint: ElementTree.Element, path: Path) -> FrameLink:
     attributes = {} if origin is None else origin.attrib
     xyz = _numbers(attributes.get("xyz", "0 0 0"), joint, path)
     rpy = _numbers(attributes.get("rpy", "0 0 0"), joint, path)
-    return FrameLink(parent.get("link", ""), child.get("link", ""), pose_of_angles(xyz, rpy))
+    try:
+        T = pose_of_angles(xyz, rpy)
+    except ValueError as error:
+        raise FileError(path, f"joint {joint.get('name')!r}: {error}") from error
+    return FrameLink(parent.get("link", ""), child.get("link", ""), T)
 
 
 def _numbers(text: str, joint: ElementTree.Element, path: Path) -> list[float]:

@@ -23,8 +23,8 @@ from calibgraph.matching.cmrnext.image_results import (
 )
 from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
-from calibgraph.matching.protocol import Stage1Source, Start
-from calibgraph.model.config import Config
+from calibgraph.matching.protocol import Start
+from calibgraph.model.config import Config, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig

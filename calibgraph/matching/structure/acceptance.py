@@ -10,6 +10,7 @@ in the clouds of other streets.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 FALSE_ACCEPTANCE = 1e-3
 """Share of cameras with nothing to find of which a pose may be accepted."""
@@ -20,14 +21,26 @@ location, and scale. Locations in turned clouds and in those of other places: KI
 to 47,000 points a scan 5 to 7, 16 beams in a laboratory 11; rendered streets, all alike, 12."""
 
 
+_LOCATION = PRIOR_LOCATION + 0.5 * PRIOR_SIGMA**2 / SCALE
+"""The tail of the Gumbel distribution is exponential, so that what is uncertain of its location
+raises it by half the variance over the scale."""
+
+
 def least_z_score(tries: float) -> float:
     """From which z-score on a pose is accepted.
-
-    The tail of the Gumbel distribution is exponential, so that what is uncertain of its location
-    raises it by half the variance over the scale.
 
     Args:
         tries: how much was searched, in searches for one roll; a single pose is less than one.
     """
-    location = PRIOR_LOCATION + 0.5 * PRIOR_SIGMA**2 / SCALE
-    return location + SCALE * math.log(tries / FALSE_ACCEPTANCE)
+    return _LOCATION + SCALE * math.log(tries / FALSE_ACCEPTANCE)
+
+
+def are_accepted(z_scores: Iterable[float], tries: float) -> bool:
+    """Whether poses of several cameras, one of each, are accepted together.
+
+    Args:
+        z_scores: of the poses; each excess over chance counts.
+        tries: of such sets of poses, as of :func:`least_z_score`.
+    """
+    excess = sum(max(0.0, z_score - _LOCATION) for z_score in z_scores)
+    return excess >= SCALE * math.log(tries / FALSE_ACCEPTANCE)

@@ -14,7 +14,7 @@ import numpy as np
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
-from calibgraph.matching.protocol import Stage1Source, Start
+from calibgraph.matching.protocol import Start
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of, load_camera_frames
 from calibgraph.matching.structure.global_search import Located, locate_cameras
@@ -27,6 +27,7 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
+from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings

@@ -103,18 +103,20 @@ def test_messages_that_are_gone_are_named(tmp_path: Path, kind: str) -> None:
         load_image(moved, load_rig(SAMPLE).cameras["left"])
 
 
-def test_without_rosbags_the_command_that_installs_it_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("library", ["rosbags", "mcap"])
+def test_without_a_library_the_command_that_installs_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
     bag = sample_bag(tmp_path, "mcap")
     imports: Callable[..., Any] = builtins.__import__
 
-    def without_rosbags(name: str, *rest: Any) -> Any:
-        if name.startswith("rosbags"):
+    def without_library(name: str, *rest: Any) -> Any:
+        if name.partition(".")[0] == library:
             raise ImportError(f"No module named {name!r}")
         return imports(name, *rest)
 
-    monkeypatch.setattr(builtins, "__import__", without_rosbags)
-    assert "rosbags.rosbag1" in sys.modules  # which the import above does not reach
-    with pytest.raises(CalibrationError, match=r"needs rosbags: pip install 'calibgraph\[ros\]'"):
+    for module in ("mcap_files", "rosbags_files"):
+        monkeypatch.delitem(sys.modules, f"calibgraph.io.bags.{module}", raising=False)
+    monkeypatch.setattr(builtins, "__import__", without_library)
+    with pytest.raises(CalibrationError, match=r"needs rosbags and mcap: pip install 'calibgraph"):
         load_rig(bag)

@@ -37,9 +37,9 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
     assert list(data.rig.cameras) == list(folder.rig.cameras)
     for name, camera in load_rig(bag).cameras.items():
         given = folder.rig.cameras[name]
-        assert camera.model_dump(exclude={"T_camera_lidar"}) == given.model_dump(
-            exclude={"T_camera_lidar"}
-        )
+        assert camera.frame_id == f"{name}_optical"
+        others = {"T_camera_lidar", "frame_id"}
+        assert camera.model_dump(exclude=others) == given.model_dump(exclude=others)
         np.testing.assert_allclose(camera.T_camera_lidar, given.T_camera_lidar, atol=1e-12)
     assert [frame.index for frame in data.frames] == list(range(len(folder.frames)))
     for found, expected in zip(data.frames, folder.frames, strict=True):

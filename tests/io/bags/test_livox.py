@@ -116,6 +116,10 @@ def test_a_bag_with_a_truncated_cloud_ends_in_one_line(tmp_path: Path) -> None:
     bag = write_bag(tmp_path, "mcap", [Stamped("/livox", LIVOX_CLOUDS[0], 5, message)])
     data = bytes(STORES[False].serialize_cdr(message, LIVOX_CLOUDS[0]))
     opened = Bag(bag)
-    opened._raw = lambda *_: iter([("/livox", 5, data[:90])])  # type: ignore[method-assign]
-    with pytest.raises(FileError, match="is truncated, was not closed or is no ROS bag"):
+    opened._recording.messages = (
+        lambda *_: iter(  # type: ignore[method-assign]
+            [("/livox", 5, data[:90])]
+        )
+    )
+    with pytest.raises(FileError, match="message of /livox recorded at 5 ns is no livox_ros_"):
         opened.first("/livox")

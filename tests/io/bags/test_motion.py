@@ -15,6 +15,7 @@ from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.model.geometry import invert
+from calibgraph.trust.inputs import find_doubts
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     PERIOD_NS,
@@ -69,7 +70,7 @@ def scan(start_s: float, points: np.ndarray) -> np.ndarray:
     return rows
 
 
-def messages() -> tuple[list[Stamped], list[np.ndarray]]:
+def messages(*, timed: bool = True) -> tuple[list[Stamped], list[np.ndarray]]:
     """The messages, and per frame the points of the world."""
     written = [
         Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, MAKE.transforms(tree_of(RIG)))
@@ -83,7 +84,9 @@ def messages() -> tuple[list[Stamped], list[np.ndarray]]:
     for number in range(FRAMES):
         stamp_ns = START_NS + number * PERIOD_NS
         worlds.append(world(number))
-        cloud = MAKE.cloud(scan(number * PERIOD_NS / 1e9, worlds[-1]), stamp_ns)
+        rows = scan(number * PERIOD_NS / 1e9, worlds[-1])
+        rows["t"] *= timed
+        cloud = MAKE.cloud(rows, stamp_ns)
         written.append(Stamped("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud))
         for name in RIG.cameras:
             image = MAKE.image(np.zeros((4, 6), np.uint8), "mono8", stamp_ns + int(IMAGE_S * 1e9))
@@ -167,6 +170,17 @@ def test_a_cache_tells_corrected_clouds_from_those_as_recorded(
 def test_the_note_states_the_correction(bag: tuple[Path, list[np.ndarray]]) -> None:
     notes = load_dataset(bag[0], bag=BagOptions(motion="tf")).notes
     assert notes[-1].endswith("clouds are corrected for motion by tf, with the t")
+
+
+def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(
+    bag: tuple[Path, list[np.ndarray]], tmp_path: Path
+) -> None:
+    equal = write_bag(tmp_path / "equal", "mcap", messages(timed=False)[0])
+    for path, motion, expected in ((equal, "tf", 1), (equal, "none", 0), (bag[0], "tf", 0)):
+        frame = load_dataset(path, bag=BagOptions(motion=motion)).frames[1]  # type: ignore[arg-type]
+        found = [text for text in find_doubts(RIG, frame, frame.load_cloud()) if "time" in text]
+        assert len(found) == expected
+        assert all("so that --motion moves it as a whole" in text for text in found)
 
 
 @pytest.mark.parametrize(

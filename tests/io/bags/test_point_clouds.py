@@ -49,6 +49,14 @@ def test_doubles_and_whole_numbers_are_read() -> None:
     np.testing.assert_array_equal(found[:, 3], np.arange(len(CLOUD)))
 
 
+def test_intensity_is_known_by_the_names_that_files_have_for_it() -> None:
+    kind = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("scalar_Intensity", "f4")]
+    points = np.zeros(len(CLOUD), kind)
+    for column, (name, _) in enumerate(kind):
+        points[name] = CLOUD[:, column]
+    np.testing.assert_array_equal(points_of(MAKE.cloud(points, START_NS), "here"), CLOUD)
+
+
 def test_a_cloud_without_intensity_has_none() -> None:
     found = points_of(MAKE.cloud(structured(CLOUD, "xyz"), START_NS), "here")
     assert np.isnan(found[:, 3]).all()

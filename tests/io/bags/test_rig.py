@@ -12,6 +12,8 @@ from calibgraph import (
     BagOptions,
     CalibrationError,
     DatasetError,
+    FileError,
+    camera_from_message,
     describe_rig,
     import_rig,
     load_dataset,
@@ -19,9 +21,9 @@ from calibgraph import (
     rig_of_bag,
 )
 from calibgraph.io.bags.camera_info import lens_of
-from calibgraph.io.bags.messages import Bag
+from calibgraph.io.bags.messages import Bag, Drive
 from calibgraph.io.bags.rig import doubtful_axes
-from calibgraph.io.bags.transforms import static_tree, transform_between
+from calibgraph.io.bags.transforms import Transforms
 from calibgraph.model.geometry import relative_transform
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
@@ -61,13 +63,13 @@ def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> N
         Stamped("/tf_static", TREE, START_NS + n, make.transforms([edge]))
         for n, edge in enumerate([("base", "lidar", shifted(9.0, 9.0, 9.0)), *edges])  # last counts
     ]
-    tree = static_tree(Bag(write_bag(tmp_path, kind, messages)))
-    T_optical_lidar = transform_between(tree, "optical", "lidar")
+    transforms = Transforms(Drive(Bag(write_bag(tmp_path, kind, messages))))
+    T_optical_lidar = transforms.between("optical", "lidar")
     assert T_optical_lidar is not None
     # 3 m along the LiDAR's x: (1, 3, 2) of the base, (0.5, 3, 0.5) of the body: 3 m to the left
     # (-x of the image), 0.5 m above (-y), 0.5 m ahead.
     np.testing.assert_allclose(T_optical_lidar @ [3, 0, 0, 1], [-3, -0.5, 0.5, 1], atol=1e-12)
-    assert transform_between(tree, "optical", "elsewhere") is None
+    assert transforms.between("optical", "elsewhere") is None
 
 
 def test_the_cameras_relative_poses_are_measurements_only_on_request(tmp_path: Path) -> None:
@@ -132,7 +134,7 @@ def test_a_bag_is_imported_with_the_extrinsics_of_another_file(tmp_path: Path) -
 def test_what_is_missing_for_a_rig_is_named(tmp_path: Path) -> None:
     messages = sample_messages(MAKE)
     bag = write_bag(tmp_path / "a", "mcap", without(messages, "/tf_static"))
-    with pytest.raises(DatasetError, match=r"does not connect the LiDAR's frame 'velodyne' with"):
+    with pytest.raises(DatasetError, match=r"connect the LiDAR's frame 'velodyne' with the frame"):
         rig_of_bag(bag)
     bag = write_bag(tmp_path / "b", "mcap", without(messages, "/left/camera_info"))
     assert list(rig_of_bag(bag).cameras) == ["front_left", "front_right"]
@@ -156,7 +158,8 @@ def test_lenses_are_named_as_in_ros(kind: str) -> None:
     assert content("plumb_bob", 0.1, 0.2, 0.3, 0.4, 0.5) == ("pinhole", [0.1, 0.2, 0.3, 0.4, 0.5])
     assert content("rational_polynomial", *range(1, 9), *[0] * 6) == ("pinhole", [*range(1, 9)])
     assert content("", 0, 0, 0, 0, 0) == ("pinhole", [])
-    with pytest.raises(DatasetError, match="model 'inverse_brown_conrady' with 1 coefficients"):
+    assert content("inverse_brown_conrady", 0, 0, 0, 0, 0) == ("pinhole", [])
+    with pytest.raises(FileError, match="here: lens model 'inverse_brown_conrady' is none of"):
         content("inverse_brown_conrady", 0.1)
 
 
@@ -182,7 +185,15 @@ def test_rectified_images_have_the_rectified_matrix_and_axes() -> None:
     np.testing.assert_array_equal(lens.R_image_frame, R)
 
 
+def test_a_message_of_a_pairs_second_camera_counts_its_baseline_on_request() -> None:
+    P = np.array([700.0, 0, 600, -70, 0, 700, 180, 14, 0, 0, 1, 0])
+    info = MAKE.camera_info(make_camera(), "first", P=P)
+    T = camera_from_message(info, np.eye(4), rectified=True, frame_of_first=True).T_camera_lidar
+    np.testing.assert_allclose(T[:3, 3], [-0.1, 0.02, 0.0], atol=1e-12)
+    assert not camera_from_message(info, np.eye(4), rectified=True).T_camera_lidar[:3, 3].any()
+
+
 def test_an_uncalibrated_camera_is_named() -> None:
     info = MAKE.camera_info(make_camera(), "eye", K=np.zeros(9))
-    with pytest.raises(DatasetError, match="here: holds no focal length"):
+    with pytest.raises(FileError, match="here: K: .* holds no focal length"):
         lens_of(info, "here", rectified=False)

@@ -55,20 +55,20 @@ def message_of(*paths: Path) -> str:
 @pytest.mark.parametrize(
     ("name", "old", "new", "said"),
     [
-        ("camchain.yaml", "camera_model: pinhole", "camera_model: omni", "'intrinsics.4' is"),
+        ("camchain.yaml", "camera_model: pinhole", "camera_model: omni", "after xi: has 3 numbers"),
         ("camchain.yaml", "camera_model: pinhole", "camera_model: eucm", "'eucm' is none of"),
         ("camchain.yaml", "camera_model: pinhole", "camera_model: ds", "'ds' is none of"),
         ("camchain.yaml", "[460.5, 461.5", "[true, 461.5", "expected no truth value"),
         ("camchain.yaml", "radtan", "fov", "lens model 'fov' is none of calibgraph's"),
         ("camchain.yaml", "[460.5, 461.5, 370.25, 240.75]", "[460.5, 461.5]", "intrinsics"),
-        ("camchain.yaml", "[460.5,", "[-460.5,", "intrinsics.0: "),
+        ("camchain.yaml", "[460.5,", "[-460.5,", "intrinsics: fx: "),
         ("camchain.yaml", "[0, -1, 0, 0.1]", "[0, 1, 0, 0.1]", "determinant -1"),
         ("camchain.yaml", "[752, 480]", "[752, 0]", "resolution.1"),
         ("camchain.yaml", "-0.002]", "-0.002, 1, 2, 3, 4, 5]", "9 distortion coefficients"),
         ("camchain.yaml", ", -0.002]", "]", "3 distortion coefficients, the lens"),
         ("info.yaml", "plumb_bob", "thin_prism", "'thin_prism' is none of"),
-        ("info.yaml", "1000.5, 0,", "1000.5,", "camera_matrix.data"),
-        ("info.yaml", "image_height: 1200", "", "'image_height' is missing"),
+        ("info.yaml", "1000.5, 0,", "1000.5,", "has 3 rows, 3 columns and 8 numbers"),
+        ("info.yaml", "image_height: 1200", "", "the height of the image is missing"),
         ("car.urdf", "<robot", "<!DOCTYPE x><robot", "is not a URDF"),
         ("car.urdf", "</robot>", "", "is not a URDF"),
         ("car.urdf", "1.0 0.0 2.0", "1.0 2.0", "joint 'a': expected three numbers"),
@@ -82,7 +82,6 @@ def message_of(*paths: Path) -> str:
         ("kit.yaml", "x: 0.4", "x: far", "front/camera_link: x: "),
         ("kit.yaml", "gnss_link", "livox_left", "could be livox_left, velodyne_top_base_link"),
         ("tf.yaml", "w: 0.5", "v: 0.5", "rotation.w' is missing"),
-        ("tf.yaml", "{x: 0, y: 0, z: 0, w: 1}", "{x: 0, y: 0, z: 0, w: 0}", "quaternion"),
         ("tf.yaml", "frame_id: base_link", "frame_id: odom", "no lens"),
         ("calib.json", "plumb_bob", "equirectangular", "intrinsics: Tuple should have at most 2"),
         ("calib.json", "plumb_bob", "atan", "'atan' is none of"),
@@ -90,7 +89,7 @@ def message_of(*paths: Path) -> str:
         ("calib.json", '"intrinsics": [', '"intrinsics": [1,', "intrinsics"),
         ("front.yml", "cols: 3", "cols: 4", "3 rows, 4 columns and 9 numbers"),
         ("front.yml", "camera_matrix", "matrix", "holds no camera matrix"),
-        ("front.yml", "718.", ".nan", "camera_matrix.data"),
+        ("front.yml", "718.", ".nan", "camera_matrix: expected finite numbers"),
         ("cameras.txt", "PINHOLE", "THIN_PRISM_FISHEYE", "line 1: lens model 'THIN_PRISM_FISHEYE'"),
         ("cameras.txt", " 185", "", "PINHOLE has 4 parameters"),
         ("cameras.txt", "1240", "wide", "line 1: expected CAMERA_ID"),
@@ -144,7 +143,7 @@ def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
         f"{key}:\n" + "".join(f"   {line}\n" for line in camera.splitlines()) for key in "ab"
     )
     (path,) = write(tmp_path, rig__yml="%YAML:1.0\n---\n" + nested)
-    assert "gives two cameras one name" in message_of(path)
+    assert "gives two cameras the name 'front'" in message_of(path)
     renamed = KALIBR.replace("cam1:", "cam1:\n  calibgraph: {camera: cam0}")
     (path,) = write(tmp_path, chain__yaml=renamed)
     assert "two cameras have one name" in message_of(path)

@@ -133,7 +133,8 @@ def test_an_omni_lens_with_another_distortion_is_refused(omni: Camera, tmp_path:
     export_calibration(Rig(cameras={"front": omni}), tmp_path / "chain.yaml", "kalibr")
     text = (tmp_path / "chain.yaml").read_text()
     for old, new, said in (
-        ("distortion_model: radtan", "distortion_model: fov", "omni-fov is no lens here"),
+        ("distortion_model: radtan", "distortion_model: fov", "lens model 'fov' is none of"),
+        ("distortion_model: radtan", "distortion_model: equi", "contradict each other"),
         ("intrinsics: [1.3,", "intrinsics: [-1.3,", "xi of the unified model is -1.3"),
     ):
         assert old in text

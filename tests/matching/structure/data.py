@@ -53,7 +53,7 @@ def with_noise_images(data: Dataset, name: str, folder: Path) -> Dataset:
     rng = np.random.default_rng(0)
     frames = []
     for frame in data.frames:
-        path = folder / f"{frame.name}.png"
+        path = folder / f"{frame.index}.png"
         cv2.imwrite(str(path), rng.integers(0, 255, (360, 640, 3), dtype=np.uint8))
         frames.append(replace(frame, image_paths={**frame.image_paths, name: path}))
     return replace(data, frames=tuple(frames))

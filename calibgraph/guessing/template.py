@@ -1,0 +1,147 @@
+"""A rig file to fill in, from the images and clouds of a dataset folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from calibgraph.errors import FileError
+from calibgraph.files import write_text
+from calibgraph.guessing.mounting import check_forward, parse_mounting
+from calibgraph.io.bags import is_bag
+from calibgraph.io.clouds import CLOUD_SUFFIXES
+from calibgraph.io.dataset_folders import folder_layout
+from calibgraph.io.frame_files import files_by_stem
+from calibgraph.io.images import IMAGE_SUFFIXES, image_size
+from calibgraph.io.kitti import CALIBRATION_NAME
+from calibgraph.io.published import published_format
+from calibgraph.io.rigs import FILL_IN, RIG_FILE
+from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
+from calibgraph.model.rig import RIG_FORMAT
+from calibgraph.outputs import yaml_mark
+from calibgraph.yaml_text import yaml_text
+
+_HEAD = """{mark}
+# Replace every {fill_in}; then: calibgraph doctor {folder}
+# Found are {clouds} clouds in lidar, and images of {cameras}.
+#
+# lidar           its name, which export uses as its frame
+# cameras         by name, as the folders in cameras/; remove those that you do not calibrate
+# intrinsics_px   focal lengths and principal point [px] of the images as recorded, for exactly
+#                 this width and height; pixel (0, 0) is the centre of the top-left pixel
+# model           pinhole (OpenCV, ROS plumb_bob), fisheye (Kannala-Brandt, ROS equidistant),
+#                 omnidirectional or equirectangular
+# distortion      in OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] of a pinhole lens, k1 to k4
+#                 of a fisheye; [] for rectified images
+# T_camera_lidar  the guess, right to 20 deg and 1.5 m: p_camera = T_camera_lidar * p_lidar [m];
+#                 camera: x right, y down, z forward; LiDAR: usually x forward, y left, z up.
+#                 At the LiDAR, level: front [[0,-1,0,0], [0,0,-1,0], [1,0,0,0], [0,0,0,1]]
+#                              left  [[1,0,0,0], [0,0,-1,0], [0,1,0,0], [0,0,0,1]]
+#                              right [[-1,0,0,0], [0,0,-1,0], [0,-1,0,0], [0,0,0,1]]
+#                              rear  [[0,1,0,0], [0,0,-1,0], [-1,0,0,0], [0,0,0,1]]
+#                 calibgraph init {folder} --mount "NAME=front, 0.4 m ahead"
+#                 writes it from words (with --force, in place of this file)
+# relative_poses  optional: measured poses between cameras, with sigmas; see docs/files.md
+"""
+
+
+def write_rig_template(
+    folder: Path | str,
+    out: Path | str | None = None,
+    *,
+    mountings: Mapping[str, str] | None = None,
+    forward: str = "+x",
+    replace: bool = False,
+) -> Path:
+    """Write a rig file with the cameras of a dataset folder, and placeholders to fill in.
+
+    Args:
+        folder: with ``lidar/`` and ``cameras/NAME/``.
+        out: the file; ``rig.yaml`` in the folder if None.
+        mountings: per camera, how it is mounted, in the words of :func:`calibgraph.guess_rig`; its
+            guess is then no placeholder.
+        forward: the axis of the LiDAR frame that points ahead, for the words.
+        replace: whether a file that is there is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileError: if the folder has no clouds or images or brings a rig of its own, or if the file
+            is there already.
+        RigError, ValueError: if words are not understood, or name no camera of the folder.
+    """
+    folder = Path(folder)
+    path = Path(out) if out is not None else folder / RIG_FILE
+    if path.exists() and not replace:
+        raise FileError(path, "is there already; --force replaces it")
+    write_text(path, rig_template(folder, mountings=mountings or {}, forward=forward))
+    return path
+
+
+def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "+x") -> str:
+    """The text of :func:`write_rig_template`."""
+    _require_plain_folder(folder)
+    sources = folder_layout(folder).images
+    if not sources:
+        beside = ", ".join(sorted(path.name for path in folder.glob("*/"))) or "none"
+        raise FileError(
+            folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
+            f"the clouds in lidar, found are the folders {beside}"
+        )  # fmt: skip
+    clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
+    for name in mountings.keys() - sources.keys():
+        raise ValueError(f"--mount {name}=...: no such camera; found are {', '.join(sources)}")
+    cameras = {
+        name: _camera(name, _size(source), mountings.get(name), forward)
+        for name, source in sources.items()
+    }
+    head = _HEAD.format(
+        mark=yaml_mark("init"), fill_in=FILL_IN, folder=folder, clouds=clouds,
+        cameras=", ".join(cameras),
+    )  # fmt: skip
+    return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})
+
+
+def _require_plain_folder(folder: Path) -> None:
+    """Refuse what brings lenses of its own.
+
+    Raises:
+        FileError: if the folder does, or is none.
+    """
+    if is_bag(folder):
+        raise FileError(folder, "is a ROS bag with lenses of its own; calibgraph bag writes them")
+    if not folder.is_dir():
+        raise FileError(folder, "no such folder; expected one with lidar/ and cameras/NAME/")
+    if published_format(folder) or (folder / CALIBRATION_NAME).is_file():
+        raise FileError(
+            folder, "brings its own rig, from which calibrate starts; calibgraph doctor shows it"
+        )
+
+
+def _size(source: Path) -> tuple[int, int]:
+    """Width and height of a camera's first image, or of the first picture of its video."""
+    if source.is_file():
+        height, width = load_picture(source / f"{0:06}{PICTURE_SUFFIX}").shape[:2]
+        return width, height
+    return image_size(next(iter(files_by_stem(source, IMAGE_SUFFIXES).values())))
+
+
+def _camera(
+    name: str, size_px: tuple[int, int], words: str | None, forward: str
+) -> dict[str, object]:
+    """A camera of the file."""
+    guess: object = FILL_IN
+    if words is not None:
+        T = parse_mounting(words, name).T_camera_lidar(check_forward(forward))
+        guess = (np.round(T, 6) + 0.0).tolist()
+    return {
+        "model": "pinhole",
+        "width_px": size_px[0],
+        "height_px": size_px[1],
+        "intrinsics_px": dict.fromkeys(("fx", "fy", "cx", "cy"), FILL_IN),
+        "distortion": FILL_IN,
+        "T_camera_lidar": guess,
+    }

@@ -1,0 +1,66 @@
+"""The content of YAML, JSON and OpenCV's XML files, as mappings of keys to values."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+
+from calibgraph.errors import FileError
+from calibgraph.files import read_json, read_text
+from calibgraph.yaml_text import parse_yaml_documents
+
+YAML_SUFFIXES = (".yaml", ".yml")
+
+
+def read_documents(path: Path) -> list[dict[str, Any]]:
+    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them.
+
+    Raises:
+        FileError: if it is malformed.
+    """
+    if path.suffix.lower() in YAML_SUFFIXES:
+        return parse_yaml_documents(re.sub(r"\A%YAML.*\n", "", read_text(path)), path)
+    return [read_json(path)]
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file.
+
+    Raises:
+        FileError: if it is not XML.
+    """
+    try:
+        root: ElementTree.Element = fromstring(read_text(path), forbid_dtd=True)
+    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+        raise FileError(path, f"is not a URDF or other XML: {error}") from error
+    return root
+
+
+def content_of_storage(root: ElementTree.Element) -> dict[str, Any]:
+    """The mapping of an XML file of OpenCV's FileStorage."""
+    return {child.tag: _value(child) for child in root}
+
+
+def _value(element: ElementTree.Element) -> Any:
+    """A mapping, a number, a list of numbers, or a text."""
+    if len(element):
+        return content_of_storage(element)
+    words = [_scalar(word) for word in (element.text or "").split()]
+    is_text = any(isinstance(word, str) for word in words)
+    if is_text or not words:
+        return (element.text or "").strip().strip('"')
+    return words[0] if len(words) == 1 and element.tag != "data" else words
+
+
+def _scalar(word: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            continue
+    return word

@@ -1,0 +1,164 @@
+"""Text files of matrices as KITTI, KITTI-360 and data sets like them write: ``KEY: numbers``.
+
+=======================  ==========================  ==============================================
+file                     lines                       direction
+=======================  ==========================  ==============================================
+calib_cam_to_velo.txt    12 or 16 numbers            p_velo = M p_cam, of KITTI-360's image_00
+calib_velo_to_cam.txt    12 numbers, or R: and T:    p_cam = M p_velo
+calib_cam_to_pose.txt    image_0k: 12 numbers        p_pose = M p_cam
+perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified images; p_rectified =
+                         S_rect_0k                   R_rect_00 p_cam, p_k = p_rectified + K^-1 P[3]
+=======================  ==========================  ==============================================
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.files import read_text
+from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
+from calibgraph.io.formats.rig_export import frame_id
+from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix
+from calibgraph.model.geometry import invert
+from calibgraph.model.rig import rigid_transform
+
+Array = NDArray[np.float64]
+
+_LIDAR, _POSE = "velodyne", "pose"
+_KITTI_360, _FIRST = "calib_cam_to_velo", "image_00"
+_TO_LIDAR = re.compile(r"cam[a-z]*_?(to|2)_?(velo|lidar)", re.IGNORECASE)
+_TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
+_EXPECTED = (
+    "expected KITTI's lines KEY: NUMBERS (perspective.txt, calib_cam_to_pose.txt), or the numbers "
+    "of one matrix in a file with cam_to_velo or velo_to_cam in its name"
+)
+
+
+def is_kitti_lines(text: str) -> bool:
+    """Whether the first line of a text is ``KEY: ...``, or a matrix or its first row."""
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    return ":" in first or len(_row(first)) in (4, 12, 16)
+
+
+def read_kitti_lines(path: Path, name: str | None) -> Part:
+    """The lenses and transforms of a file.
+
+    Args:
+        path: of the file.
+        name: of the camera of a single matrix; None for the only one, KITTI-360's for image_00.
+
+    Raises:
+        FileError: if it is malformed, or no such file.
+    """
+    lines = dict(_lines(path))
+    transforms = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
+    rectified = sorted(key[-2:] for key in lines if re.fullmatch(r"P_rect_\d\d", key))
+    if transforms:
+        links = [FrameLink(_POSE, f"{key}_optical", _rigid(row, path, key))
+                 for key, row in transforms.items()]  # fmt: skip
+        return Part(path, links=tuple(links))
+    if rectified:
+        return _rectified(lines, rectified, path)
+    camera = name or (_FIRST if path.stem == _KITTI_360 else ONLY_CAMERA)
+    link = FrameLink(f"{frame_id(camera)}_optical", _LIDAR, _T_camera_lidar(lines, path))
+    return Part(path, links=(link,))
+
+
+def _rectified(lines: dict[str, list[float]], numbers: list[str], path: Path) -> Part:
+    """The lenses of rectified images, and the frames of their cameras.
+
+    The first is turned by its rectification; others are shifted against it, as P = K [I | b] has
+    p_k = p_first + b.
+    """
+    lenses, links = {}, []
+    for k in numbers:
+        P = _matrix(lines, f"P_rect_{k}", (3, 4), path)
+        K = intrinsics_of_matrix(P[:, :3], f"{path}: P_rect_{k}")
+        width, height = _matrix(lines, f"S_rect_{k}", (1, 2), path)[0]
+        lenses[f"image_{k}"] = CameraLens("pinhole", (int(width), int(height)), K, ())
+        parent, T_k_parent = f"image_{k}_optical", np.eye(4)
+        if P[:, 3].any():
+            parent = f"image_{numbers[0]}_optical_frame"
+            T_k_parent[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+        else:
+            T_k_parent[:3, :3] = _matrix(lines, f"R_rect_{k}", (3, 3), path)
+        T = invert(_rigid(T_k_parent.ravel().tolist(), path, f"R_rect_{k}"))
+        links.append(FrameLink(parent, f"image_{k}_optical_frame", T))
+    return Part(path, lenses, links=tuple(links))
+
+
+def _T_camera_lidar(lines: dict[str, list[float]], path: Path) -> Array:
+    """(4, 4) of the one matrix of a file, in the direction that its name states.
+
+    Raises:
+        FileError: if it holds another one, or its name states no direction.
+    """
+    if {"R", "T"} <= lines.keys():
+        R, t = _matrix(lines, "R", (3, 3), path), _matrix(lines, "T", (3, 1), path)
+        row = np.hstack([R, t]).ravel().tolist()
+    elif set(lines) == {""}:
+        row = lines[""]
+    else:
+        raise FileError(path, f"has the lines {', '.join(lines)}; {_EXPECTED}")
+    to_lidar, to_camera = (bool(each.search(path.stem)) for each in (_TO_LIDAR, _TO_CAMERA))
+    if to_lidar == to_camera:
+        raise FileError(
+            path, "holds a matrix, and its name states no direction; name the file cam_to_velo.txt "
+            "if p_velo = M p_cam, velo_to_cam.txt if p_cam = M p_velo"
+        )  # fmt: skip
+    T = _rigid(row, path, "the matrix")
+    return invert(T) if to_lidar else T
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[float]]]:
+    """The numbers of each key; those without a key together."""
+    bare: list[float] = []
+    for line in read_text(path).splitlines():
+        key, colon, values = line.rpartition(":")
+        if colon and line.split(":")[0].strip().endswith("time"):
+            continue  # KITTI's calib_time, a date
+        if colon:
+            yield key.strip(), _row(values)
+        else:
+            bare += _row(line)
+    if bare:
+        yield "", bare
+
+
+def _row(text: str) -> list[float]:
+    """The numbers of a line; none if it holds a word."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        return []
+
+
+def _matrix(lines: dict[str, list[float]], key: str, shape: tuple[int, int], path: Path) -> Array:
+    found = np.array(lines.get(key, []))
+    if found.size != shape[0] * shape[1] or not np.isfinite(found).all():
+        raise FileError(
+            path, f"line {key!r} has {found.size} numbers, expected {shape[0] * shape[1]} finite "
+            "ones"
+        )  # fmt: skip
+    return found.reshape(shape)
+
+
+def _rigid(row: list[float], path: Path, what: str) -> Array:
+    """(4, 4) of 12 or 16 numbers.
+
+    Raises:
+        FileError: if they are no rigid transform.
+    """
+    if len(row) not in (12, 16):
+        raise FileError(path, f"{what} has {len(row)} numbers, expected 12 or 16; {_EXPECTED}")
+    rows = row if len(row) == 16 else [*row, 0.0, 0.0, 0.0, 1.0]  # noqa: PLR2004 - 4 x 4
+    try:
+        return rigid_transform(np.reshape(rows, (4, 4)))
+    except ValueError as error:
+        raise FileError(path, f"{what}: {error}") from error

@@ -1,0 +1,54 @@
+"""Rigs of data sets of which a camera lacks a part: the others are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from calibgraph.errors import FileError
+from calibgraph.files import checked_model
+from calibgraph.model.rig import Camera, Rig
+
+
+class IncompleteCamera(FileError):
+    """A camera without its lens, its pose or its images; what is there but wrong is no such."""
+
+
+class RigRead(NamedTuple):
+    """A rig of a data set.
+
+    Attributes:
+        rig: of its complete cameras.
+        notes: what was left out, added or taken from elsewhere, a line each.
+    """
+
+    rig: Rig
+    notes: tuple[str, ...] = ()
+
+
+def rig_of_complete(
+    lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
+) -> RigRead:
+    """The rig of the cameras that have all parts.
+
+    Args:
+        lidar: name of the LiDAR.
+        names: of the cameras.
+        read: one by its name; raises IncompleteCamera.
+        path: of the data set, for errors.
+
+    Raises:
+        FileError: if a camera is malformed, or none is complete.
+    """
+    cameras: dict[str, Camera] = {}
+    missing: dict[str, IncompleteCamera] = {}
+    for name in names:
+        try:
+            cameras[name] = read(name)
+        except IncompleteCamera as error:
+            missing[name] = error
+    if missing and not cameras:
+        raise next(iter(missing.values()))
+    notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
+    return RigRead(checked_model(Rig, {"lidar": lidar, "cameras": cameras}, path), notes)

@@ -1,0 +1,157 @@
+"""Point clouds of PCL: .pcd files, ascii, binary and compressed."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import FileError
+from calibgraph.io.lzf import MOST_RATIO, unpack_lzf
+from calibgraph.io.point_fields import (
+    RawCloud,
+    choose_fields,
+    lines_of_text,
+    raw_cloud,
+    read_count,
+    read_rows,
+    too_long,
+)
+
+_HEADER_BYTES = 65536
+_DATA = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
+_SIZES = struct.Struct("<II")  # compressed and uncompressed
+_KINDS = {f"{letter}{size}" for letter in "IU" for size in (1, 2, 4, 8)} | {"F2", "F4", "F8"}
+_PADDING = "_"
+_MOST_BYTES = 2 * 2**30  # unpacked
+
+
+@dataclass(frozen=True)
+class _Field:
+    """A field of each point: ``count`` numbers of a kind such as F4."""
+
+    name: str
+    kind: str
+    count: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of one number."""
+        return np.dtype(f"<{self.kind.lower()}")
+
+    @property
+    def bytes(self) -> int:
+        """In each point."""
+        return self.dtype.itemsize * self.count
+
+
+def read_pcd(path: Path) -> RawCloud:
+    """The points of a file, in the frame of the sensor, as they are stored.
+
+    Fields may be of any type and count; those named ``_`` are padding. ``VIEWPOINT`` is the pose of
+    the sensor in the world when it recorded the cloud. It is not applied, as PCL does not either:
+    points of one sensor stay in its frame.
+
+    Raises:
+        FileError: if the file is malformed, truncated, or has no one x, y and z.
+    """
+    data = path.read_bytes()
+    end = _DATA.search(data[:_HEADER_BYTES])
+    if end is None:
+        raise FileError(path, "has no complete .pcd header; is it complete?")
+    count, fields = _layout(path, data[: end.start()].decode("ascii", "replace"))
+    body, encoding = memoryview(data)[end.end() :], end[1].lower()
+    if encoding not in _READERS:
+        raise FileError(path, "has an unknown encoding in its header; write it as binary or ascii")
+    names = [f.name for f in fields if f.count == 1 and f.name != _PADDING]
+    choose_fields(path, names)  # before points are read as if they were right
+    columns = _READERS[encoding](path, body, count, fields)
+    named = {f.name: column for f, column in zip(fields, columns, strict=True) if f.count == 1}
+    return raw_cloud(path, names, named.__getitem__)
+
+
+def _layout(path: Path, header: str) -> tuple[int, list[_Field]]:
+    """The number of points and the fields of each.
+
+    Raises:
+        FileError: if the header is malformed.
+    """
+    lines = {words[0]: words[1:] for words in map(str.split, header.split("\n")) if words}
+    try:
+        names = lines.get("FIELDS") or lines["COLUMNS"]
+        counts = [read_count(word) for word in lines.get("COUNT", ["1"] * len(names))]
+        kinds = [a + b for a, b in zip(lines["TYPE"], lines["SIZE"], strict=True)]
+        fields = [_Field(*each) for each in zip(names, kinds, counts, strict=True)]
+        sides = [read_count(lines[side][0]) for side in ("WIDTH", "HEIGHT") if side in lines]
+        points = read_count(lines["POINTS"][0]) if "POINTS" in lines else sides[0] * sides[1]
+    except (KeyError, IndexError, ValueError) as error:
+        raise FileError(path, f"has a malformed PCD header ({error})") from None
+    whole = not sides or points == sides[0] * sides[-1] * (len(sides) > 1)
+    if not whole or min(counts) < 1 or not set(kinds) <= _KINDS:
+        raise FileError(path, "has a malformed PCD header: its FIELDS, SIZE, TYPE and COUNT, or "
+                        "its WIDTH, HEIGHT and POINTS do not fit")  # fmt: skip
+    if not points:
+        raise FileError(path, "holds no point")
+    return points, fields
+
+
+def _ascii_columns(
+    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+) -> Iterator[NDArray[Any]]:
+    """The first number of each field; padding may be left out of the lines."""
+    widths = [sum(f.count for f in fields), sum(f.count for f in fields if f.name != _PADDING)]
+    lines = lines_of_text(body)
+    rows = read_rows(path, lines, count, widths)
+    if next(lines, None) is not None:
+        raise too_long(path, count)
+    at, full = 0, rows.shape[1] == widths[0]
+    for each in fields:
+        yield rows[:, min(at, rows.shape[1] - 1)]
+        at += each.count * (full or each.name != _PADDING)
+
+
+def _binary_columns(
+    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+) -> Iterator[NDArray[Any]]:
+    """The first number of each field."""
+    row_bytes = sum(each.bytes for each in fields)
+    if len(body) < count * row_bytes:
+        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
+    if len(body) >= (count + 1) * row_bytes:
+        raise too_long(path, count)
+    at = 0
+    for each in fields:
+        yield np.ndarray((count,), each.dtype, body, at, (row_bytes,))
+        at += each.bytes
+
+
+def _compressed_columns(
+    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+) -> Iterator[NDArray[Any]]:
+    """The first number of each field: the fields lie one after the other, PCL's without padding."""
+    packed, unpacked = _SIZES.unpack(body[:8]) if len(body) >= _SIZES.size else (1, 0)
+    full = sum(each.bytes for each in fields) * count
+    short = sum(each.bytes for each in fields if each.name != _PADDING) * count
+    if len(body) < _SIZES.size + packed:
+        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
+    fits = unpacked in (full, short) and unpacked <= min(packed * MOST_RATIO, _MOST_BYTES)
+    data = np.frombuffer(body, np.uint8, packed, _SIZES.size)
+    plain = unpack_lzf(data, unpacked) if fits else None
+    if plain is None:
+        raise FileError(path, f"its compressed data are not its {count} points; write it again")
+    at = 0
+    for each in fields:
+        skipped = unpacked != full and each.name == _PADDING
+        yield np.ndarray((0 if skipped else count,), each.dtype, plain, at, (each.bytes,))
+        at += 0 if skipped else each.bytes * count
+
+
+_READERS = {
+    b"ascii": _ascii_columns, b"binary": _binary_columns, b"binary_compressed": _compressed_columns,
+}  # fmt: skip

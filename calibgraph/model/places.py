@@ -1,0 +1,109 @@
+"""Which frames share a place: stationary ones, which err the same, and near ones, which err alike.
+
+On disk, lists of frame numbers in a table's metadata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.errors import CorrespondenceError
+
+Numbers = NDArray[np.int64]
+Groups = tuple[tuple[int, ...], ...]
+
+PLACES = "places"
+STATIONARY = "stationary"
+_STATIONARY_BEFORE = "same_place"
+"""The key of older tables."""
+KEYS = (PLACES, STATIONARY, _STATIONARY_BEFORE)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Groups of frame numbers.
+
+    Attributes:
+        stationary: frames during which the vehicle stands, a group per stop; they count as one.
+        places: frames near each other, which show the same objects; None if nobody looked for them:
+            then all frames are of one place, and so are those that no group names.
+    """
+
+    stationary: Groups = ()
+    places: Groups | None = None
+
+    @staticmethod
+    def from_metadata(metadata: Mapping[str, Any]) -> Places:
+        """Read the keys of a table's metadata.
+
+        Raises:
+            CorrespondenceError: if they are not lists of lists of frame numbers.
+        """
+        key = STATIONARY if STATIONARY in metadata else _STATIONARY_BEFORE
+        named = _groups(metadata, PLACES) if PLACES in metadata else None
+        return Places(_groups(metadata, key), named)
+
+    def to_metadata(self) -> dict[str, Any]:
+        """As keys of the metadata; what is not known has no key."""
+        known = {STATIONARY: self.stationary or None, PLACES: self.places}
+        return {key: [list(g) for g in groups] for key, groups in known.items() if groups}
+
+    def merge(self, other: Places) -> Places:
+        """The groups of both; a group that both name alike is one."""
+        named = [each.places for each in (self, other) if each.places is not None]
+        return Places(
+            tuple(dict.fromkeys((*self.stationary, *other.stationary))),
+            tuple(dict.fromkeys(group for groups in named for group in groups)) if named else None,
+        )
+
+    def merge_stationary(self, frame: Numbers) -> Numbers:
+        """(n,) frame numbers, those of one stop replaced by the first of them."""
+        for stop in self.stationary:
+            frame = np.where(np.isin(frame, stop), np.int64(stop[0]), frame)
+        return frame
+
+    def split(self, frame: Numbers) -> list[Numbers]:
+        """(f,) numbers of frames, place by place."""
+        groups = self.places or ()
+        place_of = {number: place for place, group in enumerate(groups) for number in group}
+        place = np.array([place_of.get(number, len(groups)) for number in frame.tolist()], np.int64)
+        order = np.argsort(place, kind="stable")
+        edges = np.flatnonzero(np.diff(place[order])) + 1
+        return [part for part in np.split(frame[order], edges) if len(part)]
+
+    def frames_per_place(self, frame: Numbers) -> float:
+        """How many of (f,) frames share the error of a place, in the mean over frames."""
+        counts = [len(place) for place in self.split(frame)]
+        return float(np.square(counts).sum() / max(1, len(frame)))
+
+    def name_of(self, number: int) -> str:
+        """The place of a frame: the first number of its group; empty if no group has it."""
+        return next((str(group[0]) for group in self.places or () if number in group), "")
+
+
+NOWHERE = Places()
+"""Nobody looked for places."""
+
+
+def as_groups(groups: Sequence[Sequence[int]]) -> Groups:
+    """Lists of frame numbers as groups."""
+    return tuple(tuple(group) for group in groups)
+
+
+def _groups(metadata: Mapping[str, Any], key: str) -> Groups:
+    groups = metadata.get(key, [])
+    good = isinstance(groups, list) and all(
+        isinstance(group, list) and group and all(type(number) is int for number in group)
+        for group in groups
+    )
+    if not good:
+        raise CorrespondenceError(
+            f"{key} of the table's metadata must be lists of frame numbers, as in "
+            f"[[0, 1, 2], [7, 8]], found {groups!r:.60}"
+        )
+    return as_groups(groups)

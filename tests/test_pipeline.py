@@ -1,0 +1,217 @@
+"""The two calls of the library: what is saved, solved again, is what was reported."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import (
+    Calibration,
+    Config,
+    Correspondences,
+    Dataset,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    perturb,
+    simulate_correspondences,
+)
+from calibgraph.model.geometry import relative_transform, twist_between
+from calibgraph.model.places import Places
+from tests.conftest import SAMPLE, Call
+from tests.matching.structure.data import with_noise_images
+
+FRAMES = 6
+STATED = {
+    "systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.01,
+    "elevation_rad": 5e-4, "place_rotation_rad": 7e-4, "place_translation_m": 0.006,
+    "place_variance": 8.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture(scope="module")
+def guess(truth: Rig) -> Rig:
+    return perturb(truth, rotation_deg=1, translation_m=0.1, seed=3)
+
+
+def table_of(rig: Rig, *, places: bool = True) -> Correspondences:
+    """With an error that its frames share, found where places can be found."""
+    errors = MatcherErrors(outlier_share=0.1, frame_noise_px=0.5)
+    table = simulate_correspondences(rig, frames=FRAMES, matches=100, errors=errors)
+    stated = STATED | {"contrast": dict.fromkeys(rig.cameras, 30.0)} if places else {}
+    return replace(table, metadata={**table.metadata, **stated})
+
+
+def solve_again(saved: Calibration) -> Calibration:
+    """The saved table, from the saved result, with its settings."""
+    assert saved.correspondences is not None
+    return calibgraph.solve(
+        saved.rig,
+        saved.correspondences,
+        saved.config,
+        saved.terms,
+        camera_matches=saved.camera_matches,
+    )
+
+
+def require_same(saved: Calibration, again: Calibration) -> None:
+    """Within 1e-3 sigma: the tolerance at which the fit of the error model stops."""
+    for name in saved.rig.cameras:
+        covariance, other = saved.covariance[name], again.covariance[name]
+        xi = twist_between(saved.T_camera_lidar[name], again.T_camera_lidar[name])
+        if covariance is None or other is None:
+            assert covariance is None and other is None
+            np.testing.assert_allclose(xi, 0.0, atol=1e-9)
+            continue
+        sigma = np.sqrt(np.diag(covariance))
+        assert np.abs(xi / sigma).max() < 1e-3, name
+        scaled = (other - covariance) / np.outer(sigma, sigma)
+        assert np.abs(scaled).max() < 1e-3, name
+    assert again.counts == saved.counts
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The sample's frames as two recordings, the second mirrored: another place."""
+    made = []
+    for part, stems in enumerate((("000000", "000001", "000002"), ("000003", "000004", "000005"))):
+        folder = tmp_path_factory.mktemp(f"part{part}")
+        (folder / "lidar").mkdir()
+        for stem in stems:
+            cloud = np.load(SAMPLE / "lidar" / f"{stem}.npy")
+            np.save(folder / "lidar" / f"{stem}.npy", cloud * [1, 1 - 2 * part, 1, 1])
+            for images in (SAMPLE / "cameras").iterdir():
+                (image,) = images.glob(f"{stem}.*")
+                (folder / "cameras" / images.name).mkdir(parents=True, exist_ok=True)
+                shutil.copy(image, folder / "cameras" / images.name)
+        made.append(folder)
+    return made
+
+
+def load(folders: Sequence[Path], rig: Rig) -> Dataset:
+    return calibgraph.load_dataset(folders, rig)
+
+
+def some_cameras(rig: Rig, *names: str) -> Rig:
+    return Rig(cameras={name: rig.cameras[name] for name in names})
+
+
+def one_camera(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    names = ("front_left",)
+    alone = some_cameras(guess, *names)
+    return calibgraph.calibrate(load(data, alone), alone, table_of(some_cameras(truth, *names)))
+
+
+def no_overlap(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    names = ("front_left", "left")
+    two = some_cameras(guess, *names)
+    return calibgraph.calibrate(load(data, two), two, table_of(some_cameras(truth, *names)))
+
+
+def overlap(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    return calibgraph.calibrate(load(data, guess), guess, table_of(truth))
+
+
+def relative_pose(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    T = truth.T_camera_lidar
+    known = RelativePose(
+        a="front_left", b="left", T_a_b=relative_transform(T["front_left"], T["left"]),
+        rotation_sigma_rad=1e-3, translation_sigma_m=2e-3,
+    )  # fmt: skip
+    tied = guess.model_copy(update={"relative_poses": (known,)})
+    return calibgraph.calibrate(load(data, tied), tied, table_of(truth))
+
+
+def excluded_camera(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    """The images of one show noise, and few of its correspondences agree."""
+    table = table_of(truth)
+    own = np.flatnonzero(table.camera_index == table.cameras.index("left"))
+    pixels = table.pixels_px.copy()
+    pixels[own] = pixels[np.roll(own, 37)]
+    noise = with_noise_images(load(data, guess), "left", folder)
+    kept = np.setdiff1d(np.arange(len(table)), own[7:])
+    return calibgraph.calibrate(noise, guess, replace(table, pixels_px=pixels).select(kept))
+
+
+def no_time(guess: Rig, truth: Rig, data: Sequence[Path], folder: Path) -> Calibration:
+    return calibgraph.calibrate(load(data, guess), guess, table_of(truth), time_limit_s=1e-9)
+
+
+Make = Callable[[Rig, Rig, Sequence[Path], Path], Calibration]
+
+
+@pytest.mark.parametrize(
+    "make", [one_camera, no_overlap, overlap, relative_pose, excluded_camera, no_time]
+)
+def test_the_saved_table_solved_again_gives_the_saved_result(
+    make: Make, guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path
+) -> None:
+    made = make(guess, truth, recordings, tmp_path)
+    made.save(tmp_path / "result")
+    saved = calibgraph.load_calibration(tmp_path / "result")
+    require_same(saved, made)
+    require_same(saved, solve_again(saved))
+    assert saved.counts["front_left"]["places"] == 2
+    for name, sigmas in ((n, saved.sigmas(n)) for n in saved.rig.cameras):
+        assert (sigmas is None) == (make is excluded_camera and name == "left")
+
+
+def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
+    """The same table with two places named: a narrower error bar, so the test above can fail."""
+    table = table_of(truth)
+    named = table.with_places(Places(places=((0, 1, 2), (3, 4, 5))))
+    one, two = (calibgraph.solve(guess, each) for each in (table, named))
+    for name in truth.cameras:
+        a, b = one.covariance[name], two.covariance[name]
+        assert a is not None and b is not None
+        assert np.trace(b[:3, :3]) < 0.9 * np.trace(a[:3, :3])
+
+
+def test_the_checks_of_a_solution_are_those_of_its_table(guess: Rig, truth: Rig) -> None:
+    """A solve of a saved table gives its own verdict, to the last check."""
+    first = calibgraph.solve(guess, table_of(truth), Config(bootstrap=5))
+    again = solve_again(replace(first, rig=first.initial_rig))
+    assert again.verdict == first.verdict
+
+
+def test_a_folder_of_tables_is_solved_as_one(guess: Rig, truth: Rig, tmp_path: Path) -> None:
+    """Files of whole frames or of parts of them, each of which names its own places."""
+    table = table_of(truth)
+    whole = table.with_places(Places(places=((0, 1), (2, 3), (4, 5))))
+    (tmp_path / "parts").mkdir()
+    for number in range(3):
+        frames = [2 * number, 2 * number + 1]
+        part = table.select(np.isin(table.frame, frames))
+        part = part.with_places(Places(places=(tuple(frames),)))
+        part.save(tmp_path / "parts" / f"{number}.parquet")
+    found = calibgraph.solve(guess, tmp_path / "parts")
+    require_same(calibgraph.solve(guess, whole), found)
+    assert found.counts["left"]["places"] == 3
+
+
+def test_the_commands_solve_what_calibrate_saved(
+    guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
+) -> None:
+    made = overlap(guess, truth, recordings, tmp_path)
+    made.save(tmp_path / "result")
+    given = (tmp_path / "result", tmp_path / "result" / "correspondences.parquet")
+    matches = ("--camera-matches", tmp_path / "result" / "camera_matches.parquet")
+    code, _, err = call("solve", *given, *matches, "--out", tmp_path / "again")
+    assert code == 0, err
+    require_same(made, calibgraph.load_calibration(tmp_path / "again"))
+
+
+def test_an_excluded_camera_that_the_rig_lacks_is_refused(guess: Rig, truth: Rig) -> None:
+    with pytest.raises(ValueError, match=r"excluded_cameras names 'rear'; the rig has front_left"):
+        calibgraph.solve(guess, table_of(truth), Config(excluded_cameras=("rear",)))
