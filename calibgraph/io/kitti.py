@@ -25,7 +25,7 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
     return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
 
 
-def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
+def load_kitti_rig(sequence: Path) -> Rig:
     """The rig of a KITTI odometry sequence, from its own calibration.
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
@@ -33,8 +33,6 @@ def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
 
     Args:
         sequence: its folder.
-        shift_along_x_only: read it as some tools do, which shift by P_k[0, 3] / fx alone: about
-            5 mm off.
 
     Raises:
         FileError: if ``calib.txt`` is malformed or there is no image.
@@ -55,18 +53,12 @@ def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
             T_rectified_lidar,
             first_image_size(folder),
             f"{path}: P{name[-1]}",
-            along_x_only=shift_along_x_only,
         )
     return Rig(lidar=CLOUD_FOLDER, cameras=cameras)
 
 
 def camera_of_projection(
-    P: Array,
-    T_rectified_lidar: Array,
-    size_px: tuple[int, int],
-    where: str,
-    *,
-    along_x_only: bool = False,
+    P: Array, T_rectified_lidar: Array, size_px: tuple[int, int], where: str
 ) -> Camera:
     """A camera of a rectified rig.
 
@@ -75,7 +67,6 @@ def camera_of_projection(
         T_rectified_lidar: (4, 4) to that frame.
         size_px: width and height.
         where: the file and its line, for errors.
-        along_x_only: see :func:`load_kitti_rig`.
 
     Raises:
         FileError: if P is no such matrix, or the transform is none.
@@ -91,7 +82,7 @@ def camera_of_projection(
             "and undistort the skew",
         )
     shift = np.eye(4)
-    shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
+    shift[:3, 3] = np.linalg.solve(K, P[:, 3])
     content = {
         "width_px": size_px[0],
         "height_px": size_px[1],

@@ -17,8 +17,6 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
 from calibgraph.solver.repeats import number_repeats
 
-Array = NDArray[np.float64]
-
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
 
