@@ -50,7 +50,8 @@ def simulate_drive(
             failed, at_random = rng.random() < failed_share, rng.random() < 0.5
             seen = _displace(rng, camera) if failed and not at_random else camera
             made = nonsense if failed and at_random else errors
-            matcher = matchers[name].with_camera(seen, made)
+            matcher = matchers[name]  # its shared errors stay where the camera moves
+            matcher.camera, matcher.errors = seen, made
             tables.append(matcher.match(rng, name, frame, count=matches, depth_m=depth_m))
         yield concatenate(tables)
 
