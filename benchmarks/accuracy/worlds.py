@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
     Calibration,
     Camera,
@@ -20,7 +21,6 @@ from calibgraph import (
     concatenate,
     perturb,
 )
-from calibgraph.simulation.correspondences import simulate_drive
 
 Rng = np.random.Generator
 

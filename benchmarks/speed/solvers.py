@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.paper.baselines import minimize_trf, prior_rows
 from calibgraph import (
     Camera,
     Correspondences,
@@ -18,7 +19,6 @@ from calibgraph import (
     preset,
     simulate_correspondences,
 )
-from calibgraph.evaluation.baselines import minimize_trf, prior_rows
 from calibgraph.model.geometry import invert, to_T_camera_lidar
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.camera_block import camera_blocks

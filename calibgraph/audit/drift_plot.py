@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.audit.drift_result import CameraDrift, Drift
 from calibgraph.files import write_atomically
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _MARK = "calibgraph drift"
 _HEAD_BYTES = 500

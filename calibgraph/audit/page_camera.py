@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.audit.page_chart import Chart, charts_of
 from calibgraph.audit.result import Audit, CameraAudit, twist_cells
@@ -14,8 +13,6 @@ from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 from calibgraph.report.page_overlays import PICTURES_BYTES, draw_by_depth, width_on_page
 from calibgraph.report.worked_point import matrix_text
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ import typer
 
 from calibgraph.cli import outputs, remote
 from calibgraph.cli.bag import bag
-from calibgraph.cli.benchmark import bench, paper
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.check import check
 from calibgraph.cli.doctor import doctor
@@ -127,8 +126,6 @@ for _command, _outputs in COMMANDS.items():
     app.command(_command.__name__.rstrip("_").replace("_", "-"), help=_help_of(_command))(
         outputs.keep_files(_command, _outputs)
     )
-bench.command(help=_help_of(paper))(outputs.keep_files(paper, outputs.benchmark))
-app.add_typer(bench, name="bench")
 
 
 def main() -> None:

@@ -144,13 +144,6 @@ def picked(given: Given) -> list[Output]:
     return outputs_of_pick(given["out"])
 
 
-def benchmark(given: Given) -> list[Output]:
-    """The tables and the plot of the paper's experiment."""
-    from calibgraph.evaluation.output import outputs_of_report
-
-    return outputs_of_report(given["out"])
-
-
 def nothing(given: Given) -> list[Output]:
     """No file; or a new folder, which the library refuses if it holds data."""
     return []

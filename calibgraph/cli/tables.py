@@ -22,7 +22,6 @@ from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.summary import Summary
 
 if TYPE_CHECKING:
-    from calibgraph.evaluation.paper import Report, Row
     from calibgraph.matching.cmrnext.training.validation import Validation
 
 _DETAILS = "report.html or calibration.yaml"
@@ -211,24 +210,3 @@ def _cells(error: PoseError) -> list[str]:
         *(f"{value:.2f}" for value in (error.x_cm, error.y_cm, error.z_cm)),
         *(f"{value:.3f}" for value in (error.roll_deg, error.pitch_deg, error.yaw_deg)),
     ]
-
-
-def print_bench(console: Console, report: Report) -> None:
-    """Print, per number of frames and reference, the errors of the worst camera of every row."""
-    for block in report.blocks:
-        title = f"{report.data}, N = {block.frames}, {block.draws} draws, against {block.reference}"
-        table = empty_table(escape(title), "worst camera: median, 95 %")
-        add_number_columns(table, "E_R deg", "", "E_t cm", "", "failed")
-        for name, row in block.rows.items():
-            cells = [*_worst(row, "rotation_error_deg", 3), *_worst(row, "translation_error_cm", 2)]
-            table.add_row(escape(name), *cells, str(row.failed) if row.failed else "")
-        console.print(table)
-
-
-def _worst(row: Row, metric: str, digits: int) -> list[str]:
-    """Median and 95 % quantile of the camera with the largest median error."""
-    found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
-    if not found:
-        return ["-", "-"]
-    worst = max(found, key=lambda interval: interval.median)
-    return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]

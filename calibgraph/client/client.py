@@ -20,7 +20,6 @@ from calibgraph.progress import Progress, no_progress
 TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
 """In the environment: the token, if none is given."""
 
-WAIT_S = 20.0
 TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
 _PATHS = {"calibration": "calibrations", "solve": "solves", "check": "checks"}
 _LINES = "application/x-ndjson"

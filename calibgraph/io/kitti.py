@@ -25,12 +25,12 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
     return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
 
 
-def load_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> Rig:
+def load_kitti_rig(sequence: Path) -> Rig:
     """The rig of a KITTI odometry sequence; see :func:`read_kitti_rig`."""
-    return read_kitti_rig(sequence, shift_along_x_only=shift_along_x_only).rig
+    return read_kitti_rig(sequence).rig
 
 
-def read_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> RigRead:
+def read_kitti_rig(sequence: Path) -> RigRead:
     """The rig of a KITTI odometry sequence, from its own calibration.
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
@@ -38,8 +38,6 @@ def read_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> RigRe
 
     Args:
         sequence: its folder.
-        shift_along_x_only: read it as some tools do, which shift by P_k[0, 3] / fx alone: about
-            5 mm off.
 
     Raises:
         FileError: if ``calib.txt`` is malformed or there is no image.
@@ -58,21 +56,13 @@ def read_kitti_rig(sequence: Path, *, shift_along_x_only: bool = False) -> RigRe
         if line not in matrices:
             raise IncompleteCamera(path, f"line {line!r} is missing")
         size = first_image_size(folders[name])
-        where = f"{path}: {line}"
-        return camera_of_projection(
-            matrices[line], T_rectified_lidar, size, where, along_x_only=shift_along_x_only
-        )
+        return camera_of_projection(matrices[line], T_rectified_lidar, size, f"{path}: {line}")
 
     return rig_of_complete(CLOUD_FOLDER, folders, read, sequence)
 
 
 def camera_of_projection(
-    P: Array,
-    T_rectified_lidar: Array,
-    size_px: tuple[int, int],
-    where: str,
-    *,
-    along_x_only: bool = False,
+    P: Array, T_rectified_lidar: Array, size_px: tuple[int, int], where: str
 ) -> Camera:
     """A camera of a rectified rig.
 
@@ -81,7 +71,6 @@ def camera_of_projection(
         T_rectified_lidar: (4, 4) to that frame.
         size_px: width and height.
         where: the file and its line, for errors.
-        along_x_only: see :func:`load_kitti_rig`.
 
     Raises:
         FileError: if P is no such matrix, or the transform is none.
@@ -91,7 +80,7 @@ def camera_of_projection(
     if not np.isfinite(P).all():
         raise FileError(where, f"is no projection matrix of a camera: {P.tolist()}")
     shift = np.eye(4)
-    shift[:3, 3] = [P[0, 3] / K[0, 0], 0, 0] if along_x_only else np.linalg.solve(K, P[:, 3])
+    shift[:3, 3] = np.linalg.solve(K, P[:, 3])
     content = {
         "width_px": size_px[0],
         "height_px": size_px[1],

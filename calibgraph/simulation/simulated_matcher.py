@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import asdict
 
 import numpy as np
@@ -44,12 +43,6 @@ class SimulatedMatcher:
         self.bias_twist = errors.bias_pose.draw(self.rng)
         self.stuck_twist = errors.stuck_pose.draw(self.rng)
         self.bias_field = errors.bias_px * _draw_polynomial(self.rng)
-
-    def with_camera(self, camera: Camera, errors: MatcherErrors) -> SimulatedMatcher:
-        """The same matcher, with its shared errors and generator, of a camera that has moved."""
-        changed = copy(self)
-        changed.camera, changed.errors = camera, errors
-        return changed
 
     def match(
         self,

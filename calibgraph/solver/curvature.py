@@ -67,17 +67,6 @@ class Curvature:
         covariance: Array = root @ root.T
         return covariance
 
-    def response(self, covariance: Array) -> Array:
-        """(6 N, 6 N) covariance of the solution if each camera's correspondences are displaced.
-
-        Args:
-            covariance: (6 N, 6 N) of the displacements, each that of its camera's own solution.
-
-        Raises:
-            ValueError: if a direction is not determined.
-        """
-        return self.sandwich(self.of_correspondences @ covariance @ self.of_correspondences)
-
 
 def curvature_at(
     inliers: Objective,

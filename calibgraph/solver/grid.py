@@ -12,8 +12,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from factors.compiled import compiled
 
-Array = NDArray[np.float64]
-
 _MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, a hash table holds those that are taken
 _ROWS_OF_RUN = 4  # of one camera and frame, at least, in a table that is worth taking run by run
 

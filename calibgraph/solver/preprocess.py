@@ -18,8 +18,6 @@ from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
 from calibgraph.solver.repeats import number_repeats
 from calibgraph.solver.shared_error import with_common_error
 
-Array = NDArray[np.float64]
-
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
 

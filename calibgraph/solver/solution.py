@@ -6,9 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -16,8 +13,6 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.factor_graph import Optimum
 from calibgraph.solver.objective import Objective, Scales, Transforms
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

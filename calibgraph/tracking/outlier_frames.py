@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
@@ -17,8 +16,6 @@ from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.state import CameraState
-
-Array = NDArray[np.float64]
 
 AGREEMENT = 0.7
 """A frame agrees with an estimate that explains this share of the usual share of its matches."""

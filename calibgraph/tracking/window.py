@@ -18,7 +18,6 @@ from collections.abc import Mapping
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import RelativePose
@@ -28,8 +27,6 @@ from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
-
-Array = NDArray[np.float64]
 
 _RELINEARIZE = 2e-6  # rad and m: far below any sigma; every epoch begins linearized anew
 

@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import z_score
@@ -30,8 +29,6 @@ from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
 from calibgraph.trust.lens_evidence import measure_lens
 from calibgraph.trust.lens_parameter import LensParameter
-
-Array = NDArray[np.float64]
 
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence

@@ -108,7 +108,7 @@ def test_wrong_options_are_one_line(arguments: tuple[object, ...], call: Call) -
     ("arguments", "hint"),
     [
         (("calibrate", SAMPLE, "--colour", "red"), "see calibgraph calibrate --help"),
-        (("bench", "paper"), "see calibgraph bench paper --help"),
+        (("evaluate",), "see calibgraph evaluate --help"),
         (("calibrat", SAMPLE), "see calibgraph --help"),
     ],
 )
@@ -166,7 +166,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     for command in (
         "calibrate", "match", "solve", "report", "evaluate", "perturb", "export", "import",
-        "simulate", "weights", "train", "bench", "track",
+        "simulate", "weights", "train", "track",
     ):  # fmt: skip
         assert command in done.stdout
 

@@ -16,7 +16,6 @@ from calibgraph import (
 )
 from calibgraph.cli import outputs
 from calibgraph.cli.app import COMMANDS
-from calibgraph.cli.benchmark import paper
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.init import init
 from calibgraph.cli.simulate import simulate
@@ -78,7 +77,7 @@ def test_named_files_of_others_are_not_replaced(
     simulated: Path, calibrated_sample: CommandRun, call: Call
 ) -> None:
     result = Path(shutil.copytree(calibrated_sample.folder, simulated / "result"))
-    for name in ("paper.png", "notes.html", "result/report.html", "notes.csv"):
+    for name in ("notes.html", "result/report.html", "notes.csv"):
         (simulated / name).write_text("mine")
     (simulated / "settings.yaml").write_text("preset: kitti\n")
     table = simulated / "table.parquet"
@@ -94,7 +93,6 @@ def test_named_files_of_others_are_not_replaced(
         ("perturb", ("perturb", simulated, "--out", result / "calibration.yaml")),
         ("export", ("export", simulated, "--format", "ros2", "--out", simulated / "notes.html")),
         ("import", ("import", simulated / "rig.yaml", "--out", simulated / "settings.yaml")),
-        ("bench paper", ("bench", "paper", "kitti", "--out", simulated)),
     ]
     before = files_in(simulated)
     for command, arguments in cases:
@@ -145,7 +143,7 @@ def test_an_argument_longer_than_a_name_is_no_file(tmp_path: Path, call: Call) -
 
 
 def test_every_command_with_an_output_declares_it() -> None:
-    for command, written in {**COMMANDS, paper: outputs.benchmark}.items():
+    for command, written in COMMANDS.items():
         options = inspect.signature(command).parameters.keys()
         has_output = bool(options & set(outputs.WRITTEN))
         refuses_itself = command in (simulate, fleet, init)  # any data, what is no row, any file

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
     Correspondences,
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
 )
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.report import json_line
 from tests.conftest import make_camera
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import calibgraph
+from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
     Config,
     CorrespondenceError,
@@ -24,7 +25,6 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.restart import handle_small_step
 from calibgraph.tracking.step_detection import DetectedStep

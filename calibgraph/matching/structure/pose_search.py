@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.matching.structure.bodies import Body, lead, place, place_member
@@ -26,8 +25,6 @@ from calibgraph.matching.structure.pose_refinement import (
 )
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.rig import Camera, Rig
-
-Array = NDArray[np.float64]
 
 SEARCH_WINDOWS = 2100  # of the maps, per camera over all frames
 ROLLS_RAD = np.radians([0.0, -12.0, 12.0])

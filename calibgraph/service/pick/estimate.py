@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Rig
@@ -16,8 +15,6 @@ from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
 from calibgraph.service.pick.shape import Shape, shape_of
 from calibgraph.service.pick.solvers import MIN_PAIRS, SolverPose, poses_by_solver
 from calibgraph.trust.observability import weakest_direction
-
-Array = NDArray[np.float64]
 
 PAIRS_TO_FIND_A_WRONG_ONE = 6
 """Of a camera: with five, the four that are left beside a wrong one still fit almost anything."""

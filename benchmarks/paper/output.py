@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.evaluation.methods import HEADLINE
-from calibgraph.evaluation.paper import (
+from benchmarks.paper.experiment import (
     IMPROVEMENT,
     REPROJECTION,
     ROTATION,
@@ -22,9 +20,9 @@ from calibgraph.evaluation.paper import (
     Report,
     Row,
 )
-from calibgraph.evaluation.published import AXES, PAIR, published
-from calibgraph.files import write_atomically, write_text
-from calibgraph.outputs import Output
+from benchmarks.paper.methods import HEADLINE
+from benchmarks.paper.published import AXES, PAIR, published
+from benchmarks.tables import Table
 from calibgraph.report.as_json import finite
 
 if TYPE_CHECKING:
@@ -58,25 +56,33 @@ _COLUMN_IN, _ROW_IN, _NAMES_IN = 3.3, 0.27, 2.6
 
 def write_report(report: Report, folder: Path) -> list[Path]:
     """Write ``paper.md``, ``paper.json`` and ``paper.png``; returns their paths."""
-    written = _paths(folder)
-    write_text(written[0], markdown(report))
+    written = [folder / f"paper.{kind}" for kind in ("md", "json", "png")]
+    folder.mkdir(parents=True, exist_ok=True)
+    written[0].write_text(markdown(report), "utf-8")
     content = finite(json.loads(json.dumps(to_mapping(report))))
-    write_text(written[1], json.dumps(content, indent=1, allow_nan=False) + "\n")
-    write_atomically(written[2], lambda path: _plot(report, path))
+    written[1].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
+    _plot(report, written[2])
     return written
 
 
-def outputs_of_report(folder: Path) -> list[Output]:
-    """The files of a report in a folder; they are ours if the JSON there is a report's."""
-    content: Any = {}
-    with suppress(OSError, ValueError, RecursionError):
-        content = json.loads(_paths(folder)[1].read_text("utf-8"))
-    of_report = isinstance(content, dict) and "blocks" in content
-    return [Output(path, "bench paper", lambda _: of_report) for path in _paths(folder)]
+def worst_cameras(block: Block) -> Table:
+    """The errors of the worst camera of every row: the median and the 95 % quantile."""
+    heads = ("worst camera", "E_R [deg]", "95 %", "E_t [cm]", "95 %", "failed")
+    rows = (
+        (name, *_worst(row, ROTATION, 3), *_worst(row, TRANSLATION, 2), str(row.failed or ""))
+        for name, row in block.rows.items()
+    )
+    title = f"{block.frames} frames, {block.draws} draws, against {block.reference}"
+    return Table(title, heads, tuple(rows))
 
 
-def _paths(folder: Path) -> list[Path]:
-    return [folder / f"paper.{kind}" for kind in ("md", "json", "png")]
+def _worst(row: Row, metric: str, digits: int) -> list[str]:
+    """Median and 95 % quantile of the camera with the largest median error."""
+    found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
+    if not found:
+        return ["-", "-"]
+    worst = max(found, key=lambda interval: interval.median)
+    return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
 
 
 def to_mapping(report: Report) -> dict[str, Any]:

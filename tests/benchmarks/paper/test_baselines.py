@@ -8,15 +8,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import Config, preset
-from calibgraph.evaluation.baselines import (
+from benchmarks.paper.baselines import (
     TRF_TOLERANCE,
     oracle_weights,
     paper_solve,
     prior_rows,
 )
-from calibgraph.evaluation.methods import PreparedDraw
-from calibgraph.evaluation.sources import source_from
+from benchmarks.paper.methods import PreparedDraw
+from benchmarks.paper.sources import source_from
+from calibgraph import Config, preset
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.simulation.scenarios import scenario_of
 from calibgraph.solver.camera_block import camera_blocks

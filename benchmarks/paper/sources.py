@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -104,10 +104,6 @@ class Source(Protocol):
         """That many frames and a new guess."""
         ...
 
-    def halves(self, seed: int) -> tuple[Source, Source]:
-        """Two sources that share no frame."""
-        ...
-
 
 @dataclass(frozen=True)
 class Simulated:
@@ -116,12 +112,10 @@ class Simulated:
     Attributes:
         name: of the scenario.
         displacement: of the guesses.
-        stream: part of all seeds, so that streams share no drive.
     """
 
     name: str
     displacement: Displacement = Displacement()
-    stream: int = 0
     default_draws: int = field(default=50, init=False)
 
     @property
@@ -147,14 +141,10 @@ class Simulated:
     def draw(self, frames: int, seed: int) -> Draw:
         """A new drive and a new guess."""
         scenario = scenario_of(self.name)
-        drive_seed, guess_seed = _seeds(seed, self.stream)
+        drive_seed, guess_seed = _seeds(seed)
         rig = self.displacement.guess(scenario.rig, guess_seed)
         table = scenario.draw(self.frame_count(frames), drive_seed)
         return Draw(rig, table, {"truth": scenario.rig})
-
-    def halves(self, seed: int) -> tuple[Source, Source]:
-        """Different drives."""
-        return replace(self, stream=2 * self.stream + 1), replace(self, stream=2 * self.stream + 2)
 
 
 @dataclass(frozen=True)
@@ -164,12 +154,10 @@ class Recorded:
     Attributes:
         folders: dataset folder, or KITTI odometry sequences of one rig.
         displacement: of the guesses.
-        positions: of the frames to draw from; None for all.
     """
 
     folders: tuple[Path, ...]
     displacement: Displacement = Displacement()
-    positions: tuple[int, ...] | None = None
     preset: PresetName = field(default="kitti", init=False)
     default_draws: int = field(default=3, init=False)
 
@@ -190,7 +178,7 @@ class Recorded:
         if (folder / CALIBRATION_NAME).is_file():
             return {
                 "K^-1 P[:,3] (right)": load_kitti_rig(folder),
-                "P[0,3]/fx only": load_kitti_rig(folder, shift_along_x_only=True),
+                "P[0,3]/fx only": rig_shifted_along_x(folder),
             }
         if not (folder / REFERENCE_FILE).is_file():
             raise FileError(folder / REFERENCE_FILE, "no such file; a benchmark needs a reference")
@@ -198,16 +186,16 @@ class Recorded:
 
     def frame_count(self, wanted: int) -> int:
         """At most all frames."""
-        return min(wanted, len(self._positions()))
+        return min(wanted, len(self._dataset().frames))
 
     def draw(self, frames: int, seed: int) -> Draw:
         """A random subset of the frames, matched with ``structure`` from a new guess.
 
         The table is empty if the matcher finds nothing.
         """
-        draw_seed, guess_seed = _seeds(seed, 0)
-        positions = self._positions()
-        chosen = np.random.default_rng(draw_seed).permutation(positions)[: self.frame_count(frames)]
+        draw_seed, guess_seed = _seeds(seed)
+        count = len(self._dataset().frames)
+        chosen = np.random.default_rng(draw_seed).permutation(count)[: min(frames, count)]
         references = self.references
         rig = self.displacement.guess(next(iter(references.values())), guess_seed)
         data = load_dataset(self.folders, rig).select(",".join(map(str, np.sort(chosen))))
@@ -226,20 +214,23 @@ class Recorded:
             run.solution.rig, run.correspondences, references, simulated=False, matched=True
         )
 
-    def halves(self, seed: int) -> tuple[Source, Source]:
-        """Every frame is in one of two random halves."""
-        order = np.random.default_rng(seed).permutation(self._positions()).tolist()
-        if len(order) < 2:  # noqa: PLR2004 - halves
-            raise ValueError(f"{self.name}: to keep frames apart at least 2 are needed")
-        middle = (len(order) + 1) // 2
-        first, second = tuple(sorted(order[:middle])), tuple(sorted(order[middle:]))
-        return replace(self, positions=first), replace(self, positions=second)
-
-    def _positions(self) -> Sequence[int]:
-        return self.positions or range(len(self._dataset().frames))
-
     def _dataset(self) -> Dataset:
         return load_dataset(self.folders, next(iter(self.references.values())))
+
+
+def rig_shifted_along_x(sequence: Path) -> Rig:
+    """A KITTI rig as some tools read it: shifted by P[0, 3] / fx along x, about 5 mm off."""
+    rig = load_kitti_rig(sequence)
+    lines = (sequence / CALIBRATION_NAME).read_text("utf-8").splitlines()
+    values = dict(line.split(":", 1) for line in lines if ":" in line)
+    T_camera_lidar = {}
+    for name, camera in rig.cameras.items():
+        P = np.array(values[f"P{name[-1]}"].split(), dtype=np.float64).reshape(3, 4)
+        T_along_right = np.eye(4)
+        T_along_right[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])
+        T_along_right[0, 3] += P[0, 3] / P[0, 0]
+        T_camera_lidar[name] = T_along_right @ camera.T_camera_lidar
+    return rig.moved_to(T_camera_lidar)
 
 
 def _no_matches(camera: str) -> Correspondences:
@@ -248,14 +239,14 @@ def _no_matches(camera: str) -> Correspondences:
     )
 
 
-def _seeds(seed: int, stream: int) -> tuple[int, int]:
+def _seeds(seed: int) -> tuple[int, int]:
     """Independent seeds of a draw's correspondences and of its guess."""
-    state = np.random.SeedSequence([seed, stream]).generate_state(2)
+    state = np.random.SeedSequence([seed, 0]).generate_state(2)
     return int(state[0] >> 1), int(state[1] >> 1)
 
 
 def source_from(data: str, displacement: Displacement | None = None) -> Source:
-    """The source that a command-line argument names.
+    """The source that the argument DATA names.
 
     Args:
         data: a scenario's name; a dataset folder with a ``reference.yaml``, or a KITTI odometry

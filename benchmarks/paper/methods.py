@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.paper.baselines import oracle_solve, paper_solve, per_camera_adjustment
+from benchmarks.paper.sources import Draw
 from calibgraph.errors import CorrespondenceError
-from calibgraph.evaluation.baselines import oracle_solve, paper_solve, per_camera_adjustment
-from calibgraph.evaluation.sources import Draw
 from calibgraph.model.config import Config, Terms, preset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_transform

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibgraph.evaluation.methods import STAGE1, TRF_TERMS
+from benchmarks.paper.methods import STAGE1, TRF_TERMS
 
 AXES = (
     "translation_error_cm", "rotation_error_deg", "x_cm", "y_cm", "z_cm",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,13 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.paper.__main__ import main
+from benchmarks.paper.experiment import interval, run_experiment
+from benchmarks.paper.methods import HEADLINE, METHODS, ORACLE, STAGE1, TRF_TERMS
+from benchmarks.paper.output import markdown, to_mapping, write_report
+from benchmarks.paper.published import PAIR, published
+from benchmarks.paper.sources import Draw, Simulated, source_from
 from calibgraph import CorrespondenceError, preset
-from calibgraph.evaluation.methods import HEADLINE, METHODS, ORACLE, STAGE1, TRF_TERMS
-from calibgraph.evaluation.output import markdown, to_mapping, write_report
-from calibgraph.evaluation.paper import interval, run_experiment
-from calibgraph.evaluation.published import PAIR, published
-from calibgraph.evaluation.sources import Draw, Simulated, source_from
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE
 
 KITTI = preset("kitti")
 
@@ -34,10 +36,18 @@ class Thinned(Simulated):
         return replace(draw, table=draw.table.select(few))
 
 
+def run_main(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    """As ``python -m benchmarks.paper`` with these arguments."""
+    monkeypatch.setattr(sys, "argv", ["benchmarks.paper", *map(str, arguments)])
+    main()
+
+
 @pytest.mark.slow
-def test_bench_writes_every_row_and_metric(tmp_path: Path, call: Call) -> None:
-    code, _, text = call("bench", "paper", "kitti", "--frames", 5, "--draws", 2, "--out", tmp_path)
-    assert code == 0, text
+def test_every_row_and_metric_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_main(monkeypatch, "kitti", "--frames", 5, "--draws", 2, "--out", tmp_path)
+    assert "5 frames, 2 draws, against truth" in capsys.readouterr().out
     content = json.loads((tmp_path / "paper.json").read_text())
     (block,) = content["blocks"]
     assert (block["frames"], block["draws"], block["reference"]) == (5, 2, "truth")
@@ -91,20 +101,44 @@ def test_rows_that_fail_are_counted_and_marked() -> None:
 
 
 def test_a_recording_without_matches_fails_in_every_row(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, call: Call
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def find_nothing(*arguments: object, **options: object) -> None:
         raise CorrespondenceError("nothing", camera="left")
 
-    monkeypatch.setattr("calibgraph.evaluation.sources.match_in_rounds", find_nothing)
+    monkeypatch.setattr("benchmarks.paper.sources.match_in_rounds", find_nothing)
     report = run_experiment(source_from(str(SAMPLE)), frames=[2], draws=1, config=KITTI)
     assert report.published_as == ""
     assert all(row.failed == 1 for row in report.blocks[0].rows.values())
     assert len(write_report(report, tmp_path)) == 3
-    options = "--frames", 2, "--draws", 1, "--out", tmp_path / "new.yaml"
-    code, _, text = call("bench", "paper", SAMPLE, *options)
-    assert code == 2 and "calibgraph calibrate reports why" in text
-    assert not (tmp_path / "new.yaml").exists()
+    with pytest.raises(SystemExit):
+        run_main(monkeypatch, SAMPLE, "--frames", 2, "--draws", 1, "--out", tmp_path / "new")
+    assert "calibgraph calibrate reports why" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nowhere",), "'nowhere' is no scenario (kitti, walkley"),
+        (("kitti", "--frames", "ten"), "--frames: invalid int value: 'ten'"),
+        (("kitti", "--preset", "auto"), "--preset: invalid choice: 'auto'"),
+        (("kitti", "--frames", "10001"), "10001 frames: at most 10000"),
+        (("kitti", "--draws", "0"), "nothing to do: 0 draws"),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    arguments: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as exit_code:
+        run_main(monkeypatch, *arguments, "--out", tmp_path / "out")
+    assert exit_code.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_papers_numbers_are_those_of_its_tables() -> None:

@@ -10,8 +10,8 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from calibgraph.evaluation.methods import STAGE1, PreparedDraw, run_methods
-from calibgraph.evaluation.sources import Source
+from benchmarks.paper.methods import STAGE1, PreparedDraw, run_methods
+from benchmarks.paper.sources import Source
 from calibgraph.model.config import Config
 from calibgraph.model.metrics import PoseError, evaluate
 from calibgraph.model.rig import Rig
