@@ -88,8 +88,8 @@ def drift_figure(drift: Drift) -> Figure:
     for axes in grid[0]:
         axes.legend(fontsize=8, ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
     figure.suptitle(
-        f"{drift.status}: deviation from the other results, 1 sigma; grey: the tolerance; "
-        "circled: CHANGED",
+        f"Which result deviates from the others? {drift.status}\n"
+        "deviation from the other results, 1 sigma; grey: the tolerance; circled: CHANGED",
         fontsize=10,
     )
     return figure

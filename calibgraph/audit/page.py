@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.audit.page_camera import STYLES, camera_sections
-from calibgraph.audit.result import Audit, AuditStatus, twist_cells
+from calibgraph.audit.page_camera import camera_sections
+from calibgraph.audit.result import Audit, twist_cells
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.result_files import has_page_mark
+from calibgraph.model.summary import Reason
 from calibgraph.outputs import Output
-from calibgraph.report.html import load_template
+from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import depth_scale
 
 _BY = "check"
@@ -62,11 +63,11 @@ def audit_html(audit: Audit) -> str:
     cameras, left_out = camera_sections(audit)
     return load_template("page.html.j2", "calibgraph.audit").render(
         audit=audit,
-        style=STYLES[audit.status],
+        date=datetime.now(UTC).date().isoformat(),
         cameras=cameras,
         pictures_left_out=left_out,
         answer=_answer(audit),
-        findings=_findings(audit),
+        reasons=_reasons(audit),
         advice=_advice(audit),
         detectable=_detectable(audit),
         lidar=_lidar(audit),
@@ -90,32 +91,15 @@ def _answer(audit: Audit) -> str:
     return f"{wrong} For {', '.join(unknown)} this recording cannot tell." if unknown else wrong
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What was found of one camera, or of several alike.
-
-    Attributes:
-        status: of them.
-        style: of the status.
-        cameras: their names.
-        reason: of the status.
-    """
-
-    status: AuditStatus
-    style: str
-    cameras: str
-    reason: str
-
-
-def _findings(audit: Audit) -> list[Finding]:
-    """What was found of each camera; the same of several is one line."""
-    alike: dict[tuple[AuditStatus, str], list[str]] = {}
+def _reasons(audit: Audit) -> list[Reason]:
+    """The findings of the LiDAR and of each camera; the same of several is one line."""
+    alike: dict[tuple[str, str], tuple[str, ...]] = {}
+    if audit.lidar is not None:
+        alike["WRONG", f"{audit.lidar.reason}; all cameras agree on it"] = ("LiDAR",)
     for name, camera in audit.cameras.items():
-        alike.setdefault((camera.status, camera.reason), []).append(name)
-    return [
-        Finding(status, STYLES[status], ", ".join(names), reason)
-        for (status, reason), names in alike.items()
-    ]
+        key = camera.status, camera.reason
+        alike[key] = (*alike.get(key, ()), name)
+    return [Reason(status, names, text) for (status, text), names in alike.items()]
 
 
 def _advice(audit: Audit) -> list[str]:

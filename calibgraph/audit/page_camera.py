@@ -9,16 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.audit.page_chart import Chart, charts_of
-from calibgraph.audit.result import Audit, AuditStatus, CameraAudit, twist_cells
+from calibgraph.audit.result import Audit, CameraAudit, twist_cells
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 from calibgraph.report.page_overlays import PICTURES_BYTES, draw_by_depth, width_on_page
 from calibgraph.report.worked_point import matrix_text
 
 Array = NDArray[np.float64]
-
-STYLES: dict[AuditStatus, str] = {"OK": "PASS", "CANNOT TELL": "WARN", "WRONG": "FAIL"}
-"""The style of each status: that of a verdict."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,6 @@ class Section:
         name: of the camera.
         anchor: of its section in the page.
         audit: of the camera.
-        style: of its status.
         rows: label and six cells each: deviation, sigma, smallest detectable change.
         charts: rotations and translations; none where nothing was measured.
         pictures: None if they cannot be drawn.
@@ -54,7 +50,6 @@ class Section:
     name: str
     anchor: str
     audit: CameraAudit
-    style: str
     rows: tuple[tuple[str, list[str]], ...]
     charts: tuple[Chart, ...]
     pictures: Pictures | None
@@ -69,7 +64,6 @@ def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
             name=name,
             anchor=f"camera-{number}",
             audit=camera,
-            style=STYLES[camera.status],
             rows=_rows(camera),
             charts=charts_of(camera, audit.tolerance_deg, audit.tolerance_cm),
             pictures=pictures.get(name),

@@ -121,7 +121,18 @@ def serve(
         grace_s=grace_s,
         **counted,
     )
-    serve_app(create_app(settings), address)
+    serve_app(create_app(settings), address, lambda url: _announce(url, tokens))
+
+
+def _announce(url: str, tokens: Path | None) -> None:
+    """Where the pages are, and whether they ask for a token."""
+    if tokens is None:
+        needed = "no token is needed, and no other machine can reach it"
+    else:
+        needed = (
+            f"it asks for a token of {tokens}; calibgraph token {tokens} --tenant NAME makes one"
+        )
+    print_plain(terminal(), f"open {url} in a browser: {needed}")
 
 
 def token(

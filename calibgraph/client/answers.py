@@ -37,6 +37,7 @@ class RemoteJob:
         verdict: of the result; None as long as there is none.
         cannot_tell: whether the data determine too little for another one; None if unknown.
         error: why it failed, in one line.
+        name, note: that were given with it.
     """
 
     id: str
@@ -48,6 +49,8 @@ class RemoteJob:
     verdict: str | None = None
     cannot_tell: bool | None = None
     error: str | None = None
+    name: str = ""
+    note: str = ""
 
     @property
     def is_finished(self) -> bool:
@@ -68,6 +71,8 @@ def job_of(answer: Mapping[str, Any]) -> RemoteJob:
         verdict=answer.get("verdict"),
         cannot_tell=answer.get("cannot_tell"),
         error=error.get("detail"),
+        name=answer.get("name", ""),
+        note=answer.get("note", ""),
     )
 
 

@@ -37,10 +37,13 @@ class AsyncClient:
         inputs: Mapping[str, Sequence[Source]],
         settings: Mapping[str, Any] | None = None,
         *,
+        name: str = "",
+        note: str = "",
         key: str | None = None,
     ) -> RemoteJob:
         """Ask for a job."""
-        with form_of(inputs, json.dumps(dict(settings or {}))) as fields:
+        texts = {"settings": json.dumps(dict(settings or {})), "name": name, "note": note}
+        with form_of(inputs, texts) as fields:
             headers = {} if key is None else {"Idempotency-Key": key}
             return job_of(await self._json("POST", path_of(kind), files=fields, headers=headers))
 

@@ -58,6 +58,8 @@ class Client:
         inputs: Mapping[str, Sequence[Source]],
         settings: Mapping[str, Any] | None = None,
         *,
+        name: str = "",
+        note: str = "",
         key: str | None = None,
     ) -> RemoteJob:
         """Ask for a job.
@@ -67,9 +69,12 @@ class Client:
             inputs: paths, which are sent, or URIs, which the server reads: ``rig``,
                 ``correspondences``, ``recording``.
             settings: of the kind.
+            name: for people, shown in the list of jobs.
+            note: for people, shown with the job.
             key: a repeated request with it gives the job of the first.
         """
-        with form_of(inputs, json.dumps(dict(settings or {}))) as fields:
+        texts = {"settings": json.dumps(dict(settings or {})), "name": name, "note": note}
+        with form_of(inputs, texts) as fields:
             headers = {} if key is None else {"Idempotency-Key": key}
             return job_of(self._json("POST", path_of(kind), files=fields, headers=headers))
 

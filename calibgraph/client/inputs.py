@@ -29,18 +29,20 @@ def is_uri(source: Source) -> bool:
 
 
 @contextmanager
-def form_of(inputs: Mapping[str, Sequence[Source]], settings: str) -> Iterator[list[Field]]:
+def form_of(
+    inputs: Mapping[str, Sequence[Source]], texts: Mapping[str, str]
+) -> Iterator[list[Field]]:
     """The parts of a form; its files are open in the body.
 
     Args:
         inputs: by name: ``rig``, ``correspondences``, ``recording``.
-        settings: JSON.
+        texts: by name: ``settings`` as JSON, ``name``, ``note``.
 
     Raises:
         FileError: if one cannot be read.
     """
     with ExitStack() as stack:
-        fields: list[Field] = [("settings", (None, settings))]
+        fields: list[Field] = [(name, (None, text)) for name, text in texts.items()]
         for name, sources in inputs.items():
             for source in sources:
                 fields.append((name, _part(stack, name, source)))

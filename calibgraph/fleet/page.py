@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections import Counter
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,8 @@ from calibgraph.files import write_text
 from calibgraph.fleet.findings import find_changes
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import Words, newest_rows, observe
-from calibgraph.fleet.standing import COLOURS, Standing, stand
+from calibgraph.fleet.standing import STATES, Standing, stand
+from calibgraph.report.kit import load_template
 
 Array = NDArray[np.float64]
 
@@ -50,10 +49,18 @@ def write_fleet_report(
     fleet = fit_fleet(observe(newest))
     earlier = newest_rows(rows, days_ago=_WEEK) if before is None else newest_rows(before)
     standing = stand(newest, fleet, earlier)
-    content = json.dumps(payload(fleet, standing, link), separators=(",", ":"))
-    template = files("calibgraph.fleet").joinpath("page.html").read_text("utf-8")
-    write_text(path, template.replace("@DATA@", content.replace("<", "\\u003c")))
+    template = load_template("page.html.j2", "calibgraph.fleet")
+    content, last = payload(fleet, standing, link), _last_day(fleet.observations.day)
+    write_text(
+        path, template.render(content=content, vehicles=len(content["vehicles"]), newest=last)
+    )
     return fleet
+
+
+def _last_day(days: Array) -> str:
+    """The newest date, YYYY-MM-DD; empty without any."""
+    known = days[np.isfinite(days)]
+    return str(np.datetime64(int(known.max()), "D")) if len(known) else ""
 
 
 def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
@@ -68,13 +75,13 @@ def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
     reasons, reason = _count_reasons([standing.reasons[index] for index in order])
     sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
     return {
-        "colours": COLOURS, "link": link, "cameras": cameras.tolist(), "models": models,
+        "states": STATES, "link": link, "cameras": cameras.tolist(), "models": models,
         "batches": batches, "vehicles": vehicles.tolist(), "reasons": reasons,
         "findings": [[finding.kind, finding.text] for finding in find_changes(fleet)],
         "model": _pack(model, "<u2"), "batch": _pack(batch, "<u2"),
         "day": _pack(np.nan_to_num(of.day[first], nan=-1), "<i4"),
         "vehicle": _pack(vehicle, "<u4"), "camera": _pack(camera, "<u2"),
-        "colour": _pack(standing.colour[order], "<u1"),
+        "state": _pack(standing.state[order], "<u1"),
         "changed": _pack(standing.changed[order], "<u1"),
         "reason": _pack(reason, "<u2"),
         **{name: _pack(_scaled(np.where(of.measured[:, None], values, np.nan)[order]), "<i2")

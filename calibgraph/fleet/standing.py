@@ -1,4 +1,4 @@
-"""Green, yellow, red or unknown: where each camera of each vehicle stands."""
+"""PASS, WARN, FAIL or no result: where each camera of each vehicle stands."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel
 from calibgraph.fleet.observations import Observations, observe, words
 from calibgraph.model.geometry import twists_between
 
-COLOURS = ("green", "yellow", "red", "unknown")
-_GREEN, _YELLOW, _RED, _UNKNOWN = range(4)
+STATES = ("PASS", "WARN", "FAIL", "NO RESULT")
+_PASS, _WARN, _FAIL, _NO_RESULT = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,13 +23,13 @@ class Standing:
     """One entry per row of the fleet.
 
     Attributes:
-        colour: (n,) index into COLOURS. Red: FAIL, or the camera was moved in its mount. Yellow:
-            WARN, or another pose than before. Unknown: no result, or none with an error bar.
+        state: (n,) index into STATES. FAIL: that verdict, or the camera was moved in its mount.
+            WARN: that verdict, no error bar, or another pose than before.
         changed: (n,) whether the pose is another one than before.
-        reasons: (n,) in words; empty if green.
+        reasons: (n,) in words; empty if PASS.
     """
 
-    colour: NDArray[np.uint8]
+    state: NDArray[np.uint8]
     changed: NDArray[np.bool_]
     reasons: list[str]
 
@@ -46,13 +46,14 @@ def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> 
     if before is not None and len(before):
         changed = changed_poses(fleet.observations, observe(before))
     status, verdict = words(rows, "status"), words(rows, "verdict")
-    colour = np.full(len(rows), _UNKNOWN, dtype=np.uint8)
-    colour[fleet.observations.measured] = _GREEN
-    colour[fleet.observations.measured & ((verdict == "WARN") | changed)] = _YELLOW
-    colour[fleet.apart | ((status == "done") & (verdict == "FAIL"))] = _RED
+    done, measured = status == "done", fleet.observations.measured
+    state = np.full(len(rows), _NO_RESULT, dtype=np.uint8)
+    state[done] = _WARN
+    state[measured & (verdict != "WARN") & ~changed] = _PASS
+    state[fleet.apart | (done & (verdict == "FAIL"))] = _FAIL
     turned = set(moved_lidars(fleet))
     lidar = np.isin(fleet.observations.vehicle, list(turned)) if turned else changed & False
-    return Standing(colour, changed, _reasons(rows, fleet, changed, lidar))
+    return Standing(state, changed, _reasons(rows, fleet, changed, lidar))
 
 
 def changed_poses(now: Observations, before: Observations) -> NDArray[np.bool_]:

@@ -171,6 +171,7 @@ class _Parts(BaseModel):
     error_sources: dict[str, ErrorSources] = {}
     inputs: dict[str, str]
     versions: dict[str, str]
+    date: str = ""
 
 
 def _require_consistent(
@@ -215,7 +216,7 @@ _OF_SOME_CAMERAS = (
 _PLAIN = (
     "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
     "counts", "timings_s", "terms", "prior_share", "error_sources", "inputs", "versions",
-    "warnings",
+    "date", "warnings",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

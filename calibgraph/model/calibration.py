@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
@@ -112,6 +113,7 @@ class Calibration:
             not looked for.
         inputs: SHA-256 of the input files, by path.
         versions: of this package and the libraries that matter.
+        date: day of the solve (UTC), YYYY-MM-DD; empty in results of earlier versions.
     """
 
     rig: Rig
@@ -136,6 +138,7 @@ class Calibration:
     camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=package_versions)
+    date: str = field(default_factory=lambda: datetime.now(UTC).date().isoformat())
 
     @property
     def verdict(self) -> Verdict:
@@ -291,6 +294,7 @@ class Calibration:
             "timings_s": self.timings_s,
             "inputs": self.inputs,
             "versions": self.versions,
+            "date": self.date,
         }
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,18 @@ from calibgraph.model.calibration import Calibration
 def middle_frame(result: Calibration) -> Mapping[str, Any] | None:
     """The entry of the frame whose images are shown; None if the result names no frames."""
     return result.frames[len(result.frames) // 2] if result.frames else None
+
+
+def recording_name(result: Calibration) -> str:
+    """What a result was made from, in short: the last two folders of its recordings, or its table.
+
+    Returns:
+        The names; empty if the result names no files.
+    """
+    if not result.frames:
+        return Path(next(iter(result.inputs), "")).name
+    found = {os.path.commonpath([e["cloud"], *e["images"].values()]) for e in result.frames}
+    return ", ".join("/".join(Path(each).parts[-2:]) for each in sorted(found))
 
 
 def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import yaml
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from calibgraph.files import write_text
+from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.report.camera_section import camera_section
+from calibgraph.report.frames import recording_name
+from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.reprojection_errors import errors_before_after
@@ -20,17 +23,11 @@ from calibgraph.report.reprojection_errors import errors_before_after
 Array = NDArray[np.float64]
 
 _CAN_I_USE_IT = {
-    "PASS": "Yes. All checks passed.",
-    "WARN": "With care: a check is beyond its limit, or the result may be off. Read the reasons, "
-    "and look at the pictures.",
-    "FAIL": "No. Do not use this result; the reasons below name what to correct.",
+    ("PASS", False): "Yes. All checks passed.",
+    ("WARN", True): "With care: nothing seems wrong, but the data leave too much open.",
+    ("WARN", False): "With care: read the reasons, and look at the pictures.",
+    ("FAIL", False): "No. Do not use this result.",
 }
-
-
-_UNSURE = (
-    "With care: nothing seems wrong, but the data cannot tell more; the reasons name what is "
-    "missing."
-)
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -67,10 +64,14 @@ def report_html(result: Calibration) -> str:
     return load_template("page.html.j2").render(
         result=result,
         cameras=cameras,
-        usable=_UNSURE if summary.cannot_tell else _CAN_I_USE_IT[summary.status],
+        summary=summary,
+        recording=recording_name(result),
+        usable=_CAN_I_USE_IT[summary.status, summary.cannot_tell],
+        actions=summary.actions or ("Deploy it: see below.",),
         accuracy=_accuracy(result),
+        export_command=_export_command(result),
+        export_formats=EXPORT_FORMATS,
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
-        reasons=(*summary.reasons, *summary.others),
         between=pair_sections(result),
         match_scale=match_scale(),
         overlays_left_out=overlays_left_out,
@@ -81,22 +82,15 @@ def report_html(result: Calibration) -> str:
     )
 
 
-def load_template(name: str, package: str = "calibgraph.report") -> Template:
-    """A page's template, which may use the report's: ``base.html.j2``, ``macros.html.j2``.
-
-    Args:
-        name: of its file.
-        package: that the file is in.
-    """
-    loader = ChoiceLoader([PackageLoader(each, "") for each in (package, "calibgraph.report")])
-    environment = Environment(
-        loader=loader,
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(name)
+def _export_command(result: Calibration) -> str:
+    """The command that exports the cameras that did not FAIL; empty if there are none."""
+    usable = [n for n in result.rig.cameras if result.camera_verdicts[n].status != "FAIL"]
+    if not usable:
+        return ""
+    words = ["calibgraph", "export", ".", "--format", "ros2-launch", "--out", "rig.launch.xml"]
+    if len(usable) < len(result.rig.cameras):
+        words += [word for name in usable for word in ("--camera", name)]
+    return shlex.join(words)
 
 
 def _accuracy(result: Calibration) -> str:

@@ -23,14 +23,16 @@ class WorkedPoint:
 
     Attributes:
         matrix: the rows of T_camera_lidar.
+        pose: translation and quaternion of T_camera_lidar.
+        inverse: those of the static transform of ROS TF, from lidar to camera_optical.
         steps: the calculation.
-        inverse: the static transform of ROS TF, from lidar to camera_optical.
         origin: which point it is.
     """
 
     matrix: str
-    steps: str
+    pose: str
     inverse: str
+    steps: str
     origin: str
 
 
@@ -54,7 +56,8 @@ def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoi
             f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
             f"residual {used.sizes_px[row]:.2f} px"
         )
-    return WorkedPoint(matrix_text(T), _steps(camera, point) + matched, _inverse(T), origin)
+    steps = _steps(camera, point) + matched
+    return WorkedPoint(matrix_text(T), pose_text(T), pose_text(invert(T)), steps, origin)
 
 
 def _steps(camera: Camera, point: Array) -> str:
@@ -93,11 +96,10 @@ def matrix_text(T: Array) -> str:
     return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
 
 
-def _inverse(T_camera_lidar: Array) -> str:
-    """Translation and quaternion of T_lidar_camera."""
-    T_lidar_camera = invert(T_camera_lidar)
-    x, y, z, w = Rotation.from_matrix(T_lidar_camera[:3, :3]).as_quat()
+def pose_text(T: Array) -> str:
+    """Translation and quaternion of a transform, with their order and unit."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     return (
-        f"translation x y z   = {' '.join(f'{v:.6f}' for v in T_lidar_camera[:3, 3])} m\n"
+        f"translation x y z   = {' '.join(f'{v:.6f}' for v in T[:3, 3])} m\n"
         f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
     )

@@ -49,6 +49,7 @@ class JobAnswer(BaseModel):
         cannot_tell: whether the data determine too little for another verdict: of a WARN that
             nothing odd was found behind, and of CANNOT TELL; null as long as there is none.
         error: of a failed job.
+        name, note: that were given with it.
     """
 
     id: str
@@ -61,6 +62,8 @@ class JobAnswer(BaseModel):
     verdict: str | None
     cannot_tell: bool | None
     error: JobError | None
+    name: str
+    note: str
 
 
 class JobList(BaseModel):
@@ -91,6 +94,8 @@ def job_answer(record: JobRecord, step: Step | None) -> JobAnswer:
         error=JobError(kind=record.error_kind or "internal error", detail=record.error)
         if record.error is not None
         else None,
+        name=record.name or "",
+        note=record.note or "",
     )
 
 

@@ -55,7 +55,11 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.metrics = metrics = Metrics()
     app.state.service = open_service(settings, metrics)
     app.add_middleware(Shield, hosts=_hosts(settings), observe=metrics.observe_request)
-    app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
+    app.mount(
+        "/static",
+        StaticFiles(directory=STATIC_FOLDER, packages=[("calibgraph.report", "static")]),
+        name="static",
+    )
     for router in (routes_jobs, routes_results, routes_trackers, routes_service, routes_pages):
         app.include_router(router.router)
     add_problem_handlers(app)

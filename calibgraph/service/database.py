@@ -53,6 +53,8 @@ jobs = Table(
     Column("cannot_tell", Boolean),
     Column("error_kind", String(16)),
     Column("error", Text),
+    Column("name", String(100)),
+    Column("note", Text),
     UniqueConstraint("tenant", "idempotency_key"),
     Index("jobs_by_state", "state", "tenant", "number"),
     Index("jobs_by_tenant", "tenant", "number"),
@@ -100,9 +102,11 @@ def open_database(folder: Path, url: str | None, owner: str) -> Engine:
 def _add_columns(engine: Engine) -> None:
     """Add the columns that a database of an earlier version has not."""
     held = {column["name"] for column in inspect(engine).get_columns("jobs")}
-    if "cannot_tell" not in held:
-        with engine.begin() as connection:
-            connection.execute(text("ALTER TABLE jobs ADD COLUMN cannot_tell BOOLEAN"))
+    for column in jobs.columns:
+        if column.name not in held:
+            kind = column.type.compile(engine.dialect)
+            with engine.begin() as connection:
+                connection.execute(text(f"ALTER TABLE jobs ADD COLUMN {column.name} {kind}"))
 
 
 def _engine(folder: Path, url: str | None) -> Engine:

@@ -16,6 +16,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import write_text
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.fleet.uris import fetch
+from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.archives import open_upload, table_suffix
 from calibgraph.service.job_task import FILES, INPUT, LOG, SUMMARY, WORK, JobOutcome, JobTask
 from calibgraph.service.places import require_inside
@@ -184,6 +185,7 @@ def _check(
     task: JobTask, rig: Path | None, _: Path | None, recordings: list[Path], progress: Progress
 ) -> JobOutcome:
     from calibgraph.audit import audit_summary, check
+    from calibgraph.audit.page import write_audit_report
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.structure import StructureMatcher
@@ -202,6 +204,8 @@ def _check(
         seed=settings.seed,
         progress=progress,
     )
+    progress("writing", 0, 1)
+    write_audit_report(audit, task.folder / WORK / FILES / REPORT_FILE)
     _write_summary(task, audit_summary(audit))
     return JobOutcome(audit.status, audit.status == "CANNOT TELL")
 

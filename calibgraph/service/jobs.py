@@ -60,6 +60,7 @@ class JobRecord:
         cannot_tell: whether the data determine too little for another one; None if unknown.
         error_kind, error: why it failed, in one line.
         idempotency_key: that the request had.
+        name, note: for people; None in databases of earlier versions.
     """
 
     number: int
@@ -76,6 +77,8 @@ class JobRecord:
     error_kind: ErrorKind | None
     error: str | None
     idempotency_key: str | None = None
+    name: str | None = None
+    note: str | None = None
 
     @property
     def is_finished(self) -> bool:
@@ -123,7 +126,7 @@ class JobTable:
         values = {
             "id": id, "tenant": tenant, "kind": job.kind, "state": "queued",
             "request": job.model_dump_json(), "digest": digest, "idempotency_key": key,
-            "created_s": time.time(), "starts": 0,
+            "created_s": time.time(), "starts": 0, "name": job.name, "note": job.note,
         }  # fmt: skip
         try:
             with self._engine.begin() as connection:

@@ -8,16 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
+from calibgraph.report.kit import load_template
 from calibgraph.service.answers import utc
 from calibgraph.service.job_task import Step
 from calibgraph.service.jobs import JobRecord
+from calibgraph.service.requests import JobKind
 
-_MARKS = {
-    "PASS": "pass", "OK": "pass", "WARN": "warn", "CANNOT TELL": "warn",
-    "FAIL": "fail", "WRONG": "fail", "failed": "fail",
-}  # fmt: skip
 _MINUTE_S = 60
 _Row = tuple[str, str, str]
 
@@ -34,22 +30,16 @@ _AUDITED: tuple[_Row, ...] = (
     ("1 sigma (cm)", "sigma_cm", ".1f"),
 )
 
-_environment = Environment(
-    loader=FileSystemLoader(Path(__file__).parent / "pages"),
-    autoescape=True,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-)
+_QUESTIONS: Mapping[JobKind, str] = {
+    "calibration": "can this calibration be used?",
+    "solve": "can this calibration be used?",
+    "check": "is the deployed calibration still right?",
+}
 
 
 def render(template: str, **content: object) -> str:
     """A page of ``pages/``; all text in it is escaped."""
-    return _environment.get_template(template).render(**content)
-
-
-def mark_of(word: str | None) -> str:
-    """The colour's name of a verdict or state."""
-    return _MARKS.get(word or "", "plain")
+    return load_template(template, "calibgraph.service", "pages").render(**content)
 
 
 @dataclass(frozen=True)
@@ -58,8 +48,10 @@ class JobView:
 
     Attributes:
         id, kind: of the job.
+        title: its name, or kind and id.
+        note: that was given with it.
+        question: that the result answers.
         result: verdict, or else state.
-        mark: colour's name of the result.
         created, took: times in words.
         stage: what it does.
         error: why it failed.
@@ -68,8 +60,10 @@ class JobView:
 
     id: str
     kind: str
+    title: str
+    note: str
+    question: str
     result: str
-    mark: str
     created: str
     took: str
     stage: str
@@ -79,15 +73,16 @@ class JobView:
 
 def job_view(record: JobRecord, step: Step | None) -> JobView:
     """A job as a page shows it."""
-    result = "CANNOT TELL" if record.cannot_tell else record.verdict or record.state
     took = ""
     if record.started_s is not None and record.finished_s is not None:
         took = _in_words(record.finished_s - record.started_s)
     return JobView(
         id=record.id,
         kind=record.kind,
-        result=result,
-        mark=mark_of(result),
+        title=record.name or f"{record.kind} {record.id[:8]}",
+        note=record.note or "",
+        question=_QUESTIONS[record.kind],
+        result=record.verdict or record.state,
         created=minute_of(record.created_s),
         took=took,
         stage=record.state if step is None else f"{step.stage} {step.done} of {step.total}",
@@ -113,13 +108,12 @@ class CameraView:
 
     Attributes:
         name: of the camera.
-        verdict, mark: of it, and its colour's name.
+        verdict: of it.
         numbers: in the order of the columns.
     """
 
     name: str
     verdict: str
-    mark: str
     numbers: tuple[str, ...]
 
 
@@ -133,9 +127,8 @@ def camera_table(cameras: Mapping[str, Any]) -> tuple[list[str], list[CameraView
 
 def _camera_view(name: str, camera: Mapping[str, Any], rows: Sequence[_Row]) -> CameraView:
     verdict = str(camera.get("status") or camera.get("verdict"))
-    verdict = "CANNOT TELL" if camera.get("cannot_tell") else verdict
     numbers = tuple(_numbers(camera, path, form) for _, path, form in rows)
-    return CameraView(name, verdict, mark_of(verdict), numbers)
+    return CameraView(name, verdict, numbers)
 
 
 def _numbers(camera: Mapping[str, Any], path: str, form: str) -> str:
@@ -156,8 +149,19 @@ def read_summary(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def reasons_of(summary: Mapping[str, Any]) -> list[str]:
-    """Why a result is not PASS, or a check not OK."""
+def reasons_of(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Why a result is not PASS, or what a check found: status, cameras and text of each."""
+    if "summary" in summary:
+        found: list[Mapping[str, Any]] = summary["summary"]["reasons"]
+        return found
     cameras: Mapping[str, Mapping[str, Any]] = summary.get("cameras", {})
-    audit = [f"{name}: {c['reason']}" for name, c in cameras.items() if c.get("reason")]
-    return [*summary.get("reasons", []), *audit]
+    return [
+        {"status": camera["status"], "cameras": [name], "text": camera["reason"]}
+        for name, camera in cameras.items()
+    ]
+
+
+def actions_of(summary: Mapping[str, Any]) -> list[str]:
+    """What to do about a result."""
+    actions: list[str] = summary.get("summary", {}).get("actions", [])
+    return actions

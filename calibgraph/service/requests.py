@@ -14,6 +14,12 @@ KINDS: tuple[JobKind, ...] = ("calibration", "solve", "check")
 
 MAX_RECORDINGS = 100
 Uri = Annotated[str, StringConstraints(min_length=1, max_length=2000)]
+JobName = Annotated[
+    str, StringConstraints(max_length=100, strip_whitespace=True, pattern=r"^[^\x00-\x1f]*$")
+]
+JobNote = Annotated[
+    str, StringConstraints(max_length=2000, strip_whitespace=True, pattern=r"^[^\x00]*$")
+]
 Tolerance = Annotated[float, Field(gt=0, le=180)]
 
 
@@ -75,7 +81,19 @@ class CheckSettings(_Strict):
 Recordings = Annotated[tuple[Uri, ...], Field(min_length=1, max_length=MAX_RECORDINGS)]
 
 
-class CalibrationRequest(_Strict):
+class _Request(_Strict):
+    """What every request may add.
+
+    Attributes:
+        name: of the job, for people.
+        note: about it, for people.
+    """
+
+    name: JobName = ""
+    note: JobNote = ""
+
+
+class CalibrationRequest(_Request):
     """A calibration of recordings that the server can read.
 
     Attributes:
@@ -91,7 +109,7 @@ class CalibrationRequest(_Strict):
     settings: CalibrationSettings = CalibrationSettings()
 
 
-class SolveRequest(_Strict):
+class SolveRequest(_Request):
     """A solve of a table that the server can read.
 
     Attributes:
@@ -105,7 +123,7 @@ class SolveRequest(_Strict):
     settings: SolveSettings = SolveSettings()
 
 
-class CheckRequest(_Strict):
+class CheckRequest(_Request):
     """A check of a deployed calibration with recordings that the server can read.
 
     Attributes:
@@ -127,7 +145,7 @@ REQUESTS: Mapping[JobKind, type[AnyRequest]] = {
 }
 
 
-class Job(_Strict):
+class Job(_Request):
     """A job as it is kept.
 
     Attributes:
@@ -135,6 +153,7 @@ class Job(_Strict):
         uris: what is read from where, by the name of the input; uploads are in the job's folder.
         recordings: how many there are.
         settings: of the kind, as JSON.
+        name, note: for people.
     """
 
     kind: JobKind
@@ -157,6 +176,8 @@ class Job(_Strict):
 
 RIG, TABLE, RECORDING = "rig", "correspondences", "recording"
 """Names of inputs: the files of an upload, and in the job's folder."""
+ABOUT = ("name", "note")
+"""Names of texts for people."""
 
 ALLOWED: Mapping[JobKind, tuple[str, ...]] = {
     "calibration": (RECORDING, RIG, TABLE),
@@ -187,7 +208,14 @@ def job_of(request: AnyRequest, kind: JobKind) -> Job:
             uris[name] = uri
     uris |= {recording_name(i): uri for i, uri in enumerate(recordings)}
     settings = request.settings.model_dump(mode="json")
-    return Job(kind=kind, uris=uris, recordings=len(recordings), settings=settings)
+    return Job(
+        kind=kind,
+        uris=uris,
+        recordings=len(recordings),
+        settings=settings,
+        name=request.name,
+        note=request.note,
+    )
 
 
 def recording_name(index: int) -> str:

@@ -19,7 +19,15 @@ from calibgraph.service.bell import progress_of, wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem, documented
-from calibgraph.service.requests import ALLOWED, KINDS, REQUESTS, REQUIRED, SETTINGS_OF, JobKind
+from calibgraph.service.requests import (
+    ABOUT,
+    ALLOWED,
+    KINDS,
+    REQUESTS,
+    REQUIRED,
+    SETTINGS_OF,
+    JobKind,
+)
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import SETTINGS, submit
 
@@ -45,9 +53,10 @@ def _body(kind: JobKind) -> dict[str, Any]:
     files: dict[str, Any] = {name: {"type": "string", "format": "binary"} for name in ALLOWED[kind]}
     if "recording" in files:
         files["recording"] = {"type": "array", "items": files["recording"]}
+    texts = dict.fromkeys(ABOUT, {"type": "string"})
     form = {
         "type": "object",
-        "properties": {**files, SETTINGS: reference(SETTINGS_OF[kind])},
+        "properties": {**files, **texts, SETTINGS: reference(SETTINGS_OF[kind])},
         "required": list(REQUIRED[kind]),
     }
     content = {

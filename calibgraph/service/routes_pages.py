@@ -9,26 +9,30 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
+from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.access import COOKIE, Caller, Gate
 from calibgraph.service.api_page import operations, schemas
+from calibgraph.service.forms import form_of
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.pages import (
+    actions_of,
     camera_table,
     job_view,
-    mark_of,
     minute_of,
     read_summary,
     reasons_of,
     render,
 )
 from calibgraph.service.problems import Problem
+from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job
 from calibgraph.service.routes_service import require_docs
 from calibgraph.service.routes_trackers import find_tracker
 from calibgraph.service.state import Service, State
+from calibgraph.service.submission import submit
 from calibgraph.service.tracker_request import TrackerRequest
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -82,31 +86,57 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
         request,
         "job.html.j2",
         job=job_view(record, state.runner.step(id)),
+        actions=actions_of(summary),
         reasons=reasons_of(summary),
         columns=columns,
         cameras=cameras,
-        links=_links(state, record),
+        page=_explanation(state, record),
+        links=_links(record),
     )
 
 
-def _links(state: Service, record: JobRecord) -> list[dict[str, str]]:
+def _explanation(state: Service, record: JobRecord) -> dict[str, str] | None:
+    """The page that explains a job's result: its report, or the page of a check."""
+    files = state.folder.of_job(record.id) / RESULT / FILES
+    if not (files / REPORT_FILE).exists():
+        return None
+    name = "The page of this check, with pictures" if record.kind == "check" else "The report"
+    return {"name": name, "path": f"/v1/jobs/{record.id}/report.html"}
+
+
+def _links(record: JobRecord) -> list[dict[str, str]]:
     """What can be fetched of a job."""
     at = f"/v1/jobs/{record.id}"
     log = {"name": "Log", "path": f"{at}/log"}
     if record.state != "succeeded":
         return [log]
     result = {"name": "Result (JSON)", "path": f"{at}/result"}
-    files = state.folder.of_job(record.id) / RESULT / FILES
-    if record.kind == "check":
-        return [result, log]
-    report = {"name": "Report", "path": f"{at}/report.html"}
+    whole = {"name": "All files (zip)", "path": f"{at}/files.zip"}
     exports = [
         {"name": f"For {name}", "path": f"{at}/exports/{name}"}
         for name in EXPORT_FORMATS
-        if record.verdict != "FAIL"
+        if record.verdict != "FAIL" and record.kind != "check"
     ]
-    whole = {"name": "All files (zip)", "path": f"{at}/files.zip"}
-    return [*([report] if (files / REPORT_FILE).exists() else []), result, whole, log, *exports]
+    return [result, whole, log, *exports]
+
+
+@router.get("/new/{kind}")
+def new_page(kind: JobKind, request: Request, caller: Visitor) -> Response:
+    """The form of a new job."""
+    return _page(request, "new.html.j2", problem=None, **form_of(kind))
+
+
+@router.post("/new/{kind}")
+async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor) -> Response:
+    """Take in a job of the form; the form again, with the problem, if that cannot be done."""
+    try:
+        if not caller.may("submit"):
+            raise Problem(403, f"this needs a token of scope submit, found {caller.scope}")
+        record, _ = await submit(state, request, caller, kind, None)
+    except (Problem, CalibrationError) as error:
+        status = error.status if isinstance(error, Problem) else 422
+        return _page(request, "new.html.j2", status, problem=str(error), **form_of(kind))
+    return RedirectResponse(f"/jobs/{record.id}", 303)
 
 
 @router.get("/trackers")
@@ -130,8 +160,7 @@ async def tracker_page(id: str, request: Request, state: State, caller: Visitor)
         request,
         "tracker.html.j2",
         tracker={"name": record.name, "created": minute_of(record.created_s)},
-        verdict=found["verdict"],
-        mark=mark_of(found["verdict"]),
+        verdict_word=found["verdict"],
         frame=found["frame"],
         reasons=found["reasons"],
         events=[event["text"] for event in reversed(found["events"])],

@@ -13,7 +13,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 
 from calibgraph.io.formats.export import export_calibration
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.model.result_files import REPORT_FILE
+from calibgraph.model.result_files import CALIBRATION_FILE, REPORT_FILE
 from calibgraph.service.access import Reader
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.problems import Problem, documented
@@ -70,8 +70,6 @@ def files(id: JobId, state: State, caller: Reader) -> Response:
     """The files that the command writes, in an archive."""
     folder = _result_folder(state, caller, id) / FILES
     paths = sorted(path for path in folder.iterdir() if path.is_file())
-    if not paths:
-        raise Problem(404, "a check writes no files")
     held = tempfile.TemporaryFile()  # noqa: SIM115 - the answer closes it
     with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as archive:
         for path in paths:
@@ -94,10 +92,10 @@ def _chunks(file: Any) -> Iterator[bytes]:
     responses={**documented(404, 409, 422), 200: {"content": {"text/html": {}}}},
 )
 def report(id: JobId, state: State, caller: Reader) -> Response:
-    """The report: one page that explains the result."""
+    """The report of a result, or the page of a check: one page that explains it."""
     path = _result_folder(state, caller, id) / FILES / REPORT_FILE
     if not path.exists():
-        raise Problem(404, "no report was asked for, or the job is a check")
+        raise Problem(404, "no report was asked for")
     return _file(path, "text/html", {"Content-Security-Policy": REPORT_POLICY})
 
 
@@ -117,7 +115,7 @@ def export(
     folder = _result_folder(state, caller, id) / FILES
     if format not in EXPORT_FORMATS:
         raise Problem(404, f"no such format; known are {', '.join(EXPORT_FORMATS)}")
-    if not any(folder.iterdir()):
+    if not (folder / CALIBRATION_FILE).exists():
         raise Problem(404, "a check has no calibration to export")
     suffix = _SUFFIXES.get(format, ".txt")
     with tempfile.TemporaryDirectory() as temporary:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import resource
+import socket
 import ssl
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -79,8 +81,13 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def serve(app: FastAPI, address: Address) -> None:
+def serve(app: FastAPI, address: Address, announce: Callable[[str], None] | None = None) -> None:
     """Serve an application of :func:`calibgraph.service.app.create_app` until SIGTERM or Ctrl-C.
+
+    Args:
+        app: to serve.
+        address: where it listens.
+        announce: called with the URL of the pages once it listens.
 
     Raises:
         CalibrationError: if the address cannot be used.
@@ -88,7 +95,7 @@ def serve(app: FastAPI, address: Address) -> None:
     service: Service = app.state.service
     require_safe(address, has_tokens=service.settings.tokens is not None)
     _allow_many_connections()
-    server = Server(app, address)
+    server = Server(app, address, announce)
     try:
         server.run()
     except SystemExit as error:  # of uvicorn, after a line in its log
@@ -114,9 +121,12 @@ class Server(uvicorn.Server):
     Args:
         app: of :func:`calibgraph.service.app.create_app`.
         address: where it listens.
+        announce: called with the URL of the pages once it listens.
     """
 
-    def __init__(self, app: FastAPI, address: Address) -> None:
+    def __init__(
+        self, app: FastAPI, address: Address, announce: Callable[[str], None] | None = None
+    ) -> None:
         config = uvicorn.Config(
             app,
             host=address.host,
@@ -134,6 +144,17 @@ class Server(uvicorn.Server):
         )
         super().__init__(config)
         self._service: Service = app.state.service
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to listen."""
+        await super().startup(sockets=sockets)
+        if self._announce is not None and self.started:
+            host, port = self.servers[0].sockets[0].getsockname()[:2]
+            reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+            shown = f"[{reachable}]" if ":" in reachable else reachable
+            scheme = "http" if self.config.ssl_certfile is None else "https"
+            self._announce(f"{scheme}://{shown}:{port}")
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to stop."""

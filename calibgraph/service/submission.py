@@ -21,6 +21,7 @@ from calibgraph.service.jobs import JobRecord, OtherRequestError, new_id
 from calibgraph.service.places import require_inside
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
+    ABOUT,
     ALLOWED,
     MAX_RECORDINGS,
     RECORDING,
@@ -37,6 +38,11 @@ from calibgraph.service.state import Service
 from calibgraph.service.uploads import FormReader, Upload
 
 SETTINGS = "settings"
+FORM_SETTINGS: Mapping[JobKind, tuple[str, ...]] = {
+    kind: tuple(name for name in model.model_fields if name != "config")
+    for kind, model in SETTINGS_OF.items()
+}
+"""Settings that a form may give as a field of its own."""
 _MOST_KEY = 255
 _RETRY_AFTER_S = 5
 
@@ -120,27 +126,36 @@ async def _read(
 
 def _job_of_form(upload: Upload, kind: JobKind) -> Job:
     """The job of a form: fields are URIs or the settings, files are in the folder already."""
-    settings, uris = "{}", dict[str, str]()
+    uris, about = dict[str, str](), dict[str, str]()
+    settings: dict[str, Any] = {}
     files = {*upload.files}
     for name, text in upload.texts:
+        if not text.strip():
+            continue  # left empty
         if name == SETTINGS:
-            settings = text
+            settings |= _mapping(parse_json(text.encode()))
+        elif name in ABOUT:
+            about[name] = text
+        elif name in FORM_SETTINGS[kind]:
+            settings[name] = text
         elif name in ALLOWED[kind]:
             uris[_free_name(name, files | uris.keys())] = text
         else:
-            known = ", ".join((*ALLOWED[kind], SETTINGS))
+            known = ", ".join((*ALLOWED[kind], SETTINGS, *ABOUT, *FORM_SETTINGS[kind]))
             raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
     given = files | uris.keys()
     for name in REQUIRED[kind]:
         if name not in given:
             raise Problem(422, f"{name!r} is missing; add it as a file, or a field with its URI")
-    checked = _checked(SETTINGS_OF[kind], parse_json(settings.encode()))
-    return Job(
-        kind=kind,
-        uris=uris,
-        recordings=sum(name.startswith(RECORDING) for name in given),
-        settings=checked.model_dump(mode="json"),
-    )
+    content = {
+        "kind": kind,
+        "uris": uris,
+        "recordings": sum(name.startswith(RECORDING) for name in given),
+        "settings": _checked(SETTINGS_OF[kind], settings).model_dump(mode="json"),
+        **about,
+    }
+    job: Job = _checked(Job, content)
+    return job
 
 
 def _free_name(name: str, taken: set[str]) -> str:
@@ -193,10 +208,14 @@ def parse_json(body: bytes) -> Any:
         raise Problem(400, f"the body is not JSON ({error})") from error
 
 
-def _checked(model: Any, content: object) -> Any:
-    if not isinstance(content, Mapping):
+def _mapping(content: object) -> dict[str, Any]:
+    if not isinstance(content, dict):
         raise Problem(422, "expected a JSON object")
+    return content
+
+
+def _checked(model: Any, content: object) -> Any:
     try:
-        return model.model_validate(content)
+        return model.model_validate(_mapping(content))
     except ValidationError as error:
         raise Problem(422, describe(error)) from error

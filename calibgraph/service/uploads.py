@@ -140,7 +140,7 @@ class FormReader:
         part = self._part
         _, options = parse_options_header(part.disposition)
         part.name = options.get(b"name", b"").decode(errors="replace")
-        part.is_file = b"filename" in options
+        part.is_file = bool(options.get(b"filename"))  # empty: a page's field without a file
         self._digest.update(f"\0{part.is_file} {part.name!r}\0".encode())
         if not part.is_file:
             return

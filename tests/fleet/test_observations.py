@@ -11,7 +11,7 @@ from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import payload
 from calibgraph.fleet.rows import SCHEMA
-from calibgraph.fleet.standing import COLOURS, stand
+from calibgraph.fleet.standing import STATES, stand
 
 
 def rows_of(**columns: list[object]) -> pa.Table:
@@ -37,7 +37,7 @@ def test_rows_without_a_result_measure_nothing() -> None:
     assert of.covariates == {}
     fleet = fit_fleet(of)
     standing = stand(rows, fleet)
-    assert [COLOURS[c] for c in standing.colour] == ["green", "unknown", "unknown"]
+    assert [STATES[s] for s in standing.state] == ["PASS", "WARN", "NO RESULT"]
     assert standing.reasons == ["", "no error bar; few frames", "no images"]
     assert payload(fleet, standing, "")["vehicles"] == ["a", "b"]
 

@@ -16,7 +16,7 @@ from benchmarks.fleet.vehicles import simulate_fleet
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import write_fleet_report
-from calibgraph.fleet.standing import COLOURS, changed_poses, stand
+from calibgraph.fleet.standing import STATES, changed_poses, stand
 from calibgraph.model.geometry import retract_all
 from tests.conftest import Call
 from tests.report.test_browser import browser, render
@@ -47,15 +47,15 @@ def page(rows: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_colours_follow_status_verdict_and_deviation(rows: pa.Table) -> None:
+def test_states_follow_status_verdict_and_deviation(rows: pa.Table) -> None:
     fleet = fit_fleet(observe(rows))
-    colours = np.array(COLOURS)[stand(rows, fleet).colour]
-    assert set(colours[:6]) == {"unknown"}
-    assert set(colours[6:12]) == {"red"}
+    states = np.array(STATES)[stand(rows, fleet).state]
+    assert set(states[:6]) == {"NO RESULT"}
+    assert set(states[6:12]) == {"FAIL"}
     verdict = np.asarray(rows["verdict"].to_pylist())[12:]
-    assert (colours[12:][fleet.apart[12:]] == "red").all()
-    assert (colours[12:][~fleet.apart[12:] & (verdict == "WARN")] == "yellow").all()
-    assert (colours[12:][~fleet.apart[12:] & (verdict == "PASS")] == "green").all()
+    assert (states[12:][fleet.apart[12:]] == "FAIL").all()
+    assert (states[12:][~fleet.apart[12:] & (verdict == "WARN")] == "WARN").all()
+    assert (states[12:][~fleet.apart[12:] & (verdict == "PASS")] == "PASS").all()
 
 
 def test_what_changed_since_last_time_is_found(rows: pa.Table) -> None:
@@ -103,8 +103,8 @@ def test_filters_sorting_and_details_work(page: Path, tmp_path: Path) -> None:
       document.querySelector(".row").click();
       found.push(document.querySelector("#detail a").getAttribute("href"));
       at("search").value = ""; at("search").oninput();
-      document.querySelector(".counts .unknown").click(); found.push(shown());
-      document.querySelector(".counts .unknown").click();
+      document.querySelector(".counts .plain").click(); found.push(shown());
+      document.querySelector(".counts .plain").click();
       at("head").children[0].click(); found.push(document.querySelector(".row span").textContent);
       at("head").children[0].click(); found.push(document.querySelector(".row span").textContent);
       document.title = found.join(" ");"""

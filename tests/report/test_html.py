@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from markupsafe import escape
+from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Calibration, Check, Rig, Verdict, simulate_correspondences
@@ -56,8 +58,60 @@ def test_a_failure_is_marked_prominently(pair: Rig, tmp_path: Path) -> None:
     assert title_of(text).startswith("FAIL - do not use")
     assert "No. Do not use this result" in text
     assert 'class="verdict FAIL"' in text
-    for reason in result.summary.reasons:
-        assert reason.text.split(":")[0] in text
+    for reason in (*result.summary.reasons, *result.summary.others):
+        assert str(escape(reason.text)) in text
+    for action in result.summary.actions:
+        assert str(escape(action)) in text
+    assert text.count("not to be deployed") == 2 and "calibgraph export" not in text
+
+
+def test_the_order_is_verdict_action_picture_deployment_checks(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    text = write_page(sample_result, tmp_path)
+    places = [text.index(part) for part in (
+        "Can this calibration of 3 cameras", '<section class="verdict ', "What to do",
+        "front_left before", "calibgraph export . ", "T_camera_lidar of front_left", " checks: ",
+    )]  # fmt: skip
+    assert places == sorted(places)
+
+
+def test_what_is_deployed_is_what_was_saved(solved_pair: Calibration, tmp_path: Path) -> None:
+    text = write_page(solved_pair, tmp_path)
+    for name, T in solved_pair.T_camera_lidar.items():
+        block = text.split(f'aria-label="T_camera_lidar of {name}">')[1]
+        shown = np.array(block.split("</pre>")[0].split(), np.float64).reshape(4, 4)
+        np.testing.assert_allclose(shown, T, atol=5e-7)  # six decimals
+        block = text.split(f'aria-label="translation and quaternion of {name}">')[1]
+        numbers = [float(word) for word in re.findall(r"-?\d+\.\d+", block.split("</pre>")[0])]
+        np.testing.assert_allclose(numbers[:3], T[:3, 3], atol=5e-7)
+        rotation = Rotation.from_quat(numbers[3:]).as_matrix()
+        np.testing.assert_allclose(rotation, T[:3, :3], atol=4e-6)  # of four rounded numbers
+
+
+def test_a_camera_that_failed_is_left_out_of_the_export(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    failed = Verdict((Check("search", "FAIL", "not found"),))
+    result = replace(solved_pair, camera_verdicts={**solved_pair.camera_verdicts, "left": failed})
+    text = write_page(result, tmp_path)
+    assert "--out rig.launch.xml --camera right</pre>" in text
+    assert text.count("not to be deployed") == 1
+
+
+def test_warnings_about_the_data_are_in_the_verdict(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    text = write_page(replace(solved_pair, warnings=("left: blurred <&>",)), tmp_path)
+    assert "left: blurred &lt;&amp;&gt;" in text.split("</section>")[0]
+
+
+def test_the_title_names_the_recording_and_the_date(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    title = title_of(write_page(replace(sample_result, date="2026-03-01"), tmp_path))
+    status = sample_result.verdict.status
+    assert title.startswith(f"{status} - data/sample - 2026-03-01 - calibration of front_left")
 
 
 def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_path: Path) -> None:
@@ -128,4 +182,4 @@ def test_a_result_from_driving_is_reported(pair: Rig, tmp_path: Path) -> None:
 def test_the_template_is_part_of_the_package() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "calibgraph*" in setuptools["packages"]["find"]["include"]
-    assert setuptools["package-data"]["calibgraph.report"] == ["*.html.j2"]
+    assert setuptools["package-data"]["calibgraph.report"] == ["*.html.j2", "static/*"]

@@ -107,7 +107,7 @@ def test_a_page_of_another_site_can_not_call(make_server: Make, small: Problem) 
 
 def test_every_answer_has_strict_headers(make_server: Make) -> None:
     client = make_server()
-    for path in ("/healthz", "/v1/jobs", "/nothing", "/", "/docs", "/static/style.css"):
+    for path in ("/healthz", "/v1/jobs", "/nothing", "/", "/docs", "/static/page.css"):
         headers = client.get(path).headers
         assert {name: headers[name] for name in STRICT_HEADERS} == STRICT_HEADERS
 

@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 import uvicorn
 import yaml
 
+from calibgraph.service.access import add_token
 from calibgraph.service.app import create_app
 from calibgraph.service.settings import Settings
 from tests.service.conftest import Problem, frames_as_lines
@@ -47,20 +49,28 @@ class Filled:
     tracker: str
 
 
-@pytest.fixture(scope="module")
-def filled(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator[Filled]:
-    data = tmp_path_factory.mktemp("browser") / "data"
-    app = create_app(Settings(data=data, jobs_at_once=1, tracker_processes=1, free_bytes=0))
+@contextmanager
+def serving(settings: Settings) -> Iterator[str]:
+    """A server on a port; its URL."""
+    app = create_app(settings)
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning"))
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:
         time.sleep(0.05)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=120) as http:
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator[Filled]:
+    data = tmp_path_factory.mktemp("browser") / "data"
+    settings = Settings(data=data, jobs_at_once=1, tracker_processes=1, free_bytes=0)
+    with serving(settings) as url, httpx.Client(base_url=url, timeout=120) as http:
         yield fill(http, small)
-    server.should_exit = True
-    thread.join()
 
 
 def fill(http: httpx.Client, small: Problem) -> Filled:
@@ -98,7 +108,8 @@ def test_pages_are_clean_readable_and_fit(
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("requestfailed", lambda request: errors.append(request.url))
     report = f"/v1{filled.solved}/report.html"
-    places = ["/", filled.solved, filled.failed, "/trackers", filled.tracker, "/docs", "/sign-in"]
+    places = ["/", filled.solved, filled.failed, "/trackers", filled.tracker, "/docs", "/sign-in",
+              "/new/calibration", "/new/check", "/new/solve", report]  # fmt: skip
     for place in places:
         page.goto(place, wait_until="networkidle")
         page.screenshot(path=tmp_path / f"{place.strip('/').replace('/', '_')}.png", full_page=True)
@@ -106,8 +117,6 @@ def test_pages_are_clean_readable_and_fit(
         assert found.violations_count == 0, f"{place}: {found.generate_report()}"
         width = page.evaluate("document.documentElement.scrollWidth")
         assert width <= size["width"], f"{place} is {width} px wide"
-    page.goto(report, wait_until="networkidle")
-    page.screenshot(path=tmp_path / "report.png")
     assert errors == []
 
 
@@ -115,8 +124,58 @@ def test_a_job_is_followed_until_its_result(browser: Any, filled: Filled, small:
     page = browser.new_page(viewport=PHONE, base_url=filled.url)
     id = httpx.post(f"{filled.url}/v1/solves", files=small.files).json()["id"]
     page.goto(f"/jobs/{id}")
-    page.wait_for_selector(".mark.pass", timeout=60_000)
-    assert page.locator("#result").inner_text() == "PASS"
+    page.wait_for_selector(".verdict.PASS", timeout=60_000)
+    assert page.locator(".big").inner_text() == "PASS"
+
+
+@pytest.mark.parametrize("with_scripts", [True, False], ids=["scripts", "none"])
+def test_a_form_leads_to_its_job(
+    browser: Any, filled: Filled, small: Problem, tmp_path: Path, with_scripts: bool
+) -> None:
+    (tmp_path / "rig.yaml").write_bytes(small.rig)
+    (tmp_path / "table.parquet").write_bytes(small.table)
+    page = browser.new_page(base_url=filled.url, java_script_enabled=with_scripts)
+    page.goto("/new/solve")
+    page.set_input_files("#rig", tmp_path / "rig.yaml")
+    page.set_input_files("#correspondences", tmp_path / "table.parquet")
+    page.fill("#name", "car 7")
+    page.click("text=Start")
+    page.wait_for_url("**/jobs/*")
+    assert page.locator("h1").inner_text() == "car 7: can this calibration be used?"
+    assert page.locator("nav >> text=Jobs").count() == 1
+
+
+def test_a_refused_form_keeps_its_fields(browser: Any, filled: Filled, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("cameras: 7")
+    page = browser.new_page(base_url=filled.url)
+    page.goto("/new/check")
+    page.set_input_files("#rig", tmp_path / "rig.yaml")
+    page.set_input_files("#recording", tmp_path / "rig.yaml")
+    page.fill("#name", "car 7")
+    page.fill("#tolerance_deg", "500")
+    page.click("text=Start")
+    page.wait_for_selector("[role=alert]:not(:empty)")
+    assert "tolerance_deg" in page.locator("[role=alert]").inner_text()
+    assert page.input_value("#name") == "car 7"
+
+
+def test_a_browser_signs_in_and_out(browser: Any, tmp_path: Path) -> None:
+    """Its forms carry the Origin that the server asks for."""
+    tokens = tmp_path / "tokens.yaml"
+    secret = add_token(tokens, "ours", "submit")
+    settings = Settings(
+        data=tmp_path / "data", tokens=tokens, jobs_at_once=0, tracker_processes=0, free_bytes=0
+    )
+    with serving(settings) as url:
+        page = browser.new_page(base_url=url)
+        page.goto("/")
+        page.wait_for_url("**/sign-in")
+        page.fill("#token", secret)
+        page.click("main button")
+        page.wait_for_url(f"{url}/")
+        assert "Which jobs ran" in page.locator("h1").inner_text()
+        page.click("header button")
+        page.wait_for_url("**/sign-in")
 
 
 def test_the_keyboard_leads_to_a_job(browser: Any, filled: Filled) -> None:

@@ -1,0 +1,30 @@
+"""The kit of all pages: their frame, styles, scripts and macros."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+
+
+def load_template(name: str, package: str = "calibgraph.report", folder: str = "") -> Template:
+    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report.
+
+    Args:
+        name: of its file.
+        package: that the file is in.
+        folder: of the package.
+    """
+    return _environment(package, folder).get_template(name)
+
+
+@cache
+def _environment(package: str, folder: str) -> Environment:
+    loaders = [PackageLoader(package, folder), PackageLoader("calibgraph.report", "")]
+    return Environment(
+        loader=ChoiceLoader(loaders),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
