@@ -161,7 +161,8 @@ def _values(schema: Mapping[str, Any]) -> str:
         return f"{above}{low:.10g} to {high:.10g}"
     if low is not None:
         return f"above {low:.10g}" if "exclusiveMinimum" in schema else f"from {low:.10g}"
-    words = {"boolean": "`true`, `false`", "array": "`[height, width]`", "integer": "whole number"}
+    array = "`[height, width]`" if "prefixItems" in schema else "`[NAME, ...]`"
+    words = {"boolean": "`true`, `false`", "array": array, "integer": "whole number"}
     return words.get(schema["type"], schema["type"])
 
 

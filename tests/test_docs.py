@@ -176,7 +176,10 @@ def test_every_page_is_in_the_navigation() -> None:
 
 @pytest.mark.parametrize("name", ["thresholds", "settings", "tracking settings", "presets"])
 def test_generated_tables_have_rows(name: str) -> None:
-    for table in GENERATED[name]().split("\n\n"):
+    parts = GENERATED[name]().split("\n\n")
+    tables = [part for part in parts if part.startswith("|")]
+    assert tables
+    for table in tables:
         rows = table.splitlines()
         assert len(rows) > 3
         assert len({row.replace(r"\|", "").count("|") for row in rows}) == 1, "cells are missing"
