@@ -28,6 +28,11 @@ LEAST_CORRELATION = 0.42
 """Of the images from above, for the points to be looked at. All of the same pairs within 20 m have
 more; of different sequences of KITTI one pair in a hundred has."""
 
+LEAST_UPRIGHT = 500
+"""Upright points that a cloud needs for its unlikeness to mean another place. Of 13 recordings the
+poorest, of 16 beams in a hall, has 755 a cloud. All of their 214 pairs within one place are found
+alike, with overlaps from 0.73; none of 83 pairs of 25 places of KITTI 00 is, with up to 0.46."""
+
 _CELLS, _CELL_M, _REACH_M = 128, 1.0, 48.0  # so much wider that offsets up to 32 m do not wrap
 _VOXEL_M, _HEIGHT_M = 0.5, 20.0
 _MOST_POINTS = 40_000  # of a cloud, chosen at random: more show no more in such voxels

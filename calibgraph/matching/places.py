@@ -20,7 +20,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
-from calibgraph.matching.cloud_similarity import UprightCloud, align_with_any
+from calibgraph.matching.cloud_similarity import LEAST_UPRIGHT, UprightCloud, align_with_any
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
@@ -41,8 +41,9 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
     Where features do not show the motion, as beyond some 5 m, the clouds may. A frame farther than
     PLACE_M from the first of its place, or of another recording, or after an unknown motion, is
     compared with the first frames of all places. It is of the most similar one within PLACE_M, else
-    of a new one; where not even the motion is known, of the place before, which is the cautious
-    side: it widens the error bar.
+    of a new one. If neither images nor clouds show the motion, unlike clouds are evidence of
+    another place; a cloud in which little stands upright is none, and its frame stays at the place
+    before.
 
     Args:
         dataset: images and clouds.
@@ -82,30 +83,31 @@ class PlaceWalk:
         """
         before, self._before = self._before, frame
         if before is None or before.cloud_path.parent != frame.cloud_path.parent:
-            self._find_place(frame, may_stay=False)
+            self._find_place(frame)
             return self._first
         step = _motion_by_clouds(before, frame) if step is None else step
         if step is None:
-            self._find_place(frame, may_stay=True)
+            if _are_comparable(before, frame):
+                self._find_place(frame)
             return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
-            self._find_place(frame, may_stay=False, left=self._first)
+            self._find_place(frame, left=self._first)
         return self._first
 
     def remember(self, frame: Frame) -> None:
         """Know the place of which this is the first frame."""
         self._visit(frame.index, _upright_cloud(frame))
 
-    def _find_place(self, frame: Frame, *, may_stay: bool, left: int | None = None) -> None:
-        """The most similar known place, but for one that was left; the present one; a new one."""
+    def _find_place(self, frame: Frame, *, left: int | None = None) -> None:
+        """The most similar known place, but for one that was left; else a new one."""
         cloud = _upright_cloud(frame)
         known = [first for first in self._known if first != left]
         found = cloud and align_with_any(cloud, [self._known[first] for first in known])
         if found and _distance_m(found[1]) <= PLACE_M:
             self._first, self._T_now_first = known[found[0]], found[1]
             self._visit(self._first, self._known[self._first])
-        elif found or not may_stay:
+        else:
             self._first, self._T_now_first = frame.index, np.eye(4)
             self._visit(frame.index, cloud)
 
@@ -121,6 +123,12 @@ def _motion_by_clouds(before: Frame, now: Frame) -> Motion:
     earlier, later = _upright_cloud(before), _upright_cloud(now)
     found = earlier and later and align_with_any(later, [earlier])
     return found[1] if found else None
+
+
+def _are_comparable(before: Frame, now: Frame) -> bool:
+    """Whether enough stands upright in both clouds that they were alike at one place."""
+    clouds = _upright_cloud(before), _upright_cloud(now)
+    return all(cloud is not None and len(cloud.points_m) >= LEAST_UPRIGHT for cloud in clouds)
 
 
 def _upright_cloud(frame: Frame) -> UprightCloud | None:
