@@ -124,7 +124,7 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("scale", "expected"),
     [
-        (1000, "9.33e+03 m is above 1e+03 m: are the clouds in millimetres?"),
+        (1000, "9332 m is above 1000 m: are the clouds in millimetres?"),
         (100, "933 m is above 200 m: are the clouds in centimetres?"),
     ],
 )

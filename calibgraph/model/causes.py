@@ -61,6 +61,7 @@ CAUSES: dict[str, Cause] = {
         "belong to these images.",
         {
             "lens": "",
+            "values of the rig": "Correct the named value in the rig.",
             **{f"lens_{name}": "" for name in (
                 "focal_length", "distortion", "principal_point", "aspect_ratio", "skew")},
             **{name: "" for name in (

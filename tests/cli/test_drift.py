@@ -45,7 +45,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(call: Call, wee
     code, out, err = call("drift", *days)
     assert (code, out) == (1, "")
     lines = err.splitlines()
-    assert lines[0] == "CHANGED"
+    assert lines[0].startswith("CHANGED  drift: ")
     assert lines[1].startswith("  CHANGED fri, left: turned about y (yaw) by +")
     assert not lines[2].startswith("  CHANGED")
     assert lines[-1] == "nothing was written"

@@ -15,6 +15,7 @@ from calibgraph.matching.cmrnext.correlation import OnTheFly, Volume, volume_byt
 from calibgraph.matching.cmrnext.network import CmrNext
 from tests.matching.cmrnext import reference_network
 
+ROUNDING = float(np.finfo(np.float32).eps)
 ARCHITECTURES = {
     "A: LiDAR context": Architecture(width=8),
     "B: uncertainty": Architecture(width=8, uncertainty="nll"),
@@ -92,8 +93,9 @@ def test_published_test_vectors_are_reproduced(reference_folder: Path) -> None:
             "cnet": model.cnet(lidar),
         }
         for key, found in features.items():
+            # 32 float32 roundings of the largest value: processors sum in other orders.
             largest = np.abs(vectors[key]).max()
-            np.testing.assert_allclose(found, vectors[key], atol=2e-6 * largest, rtol=0)
+            np.testing.assert_allclose(found, vectors[key], atol=32 * ROUNDING * largest, rtol=0)
         y, x = np.indices((16, 24), dtype=np.float32)
         positions = torch.tensor(np.stack([x + 0.3, y - 0.7])[None])
         expected = vectors["corr_at_offset_0.3_-0.7"]

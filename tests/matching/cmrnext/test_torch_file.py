@@ -284,7 +284,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a storage of invented numbers": (
         program(b"\x80\x02(X\7\0\0\0storageX\4\0\0\0<f16X\1\0\0\0" + b"0NK\1tQ."),
-        "no attribute 'dtype'",
+        "a part of it is missing or damaged",
     ),
     "an empty file": (lambda path: path.write_bytes(b"") and None, "not a checkpoint"),
     "text": (lambda path: path.write_text("weights") and None, "not a checkpoint"),
