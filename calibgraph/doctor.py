@@ -138,14 +138,16 @@ def _load(
 def _describe(data: Dataset) -> Iterator[Finding]:
     """What is there, and whether the frames are enough."""
     count = len(data.frames)
-    yield Finding("note", f"{count} frames, {len(data.rig.cameras)} cameras")
+    yield Finding(
+        "note", f"{_counted(count, 'frame')}, {_counted(len(data.rig.cameras), 'camera')}"
+    )
     yield from (Finding("note", note) for note in data.notes)
     if not set(describe_rig(data.rig)) & set(data.notes):
         yield from (Finding("note", line) for line in describe_rig(data.rig))
     if count < ENOUGH_FRAMES:
         yield Finding(
             "warning",
-            f"{count} frames: the error bar will be a wide, usual one; record at least "
+            f"{count} frames: the error bar will be a wide default; record at least "
             f"{ENOUGH_FRAMES}, better 10 to 30 from several places",
         )
 
@@ -240,5 +242,11 @@ def _examine_guess(
     yield from (Finding("warning", text) for text in doubts)
     for name, count in seen.items():
         yield Finding("note", f"{name}: {count} of {len(cloud)} points lie in the image")
-    pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(data.rig, cloud)) or "none"
-    yield Finding("note", f"cameras that see the same by the guess: {pairs}")
+    if len(data.rig.cameras) > 1:
+        pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(data.rig, cloud)) or "none"
+        yield Finding("note", f"cameras that see the same by the guess: {pairs}")
+
+
+def _counted(count: int, noun: str) -> str:
+    """A number with its noun."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -6,6 +6,8 @@ Each format has a mark by which its files are recognised; a file without one is 
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_file
 
+_PNG_HEADER_BYTES = 33  # signature and IHDR
 _DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
 
 
@@ -96,13 +99,29 @@ def has_yaml_mark(command: str) -> Callable[[Path], bool]:
     return starts_with(yaml_mark(command).encode() + b"\n")
 
 
-def starts_with(mark: bytes) -> Callable[[Path], bool]:
-    """Whether a file starts with these bytes."""
+def png_mark(command: str) -> bytes:
+    """The chunk of a PNG picture that names the command which wrote it."""
+    text = b"tEXtSoftware\0calibgraph " + command.encode()
+    return struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+
+
+def with_png_mark(picture: bytes, command: str) -> bytes:
+    """A PNG picture with the mark of a command behind its header."""
+    return picture[:_PNG_HEADER_BYTES] + png_mark(command) + picture[_PNG_HEADER_BYTES:]
+
+
+def has_png_mark(command: str) -> Callable[[Path], bool]:
+    """Whether a PNG picture was written by a command."""
+    return starts_with(png_mark(command), _PNG_HEADER_BYTES)
+
+
+def starts_with(mark: bytes, behind: int = 0) -> Callable[[Path], bool]:
+    """Whether a file starts with these bytes, behind so many others."""
 
     def is_marked(path: Path) -> bool:
         if not path.is_file():
             return False
         with path.open("rb") as file:
-            return file.read(len(mark)) == mark
+            return file.read(behind + len(mark))[behind:] == mark
 
     return is_marked

@@ -75,7 +75,7 @@ def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
         "repeats out",
     ]
     assert (
-        "4 frames: the error bar will be a wide, usual one"
+        "4 frames: the error bar will be a wide default"
         in texts(diagnose([folder], frames="0:4"), "warning")[0]
     )
 
@@ -160,3 +160,14 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     code, _, err = call("doctor", folder / "missing")
     assert code == 1
     assert "no such folder or ROS bag" in err
+
+
+def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Call) -> None:
+    """Mend, run again: also with another rig; a picture of the user's stays."""
+    given = ("doctor", SAMPLE, "--out", tmp_path / "pictures")
+    assert call(*given)[0] == call(*given)[0] == 0
+    picture = tmp_path / "pictures" / "guess_front_left.png"
+    assert cv2.imread(str(picture)) is not None
+    cv2.imwrite(str(picture), np.zeros((4, 4, 3), np.uint8))
+    code, _, err = call(*given)
+    assert code == 2 and "was not written by calibgraph doctor" in err

@@ -162,7 +162,7 @@ def test_the_saved_table_solved_again_gives_the_saved_result(
     saved = calibgraph.load_calibration(tmp_path / "result")
     require_same(saved, made)
     require_same(saved, solve_again(saved))
-    assert saved.counts["front_left"]["places"] == 2
+    assert saved.counts["front_left"]["places"] > 1
     for name, sigmas in ((n, saved.sigmas(n)) for n in saved.rig.cameras):
         assert (sigmas is None) == (make is excluded_camera and name == "left")
 

@@ -24,7 +24,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import tie_cameras
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets
+from calibgraph.rounds import AnyMatcher, Datasets, assign_places
 from calibgraph.trust.cross_validation import competing_solution_checks
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
@@ -86,7 +86,10 @@ def check(
     data = _open(dataset, deployed, full)
     matching = Matching(keep_frames(data), deployed, full, Config(seed=seed), report)
     try:
-        run = tie_cameras(match_from_deployed(matching, watch), report)
+        run = match_from_deployed(matching, watch)
+        with watch("places"):
+            run = assign_places(run)
+        run = tie_cameras(run, report)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:

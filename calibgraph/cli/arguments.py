@@ -176,3 +176,19 @@ def terms_from(name: str) -> Terms:
         if name == terms:
             return terms
     raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")
+
+
+def require_service() -> None:
+    """Check that the server's packages are there.
+
+    Raises:
+        CalibrationError: if not.
+    """
+    from calibgraph.errors import CalibrationError
+
+    try:
+        import fastapi  # noqa: F401
+        import uvicorn  # noqa: F401
+    except ImportError as error:
+        message = f"{error.name} is missing; install the extra: pip install '.[service]'"
+        raise CalibrationError(message) from error

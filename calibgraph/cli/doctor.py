@@ -63,5 +63,7 @@ def doctor(
             print_plain(terminal(), f"{finding.level:8} {finding.text}")
         for path in found.pictures:
             print_plain(terminal(), f"{path}: written")
+        if all(finding.level == "note" for finding in found.findings):
+            print_plain(terminal(), "nothing to mend; next: calibgraph calibrate")
     if not found.healthy:
         raise typer.Exit(1)

@@ -110,12 +110,12 @@ def rig_of_bag(given: Given) -> list[Output]:
 
 
 def pictures(given: Given) -> list[Output]:
-    """The guess on images, which have no place for a mark."""
-    from calibgraph.outputs import Output
+    """The guess on images."""
+    from calibgraph.outputs import Output, has_png_mark
 
     folder = given["out"]
     found = [] if folder is None else sorted(folder.glob("guess_*.png"))
-    return [Output(path, "doctor, as far as can be seen") for path in found]
+    return [Output(path, "doctor", has_png_mark("doctor")) for path in found]
 
 
 def weights(given: Given) -> list[Output]:

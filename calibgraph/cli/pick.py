@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibgraph.cli.arguments import dataset_from
+from calibgraph.cli.arguments import dataset_from, require_service
 from calibgraph.cli.options import DatasetArgument, FramesOption, RigOption
 from calibgraph.cli.terminal import print_plain, terminal
 
@@ -38,7 +38,7 @@ def pick(
 
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
     """
-    _require_extra()
+    require_service()
     from calibgraph.files import require_place_for_folder
     from calibgraph.service.pick.app import loopback_socket, pick_server
     from calibgraph.service.pick.workspace import Workspace
@@ -51,19 +51,3 @@ def pick(
         if show:
             webbrowser.open(address)
         pick_server(workspace).run(sockets=[listening])
-
-
-def _require_extra() -> None:
-    """Check that the server's packages are there.
-
-    Raises:
-        CalibrationError: if not.
-    """
-    from calibgraph.errors import CalibrationError
-
-    try:
-        import fastapi  # noqa: F401
-        import uvicorn  # noqa: F401
-    except ImportError as error:
-        message = f"{error.name} is missing; install the extra: pip install '.[service]'"
-        raise CalibrationError(message) from error

@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from calibgraph.cli.arguments import require_service
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.errors import CalibrationError
 
@@ -92,6 +93,7 @@ def serve(
 
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
     """
+    require_service()
     from calibgraph.service.app import create_app
     from calibgraph.service.serve import Address, require_certificate, require_safe
     from calibgraph.service.serve import serve as serve_app

@@ -69,7 +69,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     if summary.error_bar:
         print_plain(console, summary.error_bar)
     if summary.others:
-        print_plain(console, f"{len(summary.others)} more: see {_DETAILS}")
+        print_plain(console, f"{len(summary.others)} more findings: see {_DETAILS}")
 
 
 def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:

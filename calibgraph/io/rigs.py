@@ -124,7 +124,8 @@ def rig_file(path: Path | str) -> Path:
         raise FileError(
             path,
             f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
-            "dataset folder with a rig.yaml, one of KITTI, nuScenes or Argoverse 2, or a ROS bag",
+            "dataset folder with a rig.yaml (calibgraph init writes one), a folder of KITTI, "
+            "nuScenes or Argoverse 2, or a ROS bag",
         )
     return found
 

@@ -57,7 +57,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "lens": Cause(
         "the intrinsics",
-        "Correct the intrinsics: focal lengths, distortion, its model and the image size must "
+        "Check the intrinsics: focal lengths, distortion, its model and the image size must "
         "belong to these images.",
         {
             "lens": "",

@@ -17,7 +17,8 @@ CORRESPONDENCES_FILE = "correspondences.parquet"
 CAMERA_MATCHES_FILE = "camera_matches.parquet"
 REPORT_FILE = "report.html"
 _BY = "calibrate, solve or track"
-PICTURES = ("overlay_*.png", "track.png")
+OVERLAYS = "overlay_*.png"
+PICTURES = (OVERLAYS, "track.png")
 
 VERDICT_KEY = "verdict"
 """In the metadata of a table: it is part of a result."""

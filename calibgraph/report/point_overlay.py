@@ -12,6 +12,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import write_atomically
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.outputs import with_png_mark
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -55,12 +56,16 @@ def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
     return _write_overlays(
-        frame, (guess,), (f"{{name}}, frame {frame.name}: guess",), folder / "guess_{name}.png"
+        frame,
+        (guess,),
+        (f"{{name}}, frame {frame.name}: guess",),
+        folder / "guess_{name}.png",
+        command="doctor",
     )
 
 
 def _write_overlays(
-    frame: Frame, rigs: tuple[Rig, ...], titles: tuple[str, ...], path: Path
+    frame: Frame, rigs: tuple[Rig, ...], titles: tuple[str, ...], path: Path, *, command: str = ""
 ) -> list[Path]:
     """Per camera, the points as each rig places them, below each other."""
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
@@ -72,7 +77,8 @@ def _write_overlays(
             for rig, title in zip(rigs, titles, strict=True)
         ]
         paths.append(path.with_name(path.name.replace("{name}", name)))
-        write_image(paths[-1], _shrink(np.vstack([*panels, _depth_bar(image.shape[1])])))
+        picture = _shrink(np.vstack([*panels, _depth_bar(image.shape[1])]))
+        write_image(paths[-1], picture, command=command)
     return paths
 
 
@@ -106,8 +112,13 @@ def _dot_side(pixels: int, points: int) -> int:
     return int(np.clip(round(side), 1, _MAX_DOT_PX))
 
 
-def write_image(path: Path, image: Image) -> None:
+def write_image(path: Path, image: Image, *, command: str = "") -> None:
     """Write a PNG atomically.
+
+    Args:
+        path: of the file.
+        image: (height, width, 3) BGR.
+        command: which marks the picture as its own; empty for no mark.
 
     Raises:
         CalibrationError: if it cannot be encoded or written.
@@ -117,7 +128,8 @@ def write_image(path: Path, image: Image) -> None:
         raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
 
     def write(part: Path) -> None:
-        part.write_bytes(data.tobytes())
+        picture = data.tobytes()
+        part.write_bytes(with_png_mark(picture, command) if command else picture)
 
     write_atomically(path, write)
 

@@ -6,7 +6,13 @@ from pathlib import Path
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.result_files import CAMERA_MATCHES_FILE, CORRESPONDENCES_FILE, REPORT_FILE
+from calibgraph.model.result_files import (
+    CAMERA_MATCHES_FILE,
+    CORRESPONDENCES_FILE,
+    OVERLAYS,
+    REPORT_FILE,
+    outputs_of_result,
+)
 from calibgraph.report.html import write_report
 from calibgraph.report.point_overlay import write_overlays
 
@@ -25,6 +31,7 @@ def write_result(
     Returns:
         The files to name to the user.
     """
+    stale = [output.path for output in outputs_of_result(folder) if output.is_ours(output.path)]
     written = [result.save(folder)]
     if data is not None:
         middle = data.frames[len(data.frames) // 2]
@@ -35,4 +42,6 @@ def write_result(
         written += write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark)
     if with_report:
         written.append(write_report(result, folder / REPORT_FILE))
+    for path in {path for path in stale if path.match(OVERLAYS)} - {*written}:
+        path.unlink()  # of a camera that this result does not have
     return written

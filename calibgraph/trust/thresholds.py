@@ -86,7 +86,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
               "Are there enough frames?",
               "With fewer, the error bar is mostly what is usual of matches.",
-              "the error bar is mostly a usual one"),
+              "the error bar is mostly a default, not measured"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
               "How much of a displaced start does a learned matcher leave?", _CHOSEN,
@@ -189,7 +189,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "deviations of chance agreement?",
               f"{_RECORDED}: right up to 0.65; one 0.35 deg off 1.0; KITTI 08: right up to 3.5. "
               "Local optima next to the right one 11 to 32.",
-              "an extrinsic nearby fits the images better; the usual cause are the intrinsics"),
+              "a slightly different pose fits the images better; often the lens is the cause"),
     Threshold("own_clouds", "score with the own clouds above that with neighbouring ones",
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?",
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "

@@ -44,9 +44,9 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     )  # fmt: skip
     code, _, text = call(*command)
     assert code == 0
-    for words in ("left->right", "left (bootstrap)", "error bar of ", "scatter of the matches"):
+    for words in ("left->right", "left (bootstrap)", "accuracy of ", "scatter of the matches"):
         assert words in text
-    assert "more: see report.html or calibration.yaml" in text  # the weakest directions
+    assert "more findings: see report.html or calibration.yaml" in text  # the weakest directions
     code, stdout, _ = call(*command, "--json")
     summary = yaml.safe_load(stdout)
     assert len(summary["pairs"]["left->right"]["translation_sigma_cm"]) == 3
@@ -112,7 +112,7 @@ def test_a_fail_shows_three_reasons_and_what_to_do_and_folds_the_rest(
     assert before[0].startswith("FAIL: off by more than 0.5 deg or 10 cm with a probability")
     at = before.index("What to do:")
     assert 1 <= len(before[1:at]) <= 3 and all(line.startswith("  FAIL  ") for line in before[1:at])
-    folded = next(n for n, line in enumerate(before) if " more: see report.html" in line)
+    folded = next(n for n, line in enumerate(before) if " more findings: see report.html" in line)
     assert 1 <= len([line for line in before[at + 1 : folded] if line.startswith("  ")]) <= 3
 
 

@@ -52,3 +52,13 @@ def test_a_table_matches_the_frames_of_the_dataset(
 def test_other_names_are_errors(name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         find_matcher(name)
+
+
+def test_the_matcher_of_a_name_states_its_source_of_stage_1() -> None:
+    """As one that is made by hand: the call of the library is that of the command line."""
+    data = calibgraph.load_dataset(SAMPLE)
+    tables = [
+        find_matcher(each).match(data, data.rig, round_index=5, progress=no_progress)
+        for each in ("structure", StructureMatcher())
+    ]
+    assert [table.findings.stage1 for table in tables] == ["rig", "rig"]

@@ -291,7 +291,7 @@ def test_few_frames_are_told(pair: Rig) -> None:
     table = simulate_correspondences(pair, errors=NOISY, frames=3)
     result = solve(pair, table)
     assert result.verdict.status != "PASS"
-    assert any("mostly a usual one" in reason for reason in result.verdict.reasons)
+    assert any("mostly a default" in reason for reason in result.verdict.reasons)
 
 
 def test_information_along_an_edge_is_used_and_across_it_is_not(pair: Rig) -> None:

@@ -50,7 +50,7 @@ def test_the_error_bar_of_few_frames_is_wide(pair: Rig, frames: int) -> None:
         for one, other in zip(narrow, wide, strict=True):
             assert np.exp(np.log(other / one).mean()) > 0.8 * np.sqrt(40 / frames)
     assert few.verdict.status != "PASS"
-    assert any("mostly a usual one" in reason for reason in few.verdict.reasons)
+    assert any("mostly a default" in reason for reason in few.verdict.reasons)
 
 
 def test_the_sigmas_of_a_relative_pose_are_in_the_error_bar(pair: Rig) -> None:

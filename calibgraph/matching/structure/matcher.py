@@ -30,7 +30,7 @@ from calibgraph.matching.structure.shift_scores import (
 from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress
@@ -226,7 +226,7 @@ class StructureMatcher:
             range_translation_m=reach.translation_m,
         )
         settings = {"matcher": "structure", "round": round_index, "seed": self.seed}
-        return {**settings, **findings.to_metadata()}
+        return {STAGE1: self.stage1, **settings, **findings.to_metadata()}
 
 
 def _search_findings(
