@@ -131,7 +131,7 @@ def _error_bar(sources: Mapping[str, ErrorSources], tolerance: tuple[float, floa
     if not sources:
         return ""
     name = max(sources, key=lambda one: sources[one].over_tolerance(tolerance))
-    return f"accuracy of {name}, 1 sigma on the worst axis: {sources[name].describe(tolerance)}"
+    return f"accuracy of {name}, 1 sigma: {sources[name].describe(tolerance)}"
 
 
 def _rank(reason: Reason) -> tuple[int, int]:

@@ -115,7 +115,7 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
     summary = summarize(unsure, sources={"left": WIDE})
     assert (
         summary.error_bar
-        == f"accuracy of left, 1 sigma on the worst axis: 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
+        == f"accuracy of left, 1 sigma: 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
     )
     (action,) = summary.actions
     assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
