@@ -89,9 +89,9 @@ def test_the_table_of_the_last_round_repeats_the_solve(result: calibgraph.Calibr
     again = calibgraph.solve(result.rig, result.correspondences, camera_matches=seen)
     for name, T in result.T_camera_lidar.items():
         delta = calibgraph.evaluate(again.rig, result.rig).cameras[name]
-        # A thousandth of a standard deviation (0.1 deg, 1 cm): where the fit stops.
-        assert delta.rotation_error_deg < 1e-4, name
-        assert delta.translation_error_cm < 1e-3, name
+        # A hundredth of a standard deviation (0.1 deg, 1 cm): the prior is about this result now.
+        assert delta.rotation_error_deg < 1e-3, name
+        assert delta.translation_error_cm < 1e-2, name
         assert T.shape == (4, 4)
 
 
