@@ -30,7 +30,12 @@ def test_every_file_of_the_packages_is_installed() -> None:
     assert len(held) > 5
 
 
-@pytest.mark.parametrize("name", ["factors", "numpy", "typer", "yaml"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "name", ["factors", *(pytest.param(n, marks=SLOW) for n in ("numpy", "typer", "yaml"))]
+)
 def test_modules_in_the_working_folder_are_not_imported(name: str, tmp_path: Path) -> None:
     (tmp_path / f"{name}.py").write_text("raise SystemExit('imported')")
     done = subprocess.run(

@@ -152,7 +152,15 @@ Make = Callable[[Rig, Rig, Sequence[Path], Path], Calibration]
 
 
 @pytest.mark.parametrize(
-    "make", [one_camera, no_overlap, overlap, relative_pose, excluded_camera, no_time]
+    "make",
+    [
+        one_camera,
+        excluded_camera,
+        *(
+            pytest.param(each, marks=pytest.mark.slow)
+            for each in (no_overlap, overlap, relative_pose, no_time)
+        ),
+    ],
 )
 def test_the_saved_table_solved_again_gives_the_saved_result(
     make: Make, guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path

@@ -13,6 +13,8 @@ from calibgraph.trust.conventions import (
 )
 from tests.conftest import SAMPLE, make_camera
 
+SLOW = pytest.mark.slow
+
 
 @pytest.mark.parametrize("words", undo_convention_errors(np.eye(4)))
 def test_every_convention_error_is_recognised_by_undoing_it(words: str) -> None:
@@ -26,8 +28,12 @@ def test_every_convention_error_is_recognised_by_undoing_it(words: str) -> None:
     [
         ("the guess is inverted (it is T_lidar_camera)", 1),
         ("the guess is of camera axes forward, left, up, not right, down, forward", 2),
-        ("the LiDAR's axes are turned by 180 deg about z (its x points backward)", 3),
-        ("the LiDAR's axes are turned by 90 deg about z (its x points right)", 4),
+        pytest.param(
+            "the LiDAR's axes are turned by 180 deg about z (its x points backward)", 3, marks=SLOW
+        ),
+        pytest.param(
+            "the LiDAR's axes are turned by 90 deg about z (its x points right)", 4, marks=SLOW
+        ),
     ],
 )
 def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(words: str, seed: int) -> None:

@@ -197,7 +197,7 @@ def test_transforms_that_move_are_not_static_and_are_named(tmp_path: Path) -> No
         load_rig(write_bag(tmp_path, "mcap", written))
 
 
-@pytest.mark.parametrize("number", [0.0, float("nan")])
+@pytest.mark.parametrize("number", [0.0, pytest.param(float("nan"), marks=pytest.mark.slow)])
 def test_odometry_without_poses_is_named_and_a_few_bad_ones_are_left_out(
     tmp_path: Path, number: float
 ) -> None:
