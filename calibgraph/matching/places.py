@@ -66,13 +66,15 @@ class PlaceWalk:
 
     Args:
         most_places: that are remembered, those visited last; None: all.
+        in_sequence: whether frames follow each other closely, as while driving: then a frame after
+            an unknown motion stays at the place before, however unlike the clouds are.
     """
 
-    def __init__(self, most_places: int | None = None) -> None:
+    def __init__(self, most_places: int | None = None, *, in_sequence: bool = False) -> None:
         self._T_now_first, self._first = np.eye(4), -1
         self._before: Frame | None = None
         self._known: dict[int, UprightCloud] = {}  # by their first frames, the last visited last
-        self._most = most_places
+        self._most, self._in_sequence = most_places, in_sequence
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
         """The number of the first frame of this frame's place.
@@ -87,8 +89,9 @@ class PlaceWalk:
             return self._first
         step = _motion_by_clouds(before, frame) if step is None else step
         if step is None:
-            if _are_comparable(before, frame):
-                self._find_place(frame)
+            self._find_place(
+                frame, may_stay=self._in_sequence or not _are_comparable(before, frame)
+            )
             return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
@@ -99,15 +102,15 @@ class PlaceWalk:
         """Know the place of which this is the first frame."""
         self._visit(frame.index, _upright_cloud(frame))
 
-    def _find_place(self, frame: Frame, *, left: int | None = None) -> None:
-        """The most similar known place, but for one that was left; else a new one."""
+    def _find_place(self, frame: Frame, *, left: int | None = None, may_stay: bool = False) -> None:
+        """The most similar known place but for one that was left, else the present or a new one."""
         cloud = _upright_cloud(frame)
         known = [first for first in self._known if first != left]
         found = cloud and align_with_any(cloud, [self._known[first] for first in known])
         if found and _distance_m(found[1]) <= PLACE_M:
             self._first, self._T_now_first = known[found[0]], found[1]
             self._visit(self._first, self._known[self._first])
-        else:
+        elif found or not may_stay:
             self._first, self._T_now_first = frame.index, np.eye(4)
             self._visit(frame.index, cloud)
 
@@ -155,7 +158,7 @@ class PlaceFinder:
     """
 
     def __init__(self, rig: Rig, *, most_places: int | None = None, seed: int = 0) -> None:
-        self._rig, self._seed, self._walk = rig, seed, PlaceWalk(most_places)
+        self._rig, self._seed, self._walk = rig, seed, PlaceWalk(most_places, in_sequence=True)
         self._before: _SeenFrame | None = None
 
     def remember(self, frame: Frame) -> None:

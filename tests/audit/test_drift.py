@@ -232,7 +232,8 @@ def test_recordings_of_one_kitti_car_agree_and_a_turned_camera_is_found(realdata
     rig = calibgraph.load_rig(folders[0])
     matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)
     given = {f.name: calibgraph.calibrate(f, rig, matcher) for f in folders}
-    wide = {"tolerance_cm": 15.0}  # sigmas along z are up to 4 cm
+    # Sigmas are up to 0.17 deg and 4 cm: what three times as much could hide is tolerated.
+    wide = {"tolerance_deg": 0.6, "tolerance_cm": 15.0}
     assert calibgraph.drift(given, **wide).status == "OK"
     turned = moved(given["06"].rig, {"image_3": twist("yaw", 1.5)})
     found = calibgraph.drift({**given, "06": replace(given["06"], rig=turned)}, **wide)

@@ -40,7 +40,7 @@ def test_a_bag_without_transforms(call: Call, tmp_path: Path) -> None:
     code, _, said = call("guess", bag, *mounts(MOUNTED), "--out", tmp_path / "rig.yaml")
     assert code == 0
     frames = calibrate_and_export(call, bag, tmp_path, said)
-    assert frames == [f"{name}_optical_frame" for name in MOUNTED]
+    assert frames == [f"{name}_optical" for name in MOUNTED]  # those of the bag
     for error in evaluate(load_calibration(tmp_path / "result").rig, TRUTH).cameras.values():
         assert error.rotation_error_deg < 0.12  # 1 px
         assert error.translation_error_cm < 3
