@@ -92,11 +92,11 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
-    """Whether a convention error in the guess explains a failure.
+    """Whether a convention error in the guess explains the failure of cameras.
 
     It takes seconds, so that a time limit that has passed does not prevent it.
     """
-    failed = any(check.status == "FAIL" for each in checks.values() for check in each)
+    failed = [n for n, each in checks.items() if any(check.status == "FAIL" for check in each)]
     if not failed:
         return {}
     error = likely_intended_guess(evidence.run.dataset, evidence.run.guess)
@@ -104,7 +104,7 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
         return {}
     text = f"{error}: correct it and calibrate again"
     check = Check("convention of the guess", "FAIL", text)
-    return {name: [check] for name in checks}
+    return dict.fromkeys(failed, [check])
 
 
 def _implausible_checks(guess: Rig, checks: Checks) -> Checks:
