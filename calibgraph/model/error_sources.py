@@ -56,7 +56,7 @@ class ErrorSources:
         bar = self._larger(tolerance)
         ordered = sorted(bar.shares.items(), key=lambda item: -item[1])
         parts = [f"{share:.0%} {name}" for name, share in ordered if share >= _MENTIONED]
-        return f"{in_unit(bar.sigma, bar.unit)}: {', '.join(parts)}"
+        return f"{in_unit(bar.sigma, bar.unit)} ({', '.join(parts)})"
 
     def action(self, tolerance: tuple[float, float]) -> str:
         """What would shrink the error bar enough for a PASS, in one sentence; empty if it is.

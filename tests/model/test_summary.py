@@ -113,7 +113,7 @@ WIDE = ErrorSources(
 def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
     unsure = {"left": Verdict((threshold("sigma_rotation").check(0.3),), Doubt(0.001, 0.1))}
     summary = summarize(unsure, sources={"left": WIDE})
-    assert summary.error_bar == f"accuracy of left, 1 sigma: 0.3 deg: 90% {COMMON}, 10% {MATCHES}"
+    assert summary.error_bar == f"accuracy of left, 1 sigma: 0.3 deg (90% {COMMON}, 10% {MATCHES})"
     (action,) = summary.actions
     assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
     few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
