@@ -95,7 +95,7 @@ def summarize(
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
         by_cause.setdefault(finding.cause, []).append(finding)
-    grouped = [_with_all_cameras(each) for each in by_cause.values()]
+    grouped = [_with_other_cameras(each) for each in by_cause.values()]
     if of_rig.cannot_tell:
         grouped = _unsure_first(grouped)
     shown = [*grouped[:MOST]]
@@ -146,10 +146,13 @@ def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
     return [replace(first, text=text), *others]
 
 
-def _with_all_cameras(reasons: Sequence[Reason]) -> Reason:
-    """The first reason of a cause, with the cameras of all."""
-    names = dict.fromkeys(name for reason in reasons for name in reason.cameras)
-    return replace(reasons[0], cameras=tuple(names))
+def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
+    """The first reason of a cause, and which other cameras have one of the same cause."""
+    first = reasons[0]
+    others = dict.fromkeys(name for reason in reasons for name in reason.cameras)
+    names = [name for name in others if name not in first.cameras]
+    also = f" (also noticed at {', '.join(names)})" if names else ""
+    return replace(first, text=f"{first.text}{also}")
 
 
 def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:

@@ -52,10 +52,11 @@ def test_sentences_that_differ_in_a_number_are_one_reason() -> None:
     )  # fmt: skip
 
 
-def test_checks_of_one_cause_are_one_reason_of_all_their_cameras() -> None:
+def test_checks_of_one_cause_are_one_reason_that_names_its_own_cameras_and_the_others() -> None:
     summary = summarize({"left": of_kinds("own_clouds"), "right": of_kinds("time_offset")})
     (reason,) = summary.reasons
-    assert (reason.cause, reason.cameras) == ("time", ("left", "right"))
+    assert (reason.cause, reason.cameras) == ("time", ("left",))
+    assert reason.text.endswith(" (also noticed at right)")
     assert [other.text for other in summary.others] == ["time_offset is odd"]
     assert summary.actions == (CAUSES["time"].action,)
 
