@@ -66,7 +66,7 @@ def report_html(result: Calibration) -> str:
         cameras=cameras,
         summary=summary,
         recording=recording_name(result),
-        usable=_CAN_I_USE_IT[summary.status, summary.cannot_tell],
+        usable=_usable(result),
         actions=summary.actions or ("Deploy it: see below.",),
         accuracy=_accuracy(result),
         export_command=_export_command(result),
@@ -80,6 +80,15 @@ def report_html(result: Calibration) -> str:
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
+
+
+def _usable(result: Calibration) -> str:
+    """Whether the result can be used: of a rig that FAILs, the cameras that do not may be."""
+    failed = [name for name, found in result.camera_verdicts.items() if found.status == "FAIL"]
+    if failed and len(failed) < len(result.camera_verdicts):
+        return f"Not of {', '.join(failed)}. The other cameras by their own verdicts."
+    summary = result.summary
+    return _CAN_I_USE_IT[summary.status, summary.cannot_tell]
 
 
 def _export_command(result: Calibration) -> str:

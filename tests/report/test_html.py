@@ -183,3 +183,14 @@ def test_the_template_is_part_of_the_package() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert "calibgraph*" in setuptools["packages"]["find"]["include"]
     assert setuptools["package-data"]["calibgraph.report"] == ["*.html.j2", "static/*"]
+
+
+def test_of_a_rig_that_fails_the_page_names_the_cameras_that_cannot_be_used(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    """The export command beside it offers the other ones."""
+    gone = Verdict((Check("search", "FAIL", "not found"),))
+    verdicts = {**solved_pair.camera_verdicts, "left": gone}
+    text = write_page(replace(solved_pair, camera_verdicts=verdicts), tmp_path)
+    assert "Not of left. The other cameras by their own verdicts." in text
+    assert "--camera right" in text
