@@ -22,6 +22,11 @@ from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
+from .graph.objective import block_factor as block_factor
+from .graph.objective import camera_prior_factor as camera_prior_factor
+from .graph.objective import projection_factor as projection_factor
+from .graph.objective import relative_pose_factor as relative_pose_factor
+from .graph.objective import relative_prior_factor as relative_prior_factor
 from .guessing.guess import CameraGuess as CameraGuess
 from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
@@ -69,11 +74,6 @@ from .pipeline import solve as solve
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
 from .simulation.matcher_errors import MatcherErrors as MatcherErrors
 from .simulation.recording import simulate_street as simulate_street
-from .solver.factor_graph import block_factor as block_factor
-from .solver.factor_graph import camera_prior_factor as camera_prior_factor
-from .solver.factor_graph import projection_factor as projection_factor
-from .solver.factor_graph import relative_pose_factor as relative_pose_factor
-from .solver.factor_graph import relative_prior_factor as relative_prior_factor
 from .tracking import DurableCalibrator as DurableCalibrator
 from .tracking import Event as Event
 from .tracking import IncrementalCalibrator as IncrementalCalibrator

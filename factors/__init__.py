@@ -26,7 +26,7 @@ from factors.pair import (
     surface_factor,
 )
 from factors.pose import (
-    bent_between_factor,
+    biased_between_factor,
     camera_prior_factor,
     pose_sigmas,
     relative_pose_factor,
@@ -60,7 +60,7 @@ __all__ = [
     "projection_factor",
     "projection_residual",
     "ray_spreads",
-    "bent_between_factor",
+    "biased_between_factor",
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",

@@ -78,7 +78,7 @@ def relative_pose_factor(
     )
 
 
-def bent_between_factor(
+def biased_between_factor(
     key_1: int, key_bend: int, key_2: int, shifts: ArrayLike, noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
     """Two poses that differ by some numbers' effect: error ``log(X_1^-1 X_2) - shifts b``.

@@ -39,8 +39,8 @@ from calibgraph import Config, Rig, concatenate, simulate_correspondences
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
-from calibgraph.solver.cloud_bends import bends_at
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.scan_distortion import distortions_at
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
 from factors import ProjectionBlock
@@ -145,7 +145,7 @@ def draw_places(
             seed=int(rng.integers(2**31)),
         )
         points = table.points_lidar_m
-        bent = points + np.tensordot(bends, bends_at(points), axes=1)
+        bent = points + np.tensordot(bends, distortions_at(points), axes=1)
         tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
         names[place] += range(frames * visit, frames * (visit + 1))
     stated = {name: value for name, value in vars(SIZES).items()}

@@ -23,10 +23,11 @@ from benchmarks.accuracy.drives import camera
 from benchmarks.simulated_drive import simulate_drive
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
+from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.factor_graph import pose_key, prior_graph, to_values
+from calibgraph.solver.optimizer import to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.tracking import warm_up_tracker
 from factors import block_factor

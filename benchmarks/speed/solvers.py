@@ -19,11 +19,12 @@ from calibgraph import (
     preset,
     simulate_correspondences,
 )
+from calibgraph.graph.objective import objective_graph, pose_key
 from calibgraph.model.geometry import invert, to_T_camera_lidar
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.factor_graph import objective_graph, pose_key, to_values
 from calibgraph.solver.objective import Objective
+from calibgraph.solver.optimizer import to_values
 from factors import projection_factor
 
 Array = NDArray[np.float64]

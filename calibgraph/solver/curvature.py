@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.geometry import (
     pose_rows,
     retract_all,
@@ -18,8 +19,8 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
-from calibgraph.solver.factor_graph import relative_pose_graph, to_values
 from calibgraph.solver.objective import Objective, Transforms
+from calibgraph.solver.optimizer import to_values
 from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]

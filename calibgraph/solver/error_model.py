@@ -1,4 +1,4 @@
-"""The error model of a solution: ``calibgraph.solver.hierarchy`` filled in, fitted, and sized."""
+"""The error model of a solution: ``calibgraph.graph.latent_poses`` filled with data, and fitted."""
 
 from __future__ import annotations
 
@@ -10,127 +10,131 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
+from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents
+from calibgraph.graph.objective import join, pose_key
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
+from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
-from calibgraph.solver.cloud_bends import bend_evidence, shifts_of_pairs
-from calibgraph.solver.component_sizes import Sizes, sizes_of
 from calibgraph.solver.conflicts import relative_pose_conflict
-from calibgraph.solver.factor_graph import Optimum, join, pose_key
-from calibgraph.solver.hierarchy import Components, Hierarchy, PlacedBlock, PlacedPair
-from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy, linearize
-from calibgraph.solver.hierarchy_poses import start_poses
+from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
+from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.solver.within_place import WEAK, within_place
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
-_ROUNDS = 3  # of fitting and sizing
+_ROUNDS = 3  # of fits and estimates of the variance ratios
 _COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorFit:
-    """The error model of a solution, at its minimum.
+    """The optimum of the error model.
 
     Attributes:
-        model: with the sizes that fit the data.
-        fit: its minimum and marginals.
-        places: the numbers of the frames of each place.
-        sizes: of its components, over the usual ones.
-        alone: the same without measured relative poses and priors, where some are measured.
+        fit: the optimum, with the variance ratios that fit the data.
+        places: the frame numbers of each place.
+        ratios: of its variance components.
+        without_priors: the optimum without measured relative poses and priors, where some are
+            measured.
     """
 
-    model: Hierarchy
-    fit: HierarchyFit
+    fit: LatentPoseFit
     places: tuple[Numbers, ...]
-    sizes: Sizes
-    alone: ErrorFit | None = None
+    ratios: VarianceRatios
+    without_priors: ErrorFit | None = None
 
-    def with_shared_size(self, least: float) -> ErrorFit:
-        """The same minimum, with covariances of what is shared everywhere of at least this size."""
-        ratio = least / self.sizes.shared
-        if ratio <= 1.0:
+    @property
+    def model(self) -> LatentPoseModel:
+        """The graph."""
+        return self.fit.linear.model
+
+    def with_shared_ratio(self, least: float) -> ErrorFit:
+        """The same optimum; the covariances of what all places share have at least this ratio."""
+        factor = least / self.ratios.shared
+        if factor <= 1.0:
             return self
         parts = self.model.components
-        model = replace(
-            self.model,
-            components=replace(
-                parts,
-                cloud=ratio * parts.cloud,
-                camera=ratio * parts.camera,
-                bend_size=ratio * parts.bend_size,
-            ),
+        components = replace(
+            parts,
+            cloud=factor * parts.cloud,
+            camera=factor * parts.camera,
+            distortion_size=factor * parts.distortion_size,
         )
-        fit = linearize(model, self.fit)
-        return replace(self, model=model, fit=fit, sizes=replace(self.sizes, shared=least))
+        fit = self.fit.with_model(replace(self.model, components=components))
+        return replace(self, fit=fit, ratios=replace(self.ratios, shared=least))
 
-    def bends(self, usual: Sequence[float]) -> tuple[Array, Array]:
+    def scan_distortion(self, prior_sigmas: Sequence[float]) -> tuple[Array, Array]:
         """(3,) offset of elevations [rad], their stretch, motion [m]; (3,) standard deviations.
 
         Args:
-            usual: the standard deviations that the matcher states.
+            prior_sigmas: (3,) prior standard deviations that the matcher states.
         """
-        values, covariance = bends_of(self.model, self.fit)
-        unit = np.asarray(usual)
+        values, covariance = self.fit.distortion
+        unit = np.asarray(prior_sigmas)
         return unit * values, unit * np.sqrt(np.diag(covariance))
 
-    def without_pose_graph(self) -> HierarchyFit | None:
-        """The fit without priors and measured relative poses, of the same sizes."""
+    def drop_pose_graph(self) -> LatentPoseFit | None:
+        """The optimum without priors and measured relative poses, of the same ratios."""
         model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
-        return fit_hierarchy(model, self.fit, relative_tolerance=_COARSE_TOLERANCE)
+        return fit_latent_poses(model, self.fit, relative_tolerance=_COARSE_TOLERANCE)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
         """Per camera, (4, 4)."""
-        return self.fit.T_camera_lidar(self.model)
+        return self.fit.T_camera_lidar
 
 
-def weigh_errors(
+def refine_with_error_model(
     inliers: Objective,
     optimum: Optimum,
     scales: Scales,
     metadata: Mapping[str, Any],
     held: Sequence[str] = (),
 ) -> tuple[ErrorFit | None, Optimum]:
-    """The minimum under the error model, where it differs from that of independent matches.
+    """The optimum of the error model, where it differs from that of independent matches.
 
-    Where there is nothing but the matches of one place, and no bends, their minimum is that of
-    both; it stays, and no model is made. Measured relative poses that contradict the
-    correspondences take no part, so that one that is wrong, or two cameras that are swapped, do not
-    move the others. Arguments and what is None as of :func:`fit_errors`.
+    With nothing but the matches of one place, and no scan distortion, both optima are equal; then
+    no model is made. Measured relative poses that contradict the correspondences take no part, so
+    that a wrong one, or two swapped cameras, do not move the others. Arguments and None as of
+    :func:`fit_errors`.
     """
     several = inliers.blocks and len(places_of(inliers, metadata)) > 1
-    bent = any(MatcherFindings.from_metadata(metadata).bend_sigmas)
-    if not (several or bent or inliers.pairs or inliers.rig.relative_poses):
+    distorted = any(MatcherFindings.from_metadata(metadata).bend_sigmas)
+    if not (several or distorted or inliers.pairs or inliers.rig.relative_poses):
         return None, optimum
-    alone, T = None, optimum.T_camera_lidar
+    free, T = None, optimum.T_camera_lidar
     if inliers.rig.relative_poses:
-        alone = fit_alone(inliers, T, scales, metadata)
-    if alone is not None:
-        agreeing = _without_contradictions(inliers, alone)
-        T = T if agreeing is inliers else T | alone.T_camera_lidar
+        free = fit_without_priors(inliers, T, scales, metadata)
+    if free is not None:
+        agreeing = _without_contradictions(inliers, free)
+        T = T if agreeing is inliers else T | free.T_camera_lidar
         inliers = agreeing
     found = fit_errors(inliers, T, scales, metadata, held)
     if found is None:
         return None, optimum
-    found = replace(found, alone=alone)
+    found = replace(found, without_priors=free)
     fit, T = found.fit, found.T_camera_lidar
     return found, Optimum(T, fit.cost, optimum.iterations + fit.iterations, fit.converged)
 
 
-def fit_alone(
+def fit_without_priors(
     inliers: Objective,
     T_camera_lidar: Mapping[str, Array],
     scales: Scales,
     metadata: Mapping[str, Any],
 ) -> ErrorFit | None:
-    """The fit of the correspondences and pairs alone; what is None as of :func:`fit_errors`."""
+    """The fit of correspondences and pairs alone; None as of :func:`fit_errors`."""
     if inliers.config.preset != "auto" or not inliers.uses_correspondences:
         return None
     free = inliers.data_only()
@@ -138,15 +142,15 @@ def fit_alone(
     return fit_errors(free, free.minimize(start, scales).T_camera_lidar, scales, metadata)
 
 
-def _without_contradictions(inliers: Objective, alone: ErrorFit) -> Objective:
+def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
     """Without the relative poses that the correspondences of both their cameras contradict."""
-    cameras, limit = alone.model.cameras, error_components().contradiction_sigmas
-    measured, T = inliers.rig.relative_poses, alone.T_camera_lidar
+    cameras, limit = free.model.cameras, error_components().contradiction_sigmas
+    measured, T = inliers.rig.relative_poses, free.T_camera_lidar
     kept = tuple(
         pair
         for pair in measured
         if not {pair.a, pair.b} <= set(cameras)
-        or relative_pose_conflict(pair, cameras, T, alone.fit.covariance).largest <= limit
+        or relative_pose_conflict(pair, cameras, T, free.fit.covariance).largest <= limit
     )
     if len(kept) == len(measured):
         return inliers
@@ -160,11 +164,11 @@ def fit_errors(
     metadata: Mapping[str, Any],
     held: Sequence[str] = (),
 ) -> ErrorFit | None:
-    """Fit poses and sizes of the errors, from the minimum for independent matches.
+    """Fit poses and variance ratios, from the optimum for independent matches.
 
     Args:
         inliers: after the gate.
-        T_camera_lidar: its minimum.
+        T_camera_lidar: its optimum.
         scales: of the residuals.
         metadata: of the correspondences, with the matcher's error and the places.
         held: cameras that nothing determines; they are known to a radian and a metre.
@@ -177,21 +181,22 @@ def fit_errors(
         return None
     places = places_of(inliers, metadata)
     model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
-    usual, sizes = model.components, Sizes()
-    fit = fit_hierarchy(
-        model, start_poses(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
+    prior, ratios = model.components, VarianceRatios()
+    fit = fit_latent_poses(
+        model, start_values(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
-    if fit is not None and np.isfinite(usual.robust_scale):  # what a wrong place shows, it errs in
-        usual = replace(usual, bend_weight=fit.place_weights(usual.robust_scale))
-        model = replace(model, components=usual)
+    if fit is not None and np.isfinite(prior.robust_scale):  # an outlying place has no evidence
+        weight = fit.place_weights(prior.robust_scale)
+        prior = replace(prior, distortion_weight=weight[:, :1] * weight[:, 1:])
+        model = replace(model, components=prior)
     for _ in range(_ROUNDS):
-        found = sizes if fit is None else sizes_of(model, fit, sizes)
-        if fit is None or found.is_near(sizes):
+        found = ratios if fit is None else estimate_variance_ratios(fit, ratios)
+        if fit is None or found.is_near(ratios):
             break
-        model, sizes = replace(model, components=found.scale(usual)), found
-        fit = fit_hierarchy(model, fit, relative_tolerance=_COARSE_TOLERANCE)
-    fit = None if fit is None else fit_hierarchy(model, fit)
-    return None if fit is None else ErrorFit(model, fit, tuple(places), sizes)
+        model, ratios = replace(model, components=found.scale(prior)), found
+        fit = fit_latent_poses(model, fit, relative_tolerance=_COARSE_TOLERANCE)
+    fit = None if fit is None else fit_latent_poses(model, fit)
+    return None if fit is None else ErrorFit(fit, tuple(places), ratios)
 
 
 def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
@@ -208,58 +213,76 @@ def error_model(
     metadata: Mapping[str, Any],
     places: Sequence[Numbers],
     held: Sequence[str] = (),
-) -> Hierarchy:
-    """The model with usual sizes; arguments as of :func:`fit_errors`."""
-    findings, usual = MatcherFindings.from_metadata(metadata), error_components()
+) -> LatentPoseModel:
+    """The model with prior variance components; arguments as of :func:`fit_errors`."""
+    findings, prior = MatcherFindings.from_metadata(metadata), error_components()
     cameras = tuple(T_camera_lidar)
     whole, share = np.square(findings.rigid_sigmas), findings.camera_share
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = usual.matchers[UNKNOWN]
+        unknown = prior.matchers[UNKNOWN]
         whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
         share = unknown.camera_share
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
     scatter_at_place = at_place.copy()
-    usual_bends = np.asarray(findings.bend_sigmas)
-    blocks, bends = {}, np.zeros((len(cameras), 6, len(usual_bends)))
-    shape = len(places), len(cameras), len(usual_bends)
-    bend_vector, bend_information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    sigmas = np.asarray(findings.bend_sigmas)
+    blocks, jacobian = {}, np.zeros((len(cameras), 6, len(sigmas)))
+    shape = len(places), len(cameras), len(sigmas)
+    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
     for name, block in inliers.blocks.items():
-        placed = PlacedBlock.of(block, scales[name], places)
-        within = within_place(inliers, name, T_camera_lidar[name], scales[name], placed)
-        at_place[:, cameras.index(name)] = within.at_place(findings.place_variance)
-        scatter_at_place[:, cameras.index(name)] = within.at_place(0.0)
-        blocks[name] = placed.with_variance(within.least)
-        if usual_bends.any():
+        number, by_place = cameras.index(name), block_by_place(block, scales[name], places)
+        within = within_place(inliers, name, T_camera_lidar[name], scales[name], by_place)
+        at_place[:, number] = within.at_place(findings.place_variance)
+        scatter_at_place[:, number] = within.at_place(0.0)
+        blocks[name] = by_place.with_variance(within.least)
+        if sigmas.any():
             pose = to_T_lidar_camera(T_camera_lidar[name])
-            evidence = bend_evidence(block, scales[name], pose, WEAK, places)
-            bends[cameras.index(name)] = evidence.shifts * usual_bends
+            evidence = distortion_evidence(block, scales[name], pose, WEAK, places)
+            jacobian[number] = evidence.jacobian * sigmas
             weight = 1.0 / within.mean_variance(findings.place_variance)
-            units = np.outer(usual_bends, usual_bends)
-            bend_information[:, cameras.index(name)] = weight * units * evidence.information
-            bend_vector[:, cameras.index(name)] = weight * usual_bends * evidence.vector
-    pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # of some the gate leaves nothing
-    components = Components(
+            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
+            vector[:, number] = weight * sigmas * evidence.vector
+    pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
+    components = VarianceComponents(
         cloud=_covariance(*((1.0 - share) * whole)),
         cloud_at_place=_covariance(*of_place),
         camera=_covariance(*(share * whole)),
-        bends=bends,
-        pair_bends=shifts_of_pairs(
-            bends,
+        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
+        at_place=at_place,
+        scatter_at_place=scatter_at_place,
+        distortion_jacobian=jacobian,
+        pair_distortion_jacobian=pair_jacobians(
+            jacobian,
             np.isin(cameras, list(inliers.blocks)),
             invert(np.stack([T_camera_lidar[name] for name in cameras])),
             sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
         ),
-        bend_information=bend_information,
-        bend_vector=bend_vector,
-        bend_weight=np.ones(shape[:2]),
-        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
-        at_place=at_place,
-        scatter_at_place=scatter_at_place,
-        robust_scale=usual.robust_sigmas if len(places) >= usual.robust_places else np.inf,
+        distortion_information=information,
+        distortion_vector=vector,
+        distortion_weight=np.ones(shape[:2]),
+        robust_scale=prior.robust_sigmas if len(places) >= prior.robust_places else np.inf,
     )
     graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
-    return Hierarchy(cameras, blocks, _placed_pairs(pairs, places), graph, components)
+    return LatentPoseModel(cameras, blocks, _pairs_by_place(pairs, places), graph, components)
+
+
+def block_by_place(
+    camera: CameraBlock, scale: ResidualScale, places: Sequence[Numbers]
+) -> BlockByPlace:
+    """The correspondences of a camera, sorted by place.
+
+    Args:
+        camera: its correspondences.
+        scale: of their residuals.
+        places: the frame numbers of each place.
+    """
+    of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
+    if len(places) == 1:
+        return BlockByPlace(camera.with_scale(scale), np.array([0, len(camera)]), of_frame, counts)
+    edges = np.zeros(len(places) + 1, dtype=np.int64)
+    np.add.at(edges[1:], of_frame, counts)
+    block = camera.sorted_by(of_frame).with_scale(scale)
+    return BlockByPlace(block, edges.cumsum(), of_frame, counts)
 
 
 def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
@@ -276,10 +299,15 @@ def _held_graph(
     return graph
 
 
-def _placed_pairs(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PlacedPair]:
-    """Each term, its information that of features which err as usual in a frame."""
+def _pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PairByPlace]:
+    """Each term with the information of features that err as usual in a frame."""
     found = []
     for pair in pairs:
         own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
-        found.append(PlacedPair.of(pair.deflate(usual_excess(own)), places))
+        term = pair.deflate(usual_excess(own))
+        of_row = place_of(term.frame, places)
+        rows = np.argsort(of_row, kind="stable")
+        present, first = np.unique(of_row[rows], return_index=True)
+        edges = np.append(first, len(rows))
+        found.append(PairByPlace(term.a, term.b, term.block.select(rows), present, edges))
     return found

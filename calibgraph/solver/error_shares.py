@@ -1,9 +1,9 @@
 """How much each source of error adds to the variance of a camera's pose.
 
-The estimate is linear in the errors near its minimum: an error e of a factor with Jacobian J and
-information M moves it by C J^T M e, where C is the covariance of all poses. The errors of different
-factors are independent, so that their variances C J^T M S M J C, with S the covariance of e, add up
-to C. The matches have the rest.
+Near its optimum the estimate is linear in the errors: an error e of a factor with Jacobian J and
+information M = S^-1 moves it by C J^T M e, where C is the covariance of all poses. The errors of
+different factors are independent, and their variances C J^T M S M J C add up to C. The matches have
+the rest.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
@@ -27,15 +30,15 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.curvature import pose_hessian
+from calibgraph.solver.elimination import Linearization, join_linear, marginal_information
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.hierarchy_poses import placed_edges, shared_edges
 
 Array = NDArray[np.float64]
 Variances = dict[str, Array]
 
-_BENDS = ELEVATION, STRETCH, MOTION
-_NOTHING = 1e-9  # share of a variance
+_DISTORTIONS = ELEVATION, STRETCH, MOTION
+_NOTHING = 1e-8  # share of a variance: rounding of a difference
+_DIFFERENCE = 5e-3  # of the log of a variance
 
 
 def sources_of_error(
@@ -75,73 +78,74 @@ def _error_bar(variances: Array) -> tuple[float, float]:
 def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     """(6 N,) of all cameras, if such frames at such places were recorded several times as often.
 
-    What places show adds up, what they all share remains.
+    The information of places is repeated; that of what they all share is not.
     """
-    model, fit = errors.model, errors.fit
-    edges, free = shared_edges(model, fit.poses), len(fit.shared_covariance)
-    cameras, parts = 6 * len(model.cameras), model.components
-    jacobian, known = edges.jacobian[:, :free], np.zeros((free, free))
-    known[:cameras, :cameras] = _pose_graph_hessian(errors)
-    of_places = fit.equations.reduced[0] - jacobian.T @ edges.information @ jacobian - known
+    linear = errors.fit.linear
+    model = linear.model
+    summary = linear.placed.eliminatePartialMultifrontal(to_ordering(model.place_keys))[1]
     found = {}
     for times in TIMES:
-        more = replace(parts, bend_information=times * parts.bend_information)
-        shared = jacobian.T @ more.shared_information @ jacobian
-        columns = np.linalg.solve(times * of_places + shared + known, np.eye(free, cameras))
-        found[times] = np.diag(columns)
+        shown = times * model.components.distortion_information
+        vector = times * model.components.distortion_vector
+        parts = replace(model.components, distortion_information=shown, distortion_vector=vector)
+        shared = replace(model, components=parts).shared_graph.linearize(linear.values)
+        graph = join_linear(shared, *times * [summary])
+        found[times] = np.diag(np.linalg.inv(marginal_information(graph, model)))
     return found
-
-
-def _pose_graph_hessian(errors: ErrorFit) -> Array:
-    """(6 N, 6 N) of priors and measured relative poses."""
-    model = errors.model
-    T_camera_lidar = errors.fit.T_camera_lidar(model)
-    return pose_hessian(model.pose_graph, list(model.cameras), T_camera_lidar)
 
 
 def variances_by_source(errors: ErrorFit) -> Variances:
     """Per source but the matches, (6 N,) of its part of the variances of all cameras."""
-    return {**_of_shared(errors), **_of_places(errors)}
+    return {**_of_shared(errors.fit.linear), PLACES: _of_places(errors)}
 
 
-def _of_shared(errors: ErrorFit) -> Variances:
-    """What all places share: the cloud, its bends, matches and pairs of a camera; the priors."""
-    model, fit = errors.model, errors.fit
-    parts, cameras = model.components, 6 * len(model.cameras)
-    edges, free = shared_edges(model, fit.poses), len(fit.shared_covariance)
-    moved = fit.shared_covariance[:cameras] @ edges.jacobian[:, :free].T @ edges.information
-    by_bend = moved[:, 6:] @ parts.all_bends @ parts.bend_covariance
-    return {
-        COMMON: _variance(moved[:, :6], parts.cloud)
-        + _of_each(moved[:, 6 : 6 + cameras], parts.camera),
-        PAIRS: _of_each(moved[:, 6 + cameras :], parts.pairs),
-        **dict(zip(_BENDS, (by_bend**2 / parts.bend_size).T, strict=True)),
-        PRIORS: _variance(fit.covariance, _pose_graph_hessian(errors)),
-    }
+def _of_shared(linear: Linearization) -> Variances:
+    """The parts of the factors that act on what all places share.
+
+    A factor with the whitened Jacobian A adds C A^T A C.
+    """
+    model = linear.model
+    summary = linear.placed.eliminatePartialMultifrontal(to_ordering(model.place_keys))[1]
+    keys = model.camera_keys + model.shared_keys[: -len(model.cameras)]
+    sizes = [len(_DISTORTIONS) if key == DISTORTION else 6 for key in keys]
+    ends = dict(zip(keys, np.cumsum(sizes), strict=True))
+    hessian = join_linear(linear.shared, summary).hessian(to_ordering(keys))[0]
+    covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
+    found = dict.fromkeys((COMMON, PAIRS, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
+    for number in range(linear.shared.size()):
+        factor = linear.shared.at(number)
+        if isinstance(factor, gtsam.HessianFactor):
+            continue  # the residuals of the distortion, which are matches
+        letters = {chr(gtsam.symbolChr(key)) for key in factor.keys()}  # noqa: SIM118
+        size = {key: sizes[keys.index(key)] for key in factor.keys()}  # noqa: SIM118
+        columns = [np.arange(ends[key] - size[key], ends[key]) for key in size]
+        moved = covariance[:, np.concatenate(columns)] @ factor.jacobian()[0].T
+        if letters == {"d"}:
+            for name, part in zip(_DISTORTIONS, (moved**2).T, strict=True):
+                found[name] = found[name] + part
+            continue
+        source = PAIRS if "n" in letters else COMMON if letters & {"m", "o"} else PRIORS
+        found[source] = found[source] + (moved**2).sum(axis=1)
+    return found
 
 
-def _of_places(errors: ErrorFit) -> Variances:
-    """What the frames of a place share, beyond the scatter of its frames."""
-    model, fit = errors.model, errors.fit
-    parts, (P, L) = model.components, fit.distances.shape
-    edges, moved = placed_edges(model, fit.poses), fit.shared_covariance[: 6 * len(model.cameras)]
-    of_place = -(moved @ fit.place_slope.transpose(0, 2, 1)).reshape(P, -1, L, 6)
-    by_place = of_place.transpose(0, 2, 1, 3).reshape(P * L, -1, 6)
-    by_shared = moved.reshape(len(moved), -1, 6)[:, edges.first].transpose(1, 0, 2)
-    gain = by_shared @ edges.to_first.transpose(0, 2, 1)
-    gain = (gain + by_place @ edges.to_second.transpose(0, 2, 1)) @ edges.information
-    cloud = np.broadcast_to(parts.cloud_at_place, (P, 1, 6, 6))
-    shared = np.concatenate([cloud, parts.at_place - parts.scatter_at_place], axis=1)
-    variances = np.einsum("nij,njk,nik->ni", gain, shared.reshape(P * L, 6, 6), gain)
-    return {PLACES: edges.weight @ variances}
+def _of_places(errors: ErrorFit) -> Array:
+    """(6 N,) the part that the frames of a place share, beyond their scatter.
 
+    The derivative of the variances by the log of its covariance, from two differences.
+    """
+    linear = errors.fit.linear
+    parts, scale = linear.model.components, linear.model.components.robust_scale
+    if np.isfinite(scale):
+        parts = parts.with_fixed_weights(errors.fit.place_weights(scale))
 
-def _variance(moved: Array, covariance: Array) -> Array:
-    """(n,) of (n, k) responses to errors of this (k, k) covariance."""
-    return np.asarray(np.einsum("ij,jk,ik->i", moved, covariance, moved))
+    def variances(step: float) -> Array:
+        factor = float(np.exp(step))
+        place = factor * (parts.at_place - parts.scatter_at_place) + parts.scatter_at_place
+        other = replace(parts, cloud_at_place=factor * parts.cloud_at_place, at_place=place)
+        return np.diag(replace(linear, model=replace(linear.model, components=other)).covariance)
 
-
-def _of_each(moved: Array, covariance: Array) -> Array:
-    """The same of errors that every camera has by itself."""
-    each = moved.reshape(len(moved), -1, 6)
-    return np.asarray(np.einsum("icj,jk,ick->i", each, covariance, each))
+    near, far = (
+        (variances(step) - variances(-step)) / (2 * step) for step in (_DIFFERENCE, 2 * _DIFFERENCE)
+    )
+    return np.asarray((4.0 * near - far) / 3.0)

@@ -15,7 +15,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
-from calibgraph.solver.error_model import weigh_errors
+from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
@@ -81,7 +81,8 @@ def solve_joint(
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
 
     with watch("error_model"):                                             # ours: shared errors
-        errors, optimum = weigh_errors(inliers, optimum, scales, kept.table.metadata, held)
+        errors, optimum = refine_with_error_model(
+            inliers, optimum, scales, kept.table.metadata, held)
 
     counts = count_correspondences(kept, objective, inliers, pairwise, frames.outlier_frames)
     seconds = watch.seconds
@@ -127,7 +128,7 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     with watch("camera_pairs"):
         inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_stop)
     with watch("error_model"):
-        errors, optimum = weigh_errors(
+        errors, optimum = refine_with_error_model(
             inliers, optimum, alone.scales, solution.correspondences.metadata, alone.held
         )
     return replace(

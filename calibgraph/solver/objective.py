@@ -13,19 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.graph.objective import join, objective_graph, pose_key, projection_graph
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, pair_graph
-from calibgraph.solver.factor_graph import (
-    RELATIVE_TOLERANCE,
-    Optimum,
-    join,
-    objective_graph,
-    optimize,
-    pose_key,
-    projection_graph,
-)
+from calibgraph.solver.optimizer import RELATIVE_TOLERANCE, Optimum, optimize
 from calibgraph.solver.residual_scale import ResidualScale
 
 Array = NDArray[np.float64]

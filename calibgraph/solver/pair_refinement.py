@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import pose_key
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.error_components import error_components
@@ -20,8 +21,8 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms, usual_excess
-from calibgraph.solver.factor_graph import Optimum, optimize, pose_key
 from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.optimizer import Optimum, optimize
 from factors import EpipolarBlock, pose_sigmas
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.factor_graph import Optimum
 from calibgraph.solver.objective import Objective, Scales, Transforms
+from calibgraph.solver.optimizer import Optimum
 
 
 @dataclass(frozen=True, eq=False)

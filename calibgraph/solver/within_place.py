@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
-from calibgraph.solver.hierarchy import PlacedBlock
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import pose_sigmas
@@ -68,7 +68,7 @@ class WithinPlace:
 
 
 def within_place(
-    inliers: Objective, name: str, T_camera_lidar: Array, scale: ResidualScale, placed: PlacedBlock
+    inliers: Objective, name: str, T_camera_lidar: Array, scale: ResidualScale, placed: BlockByPlace
 ) -> WithinPlace:
     """What a camera's matches share.
 
@@ -98,7 +98,7 @@ def within_place(
     )
 
 
-def frame_scatter(block: CameraBlock, gradients: Array, placed: PlacedBlock, true: Array) -> Array:
+def frame_scatter(block: CameraBlock, gradients: Array, placed: BlockByPlace, true: Array) -> Array:
     """(6, 6) covariance of the sum of all frames' gradients, about the means of their places.
 
     Args:

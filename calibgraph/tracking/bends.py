@@ -2,7 +2,7 @@
 
 Within an epoch each camera has a pose of its own at each place. What no such pose can follow is
 left in the residuals, at whatever estimate: so these sums need no reference, and hold on when a
-camera moves or drifts. See ``calibgraph.solver.cloud_bends``.
+camera moves or drifts. See ``calibgraph.solver.scan_distortion``.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.solver.cloud_bends import bend_evidence
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.scan_distortion import distortion_evidence
 from calibgraph.solver.within_place import WEAK
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ _BENDS = 3
 
 @dataclass(frozen=True, eq=False)
 class BendSums:
-    """Per camera the sums over epochs of :func:`calibgraph.solver.cloud_bends.bend_evidence`.
+    """Per camera the sums over epochs of ``distortion_evidence`` (``solver.scan_distortion``).
 
     Attributes:
         hessian: (n, 6, 6) of independent matches.
@@ -92,9 +92,9 @@ class BendSums:
         inliers = raw.select(raw.at(to_T_camera_lidar(T_lidar_camera)).inliers(scale))
         if len(inliers.frame) < MIN_MATCHES:
             return found
-        evidence = bend_evidence(inliers, scale, T_lidar_camera, WEAK, places)
+        evidence = distortion_evidence(inliers, scale, T_lidar_camera, WEAK, places)
         found.hessian[camera] = evidence.hessian
-        found.pull[camera] = evidence.hessian @ evidence.shifts
+        found.pull[camera] = evidence.hessian @ evidence.jacobian
         found.information[camera] = evidence.information.sum(axis=0)
         found.vector[camera] = evidence.vector.sum(axis=0)
         return found

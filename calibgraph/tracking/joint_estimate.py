@@ -14,13 +14,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, pose_equations
-from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.tracking.place_errors import (
     FrameSpread,
     Information,

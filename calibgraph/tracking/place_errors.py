@@ -1,4 +1,4 @@
-"""The error model of ``calibgraph.solver.hierarchy`` for sums over places, in closed form.
+"""The error model of ``calibgraph.graph.latent_poses`` for sums over places, in closed form.
 
 Near the references everything is a quadratic, so all poses that places have of their own are
 eliminated by formula. Of camera c at place p, let H = L L^T be the Hessian of its F frames and b
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import adjoint_camera_lidar
-from calibgraph.solver.component_sizes import Sizes
+from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.place_sums import PlaceSums
@@ -67,7 +67,7 @@ class SharedErrors:
     def of(
         findings: MatcherFindings,
         T_lidar_camera: Sequence[gtsam.Pose3],
-        sizes: Sizes,
+        sizes: VarianceRatios,
         bend_shifts: Array,
     ) -> SharedErrors:
         """What a matcher states, times the sizes that the data show, about these poses.

@@ -1,7 +1,7 @@
 """The sizes of the error model that sums over places show: REML, as in a batch.
 
-See ``calibgraph.solver.component_sizes``. Everything is linear here, so the displacements of places
-and their covariances follow from those of the cameras by formula.
+See ``calibgraph.solver.variance_components``. Everything is linear here, so the displacements of
+places and their covariances follow from those of the cameras by formula.
 """
 
 from __future__ import annotations
@@ -9,7 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.component_sizes import Evidence, Sizes, sizes_by_evidence
+from calibgraph.solver.variance_components import (
+    Component,
+    Evidence,
+    VarianceRatios,
+    ratios_by_evidence,
+)
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.place_errors import Information, PlaceTerms, SharedErrors
 from calibgraph.tracking.place_sums import PlaceSums
@@ -22,8 +27,8 @@ def sizes_shown(
     terms: PlaceTerms,
     errors: SharedErrors,
     of_poses: Information,
-    present: Sizes,
-) -> Sizes:
+    present: VarianceRatios,
+) -> VarianceRatios:
     """The sizes that sums over places show.
 
     Args:
@@ -40,19 +45,21 @@ def sizes_shown(
     flat = errors.to_cameras.reshape(6 * n, 6)
     to_seen = np.hstack([np.zeros((6 * n, 6 * n)), np.eye(6 * n), -flat])
     seen, spread = to_seen @ step, to_seen @ covariance @ to_seen.T
-    evidence = (
-        _of_all(step, covariance, errors),
-        *_at_places(terms, seen, spread, sums.frames > 0),
-    )
+    clouds, cameras = _at_places(terms, seen, spread, sums.frames > 0)
+    evidence: dict[Component, Evidence] = {
+        "shared": _of_all(step, covariance, errors),
+        "cloud": clouds,
+        "cameras": cameras,
+    }
     places = int(np.count_nonzero(sums.frames[1:].any(axis=1)) + sums.places[0].max())
     places -= 0 if sums.frames[0].any() else 1
-    return sizes_by_evidence(*evidence, places=places, present=present)
+    return ratios_by_evidence(evidence, places=places, present=present)
 
 
 def _shared_poses(
     matched: Information, errors: SharedErrors, of_poses: Information
 ) -> tuple[Array, Array]:
-    """The step and covariance of x, m (6 n each) and o: see ``calibgraph.solver.hierarchy``."""
+    """The step and covariance of x, m (6 n each) and o: see ``calibgraph.graph.latent_poses``."""
     n = len(errors.to_cameras)
     flat, weak = errors.to_cameras.reshape(6 * n, 6), np.kron(np.eye(n), WEAK)
     cameras, x, m = np.linalg.inv(errors.cameras), slice(6 * n), slice(6 * n, 12 * n)

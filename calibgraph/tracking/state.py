@@ -14,8 +14,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -142,7 +142,7 @@ class State:
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
-    sizes: Sizes = Sizes()
+    sizes: VarianceRatios = VarianceRatios()
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0

@@ -30,8 +30,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -51,9 +51,10 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, BendSums, MatcherFindings, Sizes, ResidualHistogram,
-                 ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
+                 EpochSummary, PlaceSums, BendSums, MatcherFindings, VarianceRatios,
+                 ResidualHistogram, ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
+_DATACLASSES["Sizes"] = VarianceRatios  # its name in earlier releases
 _DECODING_ERRORS = (
     ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError, EOFError,
     NotImplementedError, RecursionError, zipfile.BadZipFile,

@@ -19,10 +19,10 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
+from calibgraph.graph.objective import join, objective_graph, pose_key
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.camera_block import CameraBlock, merge
-from calibgraph.solver.factor_graph import join, objective_graph, pose_key
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import COMMON, PAIRS, PLACES, TIMES, ErrorSources
@@ -22,13 +23,12 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
 from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
-from calibgraph.solver.error_model import ErrorFit, fit_alone, fit_errors
+from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,
     sources_of_error,
     variances_by_source,
 )
-from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
@@ -196,7 +196,7 @@ class Evidence:
             solution.correspondences.metadata,
             solution.held,
         )
-        return None if found is None else found.with_shared_size(self.error_over_usual)
+        return None if found is None else found.with_shared_ratio(self.error_over_usual)
 
     @cached_property
     def error_over_usual(self) -> float:
@@ -320,14 +320,14 @@ class Evidence:
     def _data_only_by_errors(self) -> DataOnly | None:
         """The same by the error model, None where there is none."""
         solution, errors = self.solution, self.errors
-        if errors is not None and errors.alone is None and not solution.rig.relative_poses:
-            fit = errors.without_pose_graph()  # near its minimum already
+        if errors is not None and errors.without_priors is None and not solution.rig.relative_poses:
+            fit = errors.drop_pose_graph()  # near its minimum already
             if fit is not None and len(errors.model.blocks) == len(self.cameras):
-                return DataOnly(fit.T_camera_lidar(errors.model), fit.covariance)
-        alone = None if errors is None else errors.alone
+                return DataOnly(fit.T_camera_lidar, fit.covariance)
+        alone = None if errors is None else errors.without_priors
         if alone is None:
             metadata, T = solution.correspondences.metadata, solution.T_camera_lidar
-            alone = fit_alone(solution.inliers, T, solution.scales, metadata)
+            alone = fit_without_priors(solution.inliers, T, solution.scales, metadata)
         return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
 
     @cached_property

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.by_place import place_of
 from calibgraph.model.error_components import error_components
 from calibgraph.model.threshold import Threshold
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.hierarchy import place_of
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
 
@@ -48,7 +48,7 @@ def place_agreements(evidence: Evidence, errors: ErrorFit, camera: str) -> list[
     """All places where a camera has correspondences."""
     before, after = evidence.fitted_blocks[camera], evidence.solution.inliers.blocks[camera]
     cameras = tuple(errors.model.cameras)
-    distances = errors.fit.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
+    distances = errors.fit.linear.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
     kept, given = (_count(block, errors.places) for block in (after, before))
     seen = np.flatnonzero(given)
     shares = kept[seen] / given[seen]

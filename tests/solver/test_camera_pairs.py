@@ -16,6 +16,7 @@ from calibgraph import (
     perturb,
     simulate_correspondences,
 )
+from calibgraph.graph.objective import pose_key
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import (
@@ -28,8 +29,8 @@ from calibgraph.model.geometry import (
 from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
 from calibgraph.solver.curvature import curvature_at, hessians_of_blocks
-from calibgraph.solver.factor_graph import optimize, pose_key
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.solution import Solution
 from factors import EpipolarBlock, pose_sigmas
 

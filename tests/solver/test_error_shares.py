@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
-from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, PLACES
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.error_shares import variances_by_source
-from calibgraph.solver.hierarchy_poses import shared_edges
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.evidence import Evidence
 
@@ -65,23 +66,39 @@ def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> Non
 
 
 def of_matches(errors: ErrorFit) -> np.ndarray:
-    """(6 N,) variances by the data, by the scatter within places, and by what shows bends."""
-    model, fit, parts = errors.model, errors.fit, errors.model.components
-    free, data = len(fit.shared_covariance), fit.equations.data
-    moved = fit.shared_covariance[: 6 * len(model.cameras)]
-    no_scatter = replace(parts, scatter_at_place=0 * parts.at_place)
-    with_scatter = replace(errors, model=replace(model, components=no_scatter))
-    variances = variances_by_source(with_scatter)[PLACES] - variances_by_source(errors)[PLACES]
-    for place, hessian in enumerate(fit.equations.data.placed.transpose(0, 1, 3, 2, 4)):
-        own = -moved @ fit.place_slope[place].T
-        size = own.shape[1]
-        variances += np.einsum("ij,jk,ik->i", own, hessian.reshape(size, size), own)
-    assert not data.across.any() and not data.shared.any()  # no pairs of cameras
-    edges = shared_edges(model, fit.poses)
-    by_edge = moved @ edges.jacobian[:, :free].T @ edges.information
-    by_bend = by_edge[:, 6:] @ parts.all_bends @ parts.bend_covariance
-    shown = np.einsum("pn,pnij->ij", parts.bend_weight, parts.bend_information)
-    return np.asarray(variances + np.einsum("ij,jk,ik->i", by_bend, shown, by_bend))
+    """(6 N,) variances by the data, by the residuals of the distortion, and by the scatter.
+
+    From the dense covariance C: C G C, with G the information of each of these.
+    """
+    linear, weight = (
+        errors.fit.linear,
+        errors.fit.place_weights(errors.model.components.robust_scale),
+    )
+    parts = errors.model.components.with_fixed_weights(weight)
+    model = replace(errors.model, components=parts)
+    order = to_ordering([*model.camera_keys, *model.shared_keys[: -len(model.cameras)],
+                         *model.place_keys])  # fmt: skip
+    starts, end = {}, 0
+    for number in range(order.size()):
+        starts[order.at(number)] = end
+        end += 3 if order.at(number) == DISTORTION else 6
+    moved = np.linalg.inv(linear.graph.hessian(order)[0])[: 6 * len(model.cameras)]
+    information = np.zeros((end, end))
+    for number in range(linear.data.graph.size()):
+        factor = linear.data.graph.at(number)
+        rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
+        information[np.ix_(rows, rows)] += factor.information()
+    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
+    rows = starts[DISTORTION] + np.arange(3)
+    information[np.ix_(rows, rows)] += shown
+    for number, (place, camera) in enumerate(model.matched_places()):
+        edge = model.place_graph.at(model.places + number)
+        root = edge.noiseModel().R()
+        whitened, _ = edge.linearize(linear.values).jacobian()
+        rows = np.concatenate([starts[key] + np.arange(6) for key in list(edge.keys())])
+        scatter = root @ parts.scatter_at_place[place, camera] @ root.T
+        information[np.ix_(rows, rows)] += whitened.T @ scatter @ whitened
+    return np.diag(moved @ information @ moved.T)
 
 
 def test_the_error_bar_of_more_frames_is_as_predicted(pair: Rig) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
-from calibgraph.solver.factor_graph import optimize, projection_graph
+from calibgraph.graph.objective import projection_graph
 from calibgraph.solver.frame_poses import fit_frames, solve_damped
+from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock, to_runs
 
 

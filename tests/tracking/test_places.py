@@ -24,8 +24,8 @@ from calibgraph import (
 )
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.cloud_bends import bends_at
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.scan_distortion import distortions_at
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.joint_estimate import ClosedPlaces
@@ -354,13 +354,13 @@ def test_a_camera_that_sees_all_round_shows_the_motion_as_in_a_batch() -> None:
     """
     rig = rig_of("panorama")
     whole = simulate_correspondences(rig, frames=20, matches=45, seed=0)
-    bent = whole.points_lidar_m + 0.1 * bends_at(whole.points_lidar_m)[2]
+    bent = whole.points_lidar_m + 0.1 * distortions_at(whole.points_lidar_m)[2]
     places = {"places": [[*range(12)], [*range(12, 20)]], "place_variance": 8.0}
     stated = {**places, "scan_motion_m": 0.15}
     table = replace(whole, points_lidar_m=bent, metadata=stated)
     solved = solve_joint(rig, table, Config(learnt_weights=False))
     assert solved.errors is not None
-    (_, _, motion_m), (_, _, sigma_m) = solved.errors.bends(table.findings.bend_sigmas)
+    (_, _, motion_m), (_, _, sigma_m) = solved.errors.scan_distortion(table.findings.bend_sigmas)
     tracker, unstated = IncrementalCalibrator(rig), IncrementalCalibrator(rig)
     for frame in range(20):
         one = table.select(table.frame == frame)

@@ -13,12 +13,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import objective_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
 from calibgraph.solver.curvature import pose_hessian
-from calibgraph.solver.factor_graph import objective_graph, optimize
+from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]

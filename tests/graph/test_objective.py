@@ -10,10 +10,11 @@ import pytest
 from scipy.linalg import logm
 
 from calibgraph import Config, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph.graph.objective import objective_graph, pose_key
 from calibgraph.model.config import TERMS
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.factor_graph import objective_graph, optimize, pose_key, to_values
+from calibgraph.solver.optimizer import optimize, to_values
 from factors import ProjectionBlock
 from tests.conftest import stereo_relative_pose
 

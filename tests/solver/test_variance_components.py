@@ -11,9 +11,9 @@ from benchmarks.accuracy.uncertainty import displaced
 from calibgraph import MatcherErrors, Rig, concatenate, simulate_correspondences
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.component_sizes import Sizes
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.variance_components import VarianceRatios
 
 EXACT = MatcherErrors(noise_px=0.3, outlier_share=0.0)
 STATED = {"place_rotation_rad": 1e-3, "place_translation_m": 0.01, "camera_share": 0.0}
@@ -47,7 +47,7 @@ def errors_of(rig: Rig, table: Correspondences) -> ErrorFit:
 @pytest.mark.parametrize("size", [0.25, 2.0])
 def test_the_size_of_places_is_found_from_many_of_them(pair: Rig, size: float) -> None:
     places = 20
-    found = [errors_of(pair, table_of(pair, places, size, seed)).sizes.cloud for seed in range(4)]
+    found = [errors_of(pair, table_of(pair, places, size, seed)).ratios.cloud for seed in range(4)]
     # 6 (places - 1) degrees of freedom a table; what is usual counts as 12 of size 1.
     free = 6 * (places - 1)
     expected = (12 + free * size) / (12 + free)
@@ -56,9 +56,9 @@ def test_the_size_of_places_is_found_from_many_of_them(pair: Rig, size: float) -
 
 
 def test_few_places_are_never_taken_for_better_than_usual(pair: Rig) -> None:
-    assert errors_of(pair, table_of(pair, 4, 0.0, 0)).sizes == Sizes()
+    assert errors_of(pair, table_of(pair, 4, 0.0, 0)).ratios == VarianceRatios()
 
 
 def test_one_place_has_the_usual_size(pair: Rig) -> None:
     """Nothing is measured twice, so nothing is learnt, whatever the error."""
-    assert errors_of(pair, table_of(pair, 1, 25.0, 0)).sizes == Sizes()
+    assert errors_of(pair, table_of(pair, 1, 25.0, 0)).ratios == VarianceRatios()

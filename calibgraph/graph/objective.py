@@ -7,8 +7,6 @@ prior and between factors are the paper's terms.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
 from itertools import combinations, pairwise
 from typing import Literal
 
@@ -16,8 +14,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.variables import camera_key
 from calibgraph.model.config import Config, Terms
-from calibgraph.model.geometry import relative_transform, to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import relative_transform
 from calibgraph.model.rig import RelativePose, Rig
 from factors import (
     ProjectionBlock,
@@ -29,12 +28,10 @@ from factors import (
 )
 
 __all__ = [  # with the factors that calibgraph re-exports
-    "Optimum",
     "block_factor",
     "camera_prior_factor",
     "join",
     "objective_graph",
-    "optimize",
     "pose_key",
     "prior_graph",
     "projection_factor",
@@ -43,38 +40,14 @@ __all__ = [  # with the factors that calibgraph re-exports
     "relative_pose_graph",
     "relative_prior_factor",
     "relative_prior_graph",
-    "to_values",
 ]
 
 Array = NDArray[np.float64]
 
-MAX_ITERATIONS = 200
-"""Of Levenberg-Marquardt."""
-
-RELATIVE_TOLERANCE = 1e-10
-"""Relative change of the error at which it stops."""
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The result of Levenberg-Marquardt.
-
-    Attributes:
-        T_camera_lidar: per camera, (4, 4).
-        cost: the paper's objective there (twice GTSAM's error).
-        iterations: of LM.
-        converged: whether it stopped by its tolerance.
-    """
-
-    T_camera_lidar: dict[str, Array]
-    cost: float
-    iterations: int
-    converged: bool
-
 
 def pose_key(cameras: Sequence[str], name: str) -> int:
     """GTSAM key of a camera's variable ``T_lidar_camera``."""
-    return int(gtsam.symbol("x", cameras.index(name)))
+    return camera_key(cameras.index(name))
 
 
 def projection_graph(
@@ -187,44 +160,3 @@ def join(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
     for part in graphs:
         graph.push_back(part)
     return graph
-
-
-def to_values(cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
-    """GTSAM values of the extrinsics, (4, 4) T_camera_lidar of every camera."""
-    values = gtsam.Values()
-    for name in cameras:
-        values.insert(pose_key(cameras, name), to_T_lidar_camera(T_camera_lidar[name]))
-    return values
-
-
-def optimize(
-    graph: gtsam.NonlinearFactorGraph,
-    cameras: Sequence[str],
-    T_camera_lidar: Mapping[str, Array],
-    *,
-    relative_tolerance: float = RELATIVE_TOLERANCE,
-) -> Optimum:
-    """Minimize a graph by Levenberg-Marquardt.
-
-    Args:
-        graph: over the variables of the cameras.
-        cameras: their names, in the order of the variables.
-        T_camera_lidar: (4, 4) per camera, the start.
-        relative_tolerance: relative change of the error at which it stops.
-    """
-    start = to_values(cameras, T_camera_lidar)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(relative_tolerance))
-    values = optimizer.optimize()
-    found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
-    iterations = int(optimizer.iterations())
-    return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
-
-
-@cache
-def _parameters(relative_tolerance: float) -> gtsam.LevenbergMarquardtParams:
-    """Of Levenberg-Marquardt, which copies them."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(MAX_ITERATIONS)
-    parameters.setRelativeErrorTol(relative_tolerance)
-    parameters.setAbsoluteErrorTol(0.0)
-    return parameters

@@ -1,11 +1,11 @@
-"""How the sensor bends the cloud, and what that does to the matches of each camera.
+"""Scan distortion: errors of the cloud that no rigid motion describes, as each camera sees them.
 
 A rigid motion of the cloud moves all cameras alike. Three errors of recorded sensors do not: beams
 that all point higher or lower than is stated, which pitch the cloud along every line of sight;
-beams that are spread too far or too little; and motion during a turn, which displaces each heading
-by another amount. Each is one unknown number of the whole rig; a camera's matches follow it by a
-displacement that their own points show. What a pose cannot follow is left in its residuals, and
-shows how large the bends are: little to a narrow camera, much to one that sees all round.
+beams that are spread too far or too little; and motion during a turn, which displaces each
+heading by another amount. Each is one unknown number of the whole rig; it displaces a camera's
+matches by an amount that depends on their points. The part that no pose can follow remains in the
+residuals and measures the distortion: informative for a panoramic camera, weak for a narrow one.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.by_place import place_of
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.hierarchy import place_of
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import ProjectionBlock
 
@@ -29,12 +29,12 @@ Numbers = NDArray[np.int64]
 _SAMPLE = 1000  # correspondences: the displacement is a ratio of two sums over them
 
 
-def bends_at(points_lidar_m: Array) -> Array:
-    """(3, n, 3) displacements in the LiDAR frame, by a unit of each bend.
+def distortions_at(points_lidar_m: Array) -> Array:
+    """(3, n, 3) displacements in the LiDAR frame, by a unit of each distortion.
 
     Elevations that are all a radian higher; elevations twice as far from the horizon; a metre of
-    motion. This is ahead, over a turn that begins and ends behind: a point straight ahead is where
-    it is reported, one behind is half of it off.
+    motion. The motion is ahead, over a turn that begins and ends behind: a point straight ahead is
+    where it is reported, one behind is half of it off.
 
     Args:
         points_lidar_m: (n, 3).
@@ -49,38 +49,38 @@ def bends_at(points_lidar_m: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class BendEvidence:
-    """What a camera's matches have to do with a unit of each bend.
+class DistortionEvidence:
+    """Quadratics of a camera's matches in the distortions.
 
-    Half their squared residuals are, near the minimum, those of a pose that has moved by ``shifts``
-    times the bends, and the quadratics of ``information`` and ``vector`` in the bends alone.
+    Near the minimum half the squared residuals are those of a pose that has moved by ``jacobian``
+    times the distortions, plus the quadratics of ``information`` and ``vector``.
 
     Attributes:
-        shifts: (6, 3) by how much their pose follows.
-        hessian: (6, 6) J^T J of all of them, and what is known without them: shifts of several sets
-            of matches have a mean by these.
-        information: (P, 3, 3) of the residuals at each place, if all were independent.
-        vector: (P, 3) the information times the bends that the points show.
+        jacobian: (6, 3) displacement of their pose by a unit of each distortion.
+        hessian: (6, 6) J^T J of all matches plus the weak prior: the weight of ``jacobian`` in a
+            mean over several sets of matches.
+        information: (P, 3, 3) of the residuals at each place, if all matches were independent.
+        vector: (P, 3) the information times the distortions that the residuals show.
     """
 
-    shifts: Array
+    jacobian: Array
     hessian: Array
     information: Array
     vector: Array
 
 
-def bend_evidence(
+def distortion_evidence(
     block: CameraBlock,
     scale: ResidualScale,
     T_lidar_camera: gtsam.Pose3,
     weak: Array,
     places: Sequence[Numbers],
-) -> BendEvidence:
-    """What a camera's matches have to do with the bends, in the tangent of ``T_lidar_camera``.
+) -> DistortionEvidence:
+    """The quadratics of a camera's matches, in the tangent of ``T_lidar_camera``.
 
-    With J and K the Jacobians of the whitened residuals by pose and bends, the pose follows by
-    -(J^T J)^-1 J^T K. What no pose of a place of its own can follow is left of K there: else a
-    place that is displaced would show bends.
+    With J and K the Jacobians of the whitened residuals by pose and distortions, the pose follows
+    by -(J^T J)^-1 J^T K. At each place K is reduced by what a pose of that place can follow, so
+    that a displaced place shows no distortion.
 
     Args:
         block: inliers of one camera.
@@ -93,39 +93,43 @@ def bend_evidence(
     share = len(some) / len(block)
     place = place_of(some.frame, places)
     order = np.argsort(place, kind="stable")
-    by_pose, by_bend, residuals = _jacobians(some.block.select(order), scale, T_lidar_camera)
+    by_pose, by_distortion, residuals = _jacobians(some.block.select(order), scale, T_lidar_camera)
     weak = share * weak
-    bends = by_bend.shape[1]
-    information, vector = np.zeros((len(places), bends, bends)), np.zeros((len(places), bends))
+    size = by_distortion.shape[1]
+    information, vector = np.zeros((len(places), size, size)), np.zeros((len(places), size))
     edges = 2 * np.searchsorted(place[order], np.arange(len(places) + 1))
     for number in np.flatnonzero(np.diff(edges)):
         rows = slice(edges[number], edges[number + 1])
-        left = by_bend[rows] + by_pose[rows] @ _follow(by_pose[rows], by_bend[rows], weak)
+        left = by_distortion[rows] + by_pose[rows] @ _follow(
+            by_pose[rows], by_distortion[rows], weak
+        )
         information[number] = left.T @ left / share
         vector[number] = left.T @ residuals[rows] / share
     hessian = (by_pose.T @ by_pose + weak) / share
-    return BendEvidence(_follow(by_pose, by_bend, weak), hessian, information, vector)
+    return DistortionEvidence(_follow(by_pose, by_distortion, weak), hessian, information, vector)
 
 
-def shifts_of_pairs(
-    shifts: Array, seen: NDArray[np.bool_], T_lidar_camera: Array, pairs: Sequence[tuple[int, int]]
+def pair_jacobians(
+    jacobians: Array,
+    seen: NDArray[np.bool_],
+    T_lidar_camera: Array,
+    pairs: Sequence[tuple[int, int]],
 ) -> Array:
-    """(N, 6, B) by how much what pairs show of a camera follows the bends.
+    """(N, 6, B) displacement of each camera's pairs by a unit of each distortion.
 
-    Images show the relative pose of two cameras whatever the cloud; how both lie to the cloud,
-    their features show by its surfaces, which are bent as the matches see them. So a pair follows
-    by one motion of the cloud, the mean of what its cameras see, and a camera by the mean over its
-    pairs.
+    Images show the relative pose of two cameras whatever the cloud. Their pose to the cloud comes
+    from its surfaces, which are distorted as the matches see them. So a pair follows by one motion
+    of the cloud, the mean over its cameras, and a camera by the mean over its pairs.
 
     Args:
-        shifts: (N, 6, B) of the matches of all cameras.
+        jacobians: (N, 6, B) of the matches of all cameras.
         seen: (N,) which cameras have matches.
         T_lidar_camera: (N, 4, 4).
         pairs: numbers of the cameras of each.
     """
     to_cloud = adjoints(T_lidar_camera)
-    of_cloud = to_cloud @ shifts
-    total, count = np.zeros_like(shifts), np.zeros(len(shifts))
+    of_cloud = to_cloud @ jacobians
+    total, count = np.zeros_like(jacobians), np.zeros(len(jacobians))
     for pair in pairs:
         known = [camera for camera in pair if seen[camera]]
         if known:
@@ -135,27 +139,29 @@ def shifts_of_pairs(
     return np.asarray(np.linalg.solve(to_cloud, mean))
 
 
-def _follow(by_pose: Array, by_bend: Array, weak: Array) -> Array:
-    """(6, 3) the pose by a unit of each bend, from the Jacobians of both."""
-    return -np.asarray(np.linalg.solve(by_pose.T @ by_pose + weak, by_pose.T @ by_bend))
+def _follow(by_pose: Array, by_distortion: Array, weak: Array) -> Array:
+    """(6, 3) displacement of the pose by a unit of each distortion."""
+    return -np.asarray(np.linalg.solve(by_pose.T @ by_pose + weak, by_pose.T @ by_distortion))
 
 
 def _jacobians(
     block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3
 ) -> tuple[Array, Array, Array]:
-    """(2 n, 6), (2 n, 3) of the whitened residuals by pose and bends; (2 n,) these."""
+    """(2 n, 6) and (2 n, 3) Jacobians of the whitened residuals, and (2 n,) the residuals."""
     T = to_T_camera_lidar(T_lidar_camera)
     points = block.points_lidar_m @ T[:3, :3].T + T[:3, 3]
     _, by_point = block.lens.project_with_jacobian(points)
     residuals, _ = block.residuals(T_lidar_camera)
-    bends = (bends_at(block.points_lidar_m) @ T[:3, :3].T).transpose(0, 2, 1)
+    moved = (distortions_at(block.points_lidar_m) @ T[:3, :3].T).transpose(0, 2, 1)
     gradient, (x, y, z) = by_point.transpose(2, 1, 0).copy(), points.T
     across, down, ahead = gradient
     by_rotation = np.stack(  # of a point q and the gradient g: g x q
         [down * z - ahead * y, ahead * x - across * z, across * y - down * x]
     )
-    by_bend = np.einsum("jin,kjn->kin", gradient, bends)
-    values = np.concatenate([by_rotation, -gradient, by_bend, residuals.T[None]])  # (10, 2, n)
+    by_distortion = np.einsum("jin,kjn->kin", gradient, moved)
+    values = np.concatenate(
+        [by_rotation, -gradient, by_distortion, residuals.T[None]]
+    )  # (10, 2, n)
     root = block.sqrt_information
     if root is not None:  # upper triangular
         s00, s01, s11 = root.T

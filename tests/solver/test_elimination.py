@@ -1,4 +1,4 @@
-"""The error model: the eliminated form is the whole graph of stock factors."""
+"""The error model: its estimate is the optimum and the marginal of the whole graph."""
 
 from __future__ import annotations
 
@@ -17,12 +17,18 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
+from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents, latent_pose_graph
+from calibgraph.graph.variables import (
+    DISTORTION,
+    camera_key,
+    matched_at_key,
+    matched_key,
+    paired_key,
+)
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.solver.camera_pairs import Kind, pair_terms
+from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.error_model import ErrorFit, fit_errors
-from calibgraph.solver.hierarchy import Components, Hierarchy, hierarchy_graph
-from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarchy
-from calibgraph.solver.hierarchy_poses import Poses, start_poses
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -53,35 +59,57 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("degrees", [0.01, 5.0])
 @pytest.mark.parametrize(("rig_name", "pairs", "tied", "silent", "places", "frames"), CASES)
-def test_the_eliminated_form_is_the_whole_graph(
+def test_the_estimate_is_the_optimum_and_the_marginal_of_the_graph_that_is_printed(
     rig_name: str, pairs: bool, tied: bool, silent: bool, places: str, frames: int,
-    request: pytest.FixtureRequest,
+    degrees: float, request: pytest.FixtureRequest,
 ) -> None:  # fmt: skip
-    """In optimum and marginal covariance; silent: the first camera has no matches."""
+    """Also from far; silent: the first camera has no matches."""
     rig: Rig = request.getfixturevalue(rig_name)
     rig = tie(rig) if tied else rig
     errors = solve_model(rig, table_of(rig, frames, silent, PLACES[places]), pairs=pairs)
     model = with_correlations(errors.model)
-    T = errors.T_camera_lidar
-    eliminated = fit_hierarchy(model, start_poses(model, T), relative_tolerance=0.0)
-    assert eliminated is not None
-    values, bend = solve_whole(model, eliminated), gtsam.symbol("b", 0)
-    bends, covariance_of_bends = bends_of(model, eliminated)
-    # A bend of one sigma displaces a camera by 1e-3.
-    np.testing.assert_allclose(bends, values.atVector(bend), rtol=0, atol=1e-6)
-    marginals = gtsam.Marginals(hierarchy_graph(model), to_values(model, eliminated.poses, bends))
-    found = marginals.marginalCovariance(bend)
-    np.testing.assert_allclose(covariance_of_bends, found, rtol=0, atol=1e-9)
-    covariance = joint_of_cameras(model, marginals)
-    for camera in range(len(model.cameras)):
-        found = values.atPose3(gtsam.symbol("x", camera)).matrix()
-        np.testing.assert_allclose(eliminated.poses.shared[camera], found, rtol=0, atol=1e-9)
+    start = displaced(model, start_values(model, errors.T_camera_lidar), degrees)
+    found = fit_latent_poses(model, start, relative_tolerance=0.0)
+    assert found is not None and found.converged
+    graph = latent_pose_graph(model)
+    values = minimize(graph, displaced(model, found.linear.values, 0.01))
+    marginals = gtsam.Marginals(graph, values)
+    for key in model.camera_keys:
+        expected = values.atPose3(key).matrix()
+        pose = found.linear.values.atPose3(key).matrix()
+        np.testing.assert_allclose(pose, expected, rtol=0, atol=1e-8)
+    covariance = marginals.jointMarginalCovariance(model.camera_keys).fullMatrix()
     sigmas = np.sqrt(np.diag(covariance))
     unit = np.outer(sigmas, sigmas)
-    np.testing.assert_allclose(eliminated.covariance / unit, covariance / unit, rtol=0, atol=1e-9)
-    graph = hierarchy_graph(model)
-    assert eliminated.cost == pytest.approx(2 * graph.error(values), rel=1e-9)
+    np.testing.assert_allclose(found.covariance / unit, covariance / unit, rtol=0, atol=1e-6)
+    assert found.cost == pytest.approx(2 * graph.error(values), rel=1e-9)
+    distortion, spread = found.distortion
+    np.testing.assert_allclose(distortion, values.atVector(DISTORTION), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(spread, marginals.marginalCovariance(DISTORTION), rtol=1e-5)
+
+
+def displaced(model: LatentPoseModel, values: gtsam.Values, degrees: float) -> gtsam.Values:
+    """Every camera turned and moved, with all poses in which its data show it."""
+    rng, found = np.random.default_rng(2), gtsam.Values(values)
+    for number in range(len(model.cameras)):
+        step = np.radians(degrees) * rng.standard_normal(6)
+        keys = [camera_key(number), matched_key(number), paired_key(number)]
+        keys += [matched_at_key(place, number) for place in range(model.places)]
+        for key in keys:
+            if values.exists(key):
+                found.update(key, values.atPose3(key).retract(step))
+    return found
+
+
+def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    """By GTSAM's Levenberg-Marquardt."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setMaxIterations(100)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
 
 
 def tie(rig: Rig) -> Rig:
@@ -115,7 +143,7 @@ def solve_model(rig: Rig, table: Correspondences, *, pairs: bool) -> ErrorFit:
     return errors
 
 
-def with_correlations(model: Hierarchy) -> Hierarchy:
+def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
     """The same, with covariances that are neither diagonal nor equal."""
     rng = np.random.default_rng(1)
 
@@ -125,69 +153,25 @@ def with_correlations(model: Hierarchy) -> Hierarchy:
         return (scale[:, None] * mix) @ (scale[:, None] * mix).T
 
     parts = model.components
-    bends, pair_bends = (
-        each + 1e-3 * rng.standard_normal(each.shape) for each in (parts.bends, parts.pair_bends)
+    jacobian, pair_jacobian = (
+        each + 1e-3 * rng.standard_normal(each.shape)
+        for each in (parts.distortion_jacobian, parts.pair_distortion_jacobian)
     )
-    at_place = np.array([[mixed(one) for one in place] for place in parts.at_place])
-    return replace(
-        model,
-        components=Components(
-            *(mixed(c) for c in (parts.cloud, parts.cloud_at_place, parts.camera)),
-            bends,
-            pair_bends,
-            parts.bend_information + np.diag([0.5, 1.0, 2.0]),
-            parts.bend_vector + np.array([0.4, -0.3, 0.8]),
-            rng.uniform(0.2, 1.0, parts.bend_weight.shape),
-            mixed(parts.pairs),
-            at_place,
-            bend_size=1.5,
-            robust_scale=parts.robust_scale,
-        ),
+    components = replace(
+        parts,
+        cloud=mixed(parts.cloud),
+        cloud_at_place=mixed(parts.cloud_at_place),
+        camera=mixed(parts.camera),
+        pairs=mixed(parts.pairs),
+        at_place=np.array([[mixed(one) for one in place] for place in parts.at_place]),
+        distortion_jacobian=jacobian,
+        pair_distortion_jacobian=pair_jacobian,
+        distortion_information=parts.distortion_information + np.diag([0.5, 1.0, 2.0]),
+        distortion_vector=parts.distortion_vector + np.array([0.4, -0.3, 0.8]),
+        distortion_weight=rng.uniform(0.2, 1.0, parts.distortion_weight.shape),
+        distortion_size=1.5,
     )
-
-
-def solve_whole(model: Hierarchy, fit: HierarchyFit) -> gtsam.Values:
-    """By GTSAM from a displaced start."""
-    rng, graph = np.random.default_rng(2), hierarchy_graph(model)
-    start = to_values(model, fit.poses, rng.standard_normal(3))
-    for key, pose in all_poses(model, fit.poses).items():
-        start.update(key, pose.retract(1e-4 * rng.standard_normal(6)))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(0.0)
-    parameters.setAbsoluteErrorTol(0.0)
-    parameters.setMaxIterations(100)
-    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-
-
-def to_values(model: Hierarchy, poses: Poses, bends: np.ndarray) -> gtsam.Values:
-    """All variables of the graph."""
-    values = gtsam.Values()
-    values.insert(gtsam.symbol("b", 0), bends)
-    for key, pose in all_poses(model, poses).items():
-        values.insert(key, pose)
-    return values
-
-
-def joint_of_cameras(model: Hierarchy, marginals: gtsam.Marginals) -> np.ndarray:
-    """(6 N, 6 N) marginal of all x_c."""
-    cameras = [gtsam.symbol("x", camera) for camera in range(len(model.cameras))]
-    return np.asarray(marginals.jointMarginalCovariance(cameras).fullMatrix())
-
-
-def all_poses(model: Hierarchy, poses: Poses) -> dict[int, gtsam.Pose3]:
-    """By key."""
-    cameras, keys = len(model.cameras), {}
-    for kind, letter in enumerate("xmn"):
-        for camera in range(cameras):
-            pose = poses.shared[kind * cameras + camera]
-            keys[gtsam.symbol(letter, camera)] = gtsam.Pose3(pose)
-    keys[gtsam.symbol("o", 0)] = gtsam.Pose3(poses.shared[3 * cameras])
-    for place, placed in enumerate(poses.placed):
-        keys[gtsam.symbol("p", place)] = gtsam.Pose3(placed[0])
-        for camera in range(cameras):
-            key = gtsam.symbol("a", place * cameras + camera)
-            keys[key] = gtsam.Pose3(placed[1 + camera])
-    return keys
+    return replace(model, components=components)
 
 
 @pytest.mark.parametrize("kind", ["surface", "point"])
@@ -246,14 +230,16 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
         np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
 
 
-def test_a_fit_that_goes_on_is_that_of_its_poses(pair: Rig) -> None:
-    """What it knows of the data holds for other components and another pose graph."""
+def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
+    """The data that it has linearized hold for other components and another pose graph."""
     errors = solve_model(tie(pair), table_of(pair, 8, False, PLACES["four"]), pairs=True)
     other = replace(with_correlations(errors.model), pose_graph=gtsam.NonlinearFactorGraph())
     for model in (errors.model, other):
-        found, expected = (fit_hierarchy(model, start) for start in (errors.fit, errors.fit.poses))
+        starts = errors.fit, errors.fit.linear.values
+        found, expected = (fit_latent_poses(model, start) for start in starts)
         assert found is not None and expected is not None
-        np.testing.assert_allclose(found.poses.shared, expected.poses.shared, rtol=0, atol=1e-12)
+        for name, T in found.T_camera_lidar.items():
+            np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-15)
 
 
@@ -267,9 +253,17 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
     block = errors.model.blocks["left"]
     assert isinstance(block.block, ProjectionBlock)
     hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
-    camera = parts.matches_and_pairs[:6, :6]  # with the bends of the cloud
+    camera = parts.camera + with_distortion(parts)
     expected = camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
     sigmas = np.sqrt(np.diag(expected))
     difference = (errors.fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
     # The paper's priors of a metre take (3 cm / 1 m)^2 off.
     assert np.abs(difference).max() < 2e-3
+
+
+def with_distortion(parts: VarianceComponents) -> np.ndarray:
+    """(6, 6) covariance of the first camera's matches by the scan distortion."""
+    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
+    covariance = np.linalg.inv(np.eye(len(shown)) / parts.distortion_size + shown)
+    jacobian = parts.distortion_jacobian[0]
+    return np.asarray(jacobian @ covariance @ jacobian.T)

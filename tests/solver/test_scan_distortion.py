@@ -11,15 +11,15 @@ from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import adjoints, invert, to_T_lidar_camera, twist_between
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.cloud_bends import bend_evidence, bends_at, shifts_of_pairs
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.scan_distortion import distortion_evidence, distortions_at, pair_jacobians
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss
 
 
 def test_elevation_turns_each_line_of_sight_and_motion_grows_with_the_heading() -> None:
     points = np.array([[10.0, 0.0, -1.0], [0.0, 10.0, 0.0], [-10.0, 0.0, 2.0]])
-    elevation, stretch, motion = bends_at(points)
+    elevation, stretch, motion = distortions_at(points)
     slopes = np.arctan2(points[:, 2], 10.0)
     np.testing.assert_allclose(elevation, [[1.0, 0, 10], [0, 0, 10], [2, 0, 10]], atol=1e-12)
     np.testing.assert_allclose(stretch, elevation * slopes[:, None], atol=1e-12)
@@ -33,12 +33,12 @@ def test_the_shift_is_how_a_solve_of_the_bent_cloud_differs(mixed_rig: Rig, bend
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     solution = solve_joint(mixed_rig, table, config)
     inliers, points = solution.inliers, table.points_lidar_m
-    bent = replace(table, points_lidar_m=points + STEP[bend] * bends_at(points)[bend])
+    bent = replace(table, points_lidar_m=points + STEP[bend] * distortions_at(points)[bend])
     moved = solve_joint(mixed_rig, bent, config).T_camera_lidar
     for name, T in solution.T_camera_lidar.items():
         pose = to_T_lidar_camera(T)
         block, scale = inliers.blocks[name], solution.scales[name]
-        shifts = bend_evidence(block, scale, pose, np.zeros((6, 6)), [np.arange(4)]).shifts
+        shifts = distortion_evidence(block, scale, pose, np.zeros((6, 6)), [np.arange(4)]).jacobian
         found = pose.localCoordinates(to_T_lidar_camera(moved[name]))
         expected, unit = shifts[:, bend] * STEP[bend], np.repeat([1e-3, 0.01], 3)
         # Weights of the loss and the gate, which are left out of it, are worth up to 15 %.
@@ -53,12 +53,12 @@ def test_a_camera_that_sees_all_round_shows_the_bends(bend: int) -> None:
     errors = MatcherErrors(noise_px=0.5, outlier_share=0.0)
     table = simulate_correspondences(rig, frames=4, matches=400, errors=errors, seed=0)
     points = table.points_lidar_m
-    bent = replace(table, points_lidar_m=points + size * bends_at(points)[bend])
+    bent = replace(table, points_lidar_m=points + size * distortions_at(points)[bend])
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     solution = solve_joint(rig, bent, config)
     (name, T), *_ = solution.T_camera_lidar.items()
     block, scale = solution.inliers.blocks[name], solution.scales[name]
-    found = bend_evidence(
+    found = distortion_evidence(
         block, scale, to_T_lidar_camera(T), np.zeros((6, 6)), [np.arange(2), np.arange(2, 4)]
     )
     information = found.information.sum(axis=0)
@@ -75,12 +75,12 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     table = simulate_correspondences(rig, frames=6, matches=400, seed=0)
     points = table.points_lidar_m
     stated = {**table.metadata, "scan_motion_m": 0.15}
-    bent = replace(table, points_lidar_m=points + 0.1 * bends_at(points)[2], metadata=stated)
+    bent = replace(table, points_lidar_m=points + 0.1 * distortions_at(points)[2], metadata=stated)
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     without = solve_joint(rig, replace(bent, metadata=table.metadata), config)
     solution = solve_joint(rig, bent, config)
     assert solution.errors is not None
-    values, sigmas = solution.errors.bends(bent.findings.bend_sigmas)
+    values, sigmas = solution.errors.scan_distortion(bent.findings.bend_sigmas)
     assert abs(values[2] - 0.1) < 3 * sigmas[2] < 0.06
     for name, T in rig.T_camera_lidar.items():
         before, after = (
@@ -94,9 +94,9 @@ def test_a_pair_follows_the_bends_by_one_motion_of_the_cloud(mixed_rig: Rig) -> 
     T = np.stack([invert(camera.T_camera_lidar) for camera in mixed_rig.cameras.values()])
     shifts = np.random.default_rng(0).standard_normal((3, 6, 2))
     seen, to_cloud = np.array([True, True, False]), adjoints(T)
-    found = to_cloud @ shifts_of_pairs(shifts, seen, T, [(0, 1)])
+    found = to_cloud @ pair_jacobians(shifts, seen, T, [(0, 1)])
     both = (to_cloud[0] @ shifts[0] + to_cloud[1] @ shifts[1]) / 2
     np.testing.assert_allclose(found, [both, both, np.zeros((6, 2))], rtol=0, atol=1e-12)
-    found = to_cloud @ shifts_of_pairs(shifts, seen, T, [(0, 1), (1, 2)])
+    found = to_cloud @ pair_jacobians(shifts, seen, T, [(0, 1), (1, 2)])
     alone = to_cloud[1] @ shifts[1]
     np.testing.assert_allclose(found, [both, (both + alone) / 2, alone], rtol=0, atol=1e-12)

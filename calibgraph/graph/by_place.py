@@ -1,0 +1,99 @@
+"""The data of the error model, place by place: correspondences, and camera-to-camera matches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_lidar_camera
+from factors import BlockSums, PairBlock, ProjectionBlock
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+
+def place_of(frame: Numbers, places: Sequence[Numbers]) -> Numbers:
+    """(n,) index of each frame's place; of a frame that is in none, any index.
+
+    Args:
+        frame: (n,) frame numbers.
+        places: the frame numbers of each place.
+    """
+    numbers = np.concatenate(places)
+    place = np.repeat(np.arange(len(places)), [len(frames) for frames in places])
+    order = np.argsort(numbers)
+    nearest = np.searchsorted(numbers, frame, sorter=order)
+    found: Numbers = place[order][np.minimum(nearest, len(numbers) - 1)]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class BlockByPlace:
+    """One camera's correspondences, sorted by place.
+
+    Attributes:
+        block: with its loss and scale.
+        edges: (P + 1,) first row of each place, and the end.
+        place_of_frame: (f,) of the camera's frames, in their own order.
+        count_of_frame: (f,) of correspondences.
+    """
+
+    block: ProjectionBlock
+    edges: Numbers
+    place_of_frame: Numbers
+    count_of_frame: Numbers
+
+    @property
+    def frames(self) -> Numbers:
+        """(P,) number of frames of each place."""
+        return np.bincount(self.place_of_frame, minlength=len(self.edges) - 1)
+
+    @property
+    def places(self) -> Numbers:
+        """(p,) the places that have correspondences, in rising order."""
+        return np.flatnonzero(np.diff(self.edges))
+
+    def with_variance(self, factor: float) -> BlockByPlace:
+        """Multiply the variance of the matches; the loss keeps its tuning constant in pixels."""
+        root = factor**0.5
+        block = self.block.rescale(scale=self.block.scale / root, sigma=self.block.sigma * root)
+        return replace(self, block=block)
+
+    def sums(self, T_camera_cloud: Array) -> BlockSums:
+        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
+        if len(T_camera_cloud) == 1:
+            one = self.block.sums(to_T_lidar_camera(T_camera_cloud[0]))
+            return BlockSums(one.hessian[None], one.gradient[None], np.array([one.cost]))
+        runs = np.column_stack([self.edges[:-1], self.edges[1:]])
+        return self.block.run_sums(np.ascontiguousarray(T_camera_cloud), runs)
+
+    def at_place(self, place: int) -> ProjectionBlock:
+        """The correspondences of one place."""
+        return self.block.select(np.arange(self.edges[place], self.edges[place + 1]))
+
+
+@dataclass(frozen=True, eq=False)
+class PairByPlace:
+    """The matches between two cameras, sorted by place.
+
+    Attributes:
+        a: name of the first camera.
+        b: name of the second camera.
+        block: the features.
+        places: (r,) the places that have features, in rising order.
+        edges: (r + 1,) first row of each of these, and the end.
+    """
+
+    a: str
+    b: str
+    block: PairBlock
+    places: Numbers
+    edges: Numbers
+
+    def at_each_place(self) -> Iterator[tuple[int, PairBlock]]:
+        """Every place with its features."""
+        for place, first, end in zip(self.places, self.edges[:-1], self.edges[1:], strict=True):
+            yield int(place), self.block.select(np.arange(first, end))

@@ -1,0 +1,277 @@
+"""The error model as a factor graph: errors that the data of one place, or of all places, share.
+
+    prior         o at the identity, d at zero, each by its variance components
+    distortion    d by the residuals of the matches, which no pose can follow
+    camera        x_c to m_c, and x_c to n_c, displaced by the scan distortion d
+    place         o to o_p, and m_c to a_cp, with a robust loss
+    data          correspondences of camera c at place p, on o_p and a_cp;
+                  camera-to-camera matches at place p, on o_p, n_a and n_b
+    pose graph    priors and measured relative poses, on x_c
+
+The names are those of ``calibgraph.graph.variables``. Without errors of sensor and matcher all
+poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph.by_place import BlockByPlace, PairByPlace
+from calibgraph.graph.objective import join
+from calibgraph.graph.variables import (
+    CLOUD,
+    DISTORTION,
+    camera_key,
+    cloud_at_key,
+    matched_at_key,
+    matched_key,
+    paired_key,
+)
+from factors import biased_between_factor, pair_block_factor, placed_pair_factor, robust_noise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceComponents:
+    """Covariances of the latent displacements, positive definite, each in the tangent of its pose.
+
+    Attributes:
+        cloud: (6, 6) of the cloud at every place, in the LiDAR frame.
+        cloud_at_place: (6, 6) of the cloud at one place, about ``cloud``.
+        camera: (6, 6) of all matches of a camera, in its axes.
+        pairs: (6, 6) of all pairs of a camera, in its axes.
+        at_place: (P, N, 6, 6) of a camera's matches at one place, about ``camera``.
+        scatter_at_place: (P, N, 6, 6) the part of ``at_place`` that the scatter of frames shows.
+        distortion_jacobian: (N, 6, B) displacement of a camera's matches by one prior standard
+            deviation of each scan distortion; B = 0 without any.
+        pair_distortion_jacobian: (N, 6, B) displacement of a camera's pairs by the same.
+        distortion_information: (P, N, B, B) of a camera's residuals at a place about the
+            distortion.
+        distortion_vector: (P, N, B) the information times the distortion that these show.
+        distortion_weight: (P, N) weight of these.
+        distortion_size: prior variance of the distortion, over the stated one.
+        robust_scale: tuning constant [sigmas] of the loss of a place (Geman and McClure);
+            infinite: none.
+    """
+
+    cloud: Array
+    cloud_at_place: Array
+    camera: Array
+    pairs: Array
+    at_place: Array
+    scatter_at_place: Array
+    distortion_jacobian: Array
+    pair_distortion_jacobian: Array
+    distortion_information: Array
+    distortion_vector: Array
+    distortion_weight: Array
+    distortion_size: float | Array = 1.0
+    robust_scale: float = np.inf
+
+    def with_fixed_weights(self, weight: Array) -> VarianceComponents:
+        """Quadratic losses of the same curvature as the robust ones.
+
+        Args:
+            weight: (P, 1 + N) of the cloud and of each camera at each place.
+        """
+        clouds = self.cloud_at_place / weight[:, 0, None, None]
+        cameras = weight[:, 1:, None, None]
+        return replace(
+            self,
+            cloud_at_place=clouds,
+            at_place=self.at_place / cameras,
+            scatter_at_place=self.scatter_at_place / cameras,
+            robust_scale=np.inf,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LatentPoseModel:
+    """Data, priors and variance components: everything that the graph is made of.
+
+    Attributes:
+        cameras: their names.
+        blocks: correspondences, per camera that has some.
+        pairs: camera-to-camera matches.
+        pose_graph: priors and measured relative poses, on ``x_c``.
+        components: of the errors.
+    """
+
+    cameras: tuple[str, ...]
+    blocks: Mapping[str, BlockByPlace]
+    pairs: Sequence[PairByPlace]
+    pose_graph: gtsam.NonlinearFactorGraph
+    components: VarianceComponents
+
+    @property
+    def places(self) -> int:
+        """Number of places."""
+        return len(self.components.at_place)
+
+    @property
+    def camera_keys(self) -> list[int]:
+        """Keys of ``x_c``."""
+        return [camera_key(number) for number in range(len(self.cameras))]
+
+    @property
+    def matched(self) -> list[int]:
+        """Numbers of the cameras that have correspondences."""
+        return [number for number, name in enumerate(self.cameras) if name in self.blocks]
+
+    @property
+    def paired(self) -> list[int]:
+        """Numbers of the cameras that are part of a pair."""
+        names = {name for pair in self.pairs for name in (pair.a, pair.b)}
+        return [number for number, name in enumerate(self.cameras) if name in names]
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the scan distortion is a variable."""
+        parts = self.components
+        return bool(parts.distortion_jacobian.any() or parts.pair_distortion_jacobian.any())
+
+    def matched_places(self) -> Iterator[tuple[int, int]]:
+        """Place and camera of every ``a_cp``."""
+        for number in self.matched:
+            for place in self.blocks[self.cameras[number]].places:
+                yield int(place), number
+
+    @cached_property
+    def shared_graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors of what all places share: priors, distortion, camera, pose graph."""
+        return join(_shared_graph(self), self.pose_graph)
+
+    @cached_property
+    def place_graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors between what all places share and each place."""
+        return _place_graph(self)
+
+    @property
+    def place_keys(self) -> list[int]:
+        """Keys of ``a_cp`` and ``o_p``."""
+        matched = [matched_at_key(place, camera) for place, camera in self.matched_places()]
+        return [*matched, *map(cloud_at_key, range(self.places))]
+
+    @property
+    def shared_keys(self) -> list[int]:
+        """Keys of the variables that no place has of its own; ``x_c`` last."""
+        distortion = [DISTORTION] if self.is_distorted else []
+        shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
+        return [CLOUD, *shown, *distortion, *self.camera_keys]
+
+    @cached_property
+    def ordering(self) -> gtsam.Ordering:
+        """The poses of places first: their elimination is a Schur complement, place by place."""
+        return to_ordering([*self.place_keys, *self.shared_keys])
+
+
+def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """The whole graph; its optimum and its marginal are what is reported.
+
+    ``2 * graph.error(values)`` is the cost.
+    """
+    return join(model.shared_graph, model.place_graph, data_graph(model))
+
+
+def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """One lossless factor per camera and place, and one per pair and place."""
+    graph = gtsam.NonlinearFactorGraph()
+    for place, camera in model.matched_places():
+        block = model.blocks[model.cameras[camera]].at_place(place)
+        graph.add(pair_block_factor(cloud_at_key(place), matched_at_key(place, camera), block))
+    for pair in model.pairs:
+        key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
+        for place, features in pair.at_each_place():
+            graph.add(placed_pair_factor(cloud_at_key(place), key_a, key_b, features))
+    return graph
+
+
+def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
+    """GTSAM's list of keys."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
+def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """Priors of what all places share; x_c to m_c and to n_c."""
+    parts, graph = model.components, gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
+    if model.is_distorted:
+        graph.push_back(_distortion_graph(parts))
+    for number in model.matched:
+        graph.add(_to_shown(model, number, matched_key(number), "camera"))
+    for number in model.paired:
+        graph.add(_to_shown(model, number, paired_key(number), "pairs"))
+    return graph
+
+
+def _to_shown(model: LatentPoseModel, number: int, key: int, kind: str) -> gtsam.NonlinearFactor:
+    """From a camera to its pose as its matches or its pairs show it."""
+    parts = model.components
+    noise = _noise(parts.camera if kind == "camera" else parts.pairs)
+    if not model.is_distorted:
+        return gtsam.BetweenFactorPose3(camera_key(number), key, gtsam.Pose3(), noise)
+    jacobians = {"camera": parts.distortion_jacobian, "pairs": parts.pair_distortion_jacobian}
+    return biased_between_factor(
+        camera_key(number), DISTORTION, key, jacobians[kind][number], noise
+    )
+
+
+def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
+    """The prior of the distortion, and its quadratic by the residuals."""
+    graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
+    noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
+    graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
+    information, vector, constant = _shown_distortion(parts)
+    zero = gtsam.Values()
+    zero.insert(DISTORTION, np.zeros(size))
+    shown = gtsam.HessianFactor(DISTORTION, information, vector, constant)
+    graph.add(gtsam.LinearContainerFactor(shown, zero))
+    return graph
+
+
+def least_cost_of_distortion(parts: VarianceComponents) -> float:
+    """Twice the error of both factors of the distortion by itself, at its minimum."""
+    information, vector, constant = _shown_distortion(parts)
+    prior = np.diag(1.0 / np.broadcast_to(parts.distortion_size, len(vector)))
+    return constant - float(vector @ np.linalg.solve(prior + information, vector))
+
+
+def _shown_distortion(parts: VarianceComponents) -> tuple[Array, Array, float]:
+    """(B, B) information, (B,) vector and constant by the residuals of all places."""
+    weight = parts.distortion_weight
+    information = np.einsum("pn,pnij->ij", weight, parts.distortion_information)
+    vector = np.einsum("pn,pni->i", weight, parts.distortion_vector)
+    return information, vector, float(vector @ np.linalg.pinv(information) @ vector)
+
+
+def _place_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """O to o_p and m_c to a_cp."""
+    parts, graph, no_motion = model.components, gtsam.NonlinearFactorGraph(), gtsam.Pose3()
+    clouds = np.broadcast_to(parts.cloud_at_place, (model.places, 6, 6))
+    for place, covariance in enumerate(clouds):
+        noise = _robust(covariance, parts.robust_scale)
+        graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud_at_key(place), no_motion, noise))
+    for place, camera in model.matched_places():
+        noise = _robust(parts.at_place[place, camera], parts.robust_scale)
+        keys = matched_key(camera), matched_at_key(place, camera)
+        graph.add(gtsam.BetweenFactorPose3(*keys, no_motion, noise))
+    return graph
+
+
+def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
+    noise = _noise(covariance)
+    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)

@@ -1,0 +1,45 @@
+"""Keys of the variables. All are ``Pose3`` in the LiDAR frame but the scan distortion, a vector.
+
+x_c   camera c as it is: ``T_lidar_camera``, the estimate
+d     the scan distortion, in standard deviations of its prior
+m_c   camera c as its matches show it at every place
+n_c   camera c as its pairs with other cameras show it
+o     the cloud as it is displaced at every place
+o_p   the cloud as it is displaced at place p
+a_cp  camera c as its matches at place p show it
+"""
+
+from __future__ import annotations
+
+import gtsam
+
+CLOUD = int(gtsam.symbol("o", 0))
+DISTORTION = int(gtsam.symbol("d", 0))
+
+MOST_CAMERAS = 2**16
+"""The numbers of camera and place share an index of 56 bits."""
+
+
+def camera_key(camera: int) -> int:
+    """Key of ``x_c``."""
+    return int(gtsam.symbol("x", camera))
+
+
+def matched_key(camera: int) -> int:
+    """Key of ``m_c``."""
+    return int(gtsam.symbol("m", camera))
+
+
+def paired_key(camera: int) -> int:
+    """Key of ``n_c``."""
+    return int(gtsam.symbol("n", camera))
+
+
+def cloud_at_key(place: int) -> int:
+    """Key of ``o_p``."""
+    return int(gtsam.symbol("p", place))
+
+
+def matched_at_key(place: int, camera: int) -> int:
+    """Key of ``a_cp``."""
+    return int(gtsam.symbol("a", place * MOST_CAMERAS + camera))

@@ -1,0 +1,279 @@
+"""Optimum and marginal of the error model (``calibgraph.graph.latent_poses``), by GTSAM.
+
+Gauss-Newton, with steps shortened until they descend: the data enter as ``HessianFactor``s, the
+stock factors are linearized by GTSAM, and GTSAM eliminates the poses of places first, which is a
+Schur complement per place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.linear_data import LinearData
+from calibgraph.graph.variables import (
+    CLOUD,
+    DISTORTION,
+    camera_key,
+    cloud_at_key,
+    matched_at_key,
+    matched_key,
+    paired_key,
+)
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.solver.optimizer import MAX_ITERATIONS
+from factors import unit_diagonal
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-6
+"""Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
+
+_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
+
+_ROUNDING = 2e-15  # smallest part of a sum that a difference may leave
+
+_SHARES = 0.5 ** np.arange(12)
+"""Of a step: the first that descends; mostly the whole step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The Gaussian graph of the error model at given values.
+
+    Attributes:
+        model: the graph.
+        values: of all its variables.
+        data: its quadratics there.
+    """
+
+    model: LatentPoseModel
+    values: gtsam.Values
+    data: LinearData
+
+    @staticmethod
+    def at(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
+        """Linearize the whole graph."""
+        return Linearization(model, values, LinearData.at(model, values))
+
+    @cached_property
+    def shared(self) -> gtsam.GaussianFactorGraph:
+        """The linear factors of what all places share."""
+        return self.model.shared_graph.linearize(self.values)
+
+    @cached_property
+    def placed(self) -> gtsam.GaussianFactorGraph:
+        """The linear factors of all places, data included."""
+        graph = self.model.place_graph.linearize(self.values)
+        graph.push_back(self.data.graph)
+        return graph
+
+    @property
+    def graph(self) -> gtsam.GaussianFactorGraph:
+        """All linear factors."""
+        return join_linear(self.shared, self.placed)
+
+    @cached_property
+    def cost(self) -> float:
+        """Twice GTSAM's error."""
+        graphs = self.model.shared_graph, self.model.place_graph
+        return self.data.cost + sum(2.0 * graph.error(self.values) for graph in graphs)
+
+    @cached_property
+    def information(self) -> Array:
+        """(6 N, 6 N) marginal information of all x_c."""
+        return marginal_information(self.graph, self.model)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(6 N, 6 N) marginal covariance of all x_c, in their tangents."""
+        return np.asarray(np.linalg.inv(self.information))
+
+    @cached_property
+    def distances(self) -> Array:
+        """(P, 1 + N) in sigmas: of o_p from o, of a_cp from m_c; 0 where there are no data."""
+        model, values = self.model, self.values
+        parts, cloud = model.components, values.atPose3(CLOUD)
+        found = np.zeros((model.places, 1 + len(model.cameras)))
+        clouds = np.broadcast_to(parts.cloud_at_place, (model.places, 6, 6))
+        for place, covariance in enumerate(clouds):
+            step = cloud.between(values.atPose3(cloud_at_key(place)))
+            found[place, 0] = _length(step, covariance)
+        matched = {number: values.atPose3(matched_key(number)) for number in model.matched}
+        for place, number in model.matched_places():
+            step = matched[number].between(values.atPose3(matched_at_key(place, number)))
+            found[place, 1 + number] = _length(step, parts.at_place[place, number])
+        return found
+
+    @cached_property
+    def step(self) -> gtsam.VectorValues:
+        """The step of Gauss-Newton."""
+        return self.graph.optimize(self.model.ordering)
+
+    def descend(self) -> Linearization | None:
+        """The graph after a step, shortened until it descends; None if no step does."""
+        for share in _SHARES:
+            values = self.values.retract(self.step if share == 1.0 else self.step.scale(share))
+            tried = Linearization.at(self.model, values)
+            if tried.cost <= self.cost:
+                return tried
+        return None
+
+    def is_determined(self) -> bool:
+        """Whether every direction of every camera is, but for rounding noise."""
+        if not set(self.model.camera_keys) <= set(self.model.shared_graph.keyVector()):
+            return False  # nothing acts on a camera
+        try:
+            information = self.information
+        except RuntimeError:  # GTSAM finds an indeterminate linear system
+            return False
+        diagonal = np.diag(information)
+        if not np.isfinite(information).all() or diagonal.min() <= 0:
+            return False
+        values = np.linalg.eigvalsh(unit_diagonal(information)[0])
+        keys = to_ordering(self.model.shared_keys)
+        before = np.sqrt(np.diag(self.shared.hessian(keys)[0])[-len(diagonal) :])
+        left = np.linalg.eigvalsh(information / np.outer(before, before))[0]
+        return bool(values[0] > _SINGULAR * values[-1] and left > _ROUNDING)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentPoseFit:
+    """The optimum of the error model.
+
+    Attributes:
+        linear: the graph linearized there.
+        iterations: number of Gauss-Newton steps.
+        converged: whether it stopped by its tolerance.
+    """
+
+    linear: Linearization
+    iterations: int
+    converged: bool
+
+    @property
+    def cost(self) -> float:
+        """Twice GTSAM's error."""
+        return self.linear.cost
+
+    @property
+    def covariance(self) -> Array:
+        """(6 N, 6 N) marginal of all x_c, in their tangents."""
+        return self.linear.covariance
+
+    @property
+    def T_camera_lidar(self) -> dict[str, Array]:
+        """Per camera, (4, 4)."""
+        model, values = self.linear.model, self.linear.values
+        return {
+            name: to_T_camera_lidar(values.atPose3(camera_key(number)))
+            for number, name in enumerate(model.cameras)
+        }
+
+    @cached_property
+    def distortion(self) -> tuple[Array, Array]:
+        """(B,) scan distortion in prior standard deviations, and its (B, B) marginal covariance."""
+        if not self.linear.model.is_distorted:
+            size = self.linear.model.components.distortion_jacobian.shape[2]
+            return np.zeros(size), np.eye(size)
+        marginals = gtsam.Marginals(self.linear.graph, self.linear.values)
+        covariance = np.asarray(marginals.marginalCovariance(DISTORTION))
+        return self.linear.values.atVector(DISTORTION), covariance
+
+    def place_weights(self, robust_scale: float) -> Array:
+        """(P, 1 + N) weights of the cloud and of each camera at each place, in a robust loss."""
+        return np.asarray((1.0 + (self.linear.distances / robust_scale) ** 2) ** -2)
+
+    def with_model(self, model: LatentPoseModel) -> LatentPoseFit:
+        """The marginals of another model of the same data, at the same values."""
+        return replace(self, linear=replace(self.linear, model=model))
+
+
+def fit_latent_poses(
+    model: LatentPoseModel,
+    start: gtsam.Values | LatentPoseFit,
+    *,
+    relative_tolerance: float = TOLERANCE,
+) -> LatentPoseFit | None:
+    """Minimize by Gauss-Newton, with steps shortened until they descend.
+
+    Args:
+        model: the graph.
+        start: values of all its variables, or a fit of the same data, which is continued.
+        relative_tolerance: relative change of the cost at which it stops.
+
+    Returns:
+        None if a direction is not determined.
+    """
+    if isinstance(start, LatentPoseFit):
+        present = start.linear
+        present = present if present.model is model else replace(present, model=model)
+    else:
+        present = Linearization.at(model, start)
+    if not present.is_determined():
+        return None
+    iterations, converged = 0, False
+    while iterations < MAX_ITERATIONS and not converged:
+        try:
+            found = present.descend()
+        except RuntimeError:  # GTSAM finds an indeterminate linear system
+            return None
+        if found is None:  # this is the minimum, to rounding
+            converged = True
+            break
+        converged = present.cost - found.cost <= relative_tolerance * present.cost
+        present, iterations = found, iterations + 1
+    return LatentPoseFit(present, iterations, converged)
+
+
+def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
+    """All poses of a camera at its (4, 4) extrinsic, the cloud where it is, no distortion."""
+    values, no_motion = gtsam.Values(), gtsam.Pose3()
+    poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in model.cameras]
+    for number, pose in enumerate(poses):
+        values.insert(camera_key(number), pose)
+    for number in model.matched:
+        values.insert(matched_key(number), poses[number])
+    for number in model.paired:
+        values.insert(paired_key(number), poses[number])
+    for place, number in model.matched_places():
+        values.insert(matched_at_key(place, number), poses[number])
+    for key in [CLOUD, *map(cloud_at_key, range(model.places))]:
+        values.insert(key, no_motion)
+    if model.is_distorted:
+        values.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
+    return values
+
+
+def marginal_information(graph: gtsam.GaussianFactorGraph, model: LatentPoseModel) -> Array:
+    """(6 N, 6 N) of all x_c.
+
+    Args:
+        graph: linear factors, over the variables of the model or some of them.
+        model: for its cameras.
+
+    Raises:
+        RuntimeError: if a variable besides the cameras is not determined.
+    """
+    keys = model.camera_keys
+    return np.asarray(graph.marginal(keys).hessian(to_ordering(keys))[0])
+
+
+def join_linear(*graphs: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
+    """One graph with the linear factors of all."""
+    joined = gtsam.GaussianFactorGraph()
+    for graph in graphs:
+        joined.push_back(graph)
+    return joined
+
+
+def _length(step: gtsam.Pose3, covariance: Array) -> float:
+    """Length of a motion in sigmas."""
+    twist = gtsam.Pose3.Logmap(step)
+    return float(np.sqrt(twist @ np.linalg.solve(covariance, twist)))
