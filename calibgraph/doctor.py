@@ -19,7 +19,7 @@ from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.frame_choice import choose_frames
-from calibgraph.matching.standstill import same_places
+from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
@@ -215,7 +215,7 @@ def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding
 def _examine_places(data: Dataset) -> Iterator[Finding]:
     """How many places the frames are of, if the vehicle stands in some."""
     try:
-        places = same_places(data, data.rig)
+        places = find_stationary_frames(data, data.rig)
     except (CalibrationError, OSError):  # which is a finding already
         return
     if places:

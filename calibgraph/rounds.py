@@ -25,7 +25,7 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
-from calibgraph.matching.standstill import same_places
+from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
@@ -144,7 +144,7 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
 def find_stationary(data: Dataset, rig: Rig) -> Places:
     """During which frames the vehicle stands."""
     try:
-        return Places(stationary=as_groups(same_places(data, rig)))
+        return Places(stationary=as_groups(find_stationary_frames(data, rig)))
     except (CalibrationError, OSError):  # the checks on images report it
         return Places()
 

@@ -150,13 +150,13 @@ def _judge_camera(
     if found is None:
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
-        deviation, sigma = found.apart.deviation[row], found.apart.sigma[row]
-        quantiles = Quantiles.of(found.apart.freedom[row], limits.tail)
+        deviation, sigma = found.leave_one_out.deviation[row], found.leave_one_out.sigma[row]
+        quantiles = Quantiles.of(found.leave_one_out.freedom[row], limits.tail)
         audit, reason = judge_axes(deviation, sigma, quantiles, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
-            axes = tuple(np.flatnonzero(found.apart.axes_beyond(limits)[row]).tolist())
+            axes = tuple(np.flatnonzero(found.leave_one_out.axes_beyond(limits)[row]).tolist())
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
         smallest = detectable(sigma, quantiles.significant)
@@ -167,14 +167,14 @@ def _judge_camera(
 def _whose_change(found: Deviations, row: int, names: list[str]) -> str:
     """What else may have changed in place of a result; empty if nothing."""
     count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
-    rivals = [names[found.poses.results[other]] for other in np.flatnonzero(found.rivals[row])]
-    if not rivals:
+    others = [names[found.poses.results[other]] for other in np.flatnonzero(found.ambiguous[row])]
+    if not others:
         return ""
     if count == 2:  # noqa: PLR2004 - no majority
-        return f" from {rivals[0]}; of two results it is not known which changed: give a third"
+        return f" from {others[0]}; of two results it is not known which changed: give a third"
     if 2 * agreeing <= count:
         return "; no more than half of the results agree, so that it is not known which changed"
-    return f"; it may be {' or '.join(rivals)} that changed, not this result: give more results"
+    return f"; it may be {' or '.join(others)} that changed, not this result: give more results"
 
 
 def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | None:
@@ -225,9 +225,9 @@ def _lidar(
     if covariance is None:
         return None
     rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
-    parts = [(each.apart, row) for each, row in zip(seen.values(), rows, strict=True)]
-    deviation = np.concatenate([apart.deviation[row] for apart, row in parts])
-    freedom = np.min([apart.freedom[row] for apart, row in parts])
+    parts = [(each.leave_one_out, row) for each, row in zip(seen.values(), rows, strict=True)]
+    deviation = np.concatenate([each.deviation[row] for each, row in parts])
+    freedom = np.min([each.freedom[row] for each, row in parts])
     bases = [each.poses.base for each in seen.values()]
     return find_lidar_motion(deviation, covariance, bases, moved, float(limits.sigmas(freedom)))
 

@@ -9,7 +9,7 @@ in this order:
 3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
 4. `tracking_rounds`: run again from a start displaced from the result.
 5. `release`: no more rounds follow.
-6. `fails_on_images`: whether the checks on images may FAIL the result.
+6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     @property
-    def fails_on_images(self) -> bool:
+    def image_checks_can_fail(self) -> bool:
         """Whether the checks on images may FAIL a result; if not (default), they WARN at most.
 
         The image evidence is measured by the matcher ``structure``, from which another matcher may
@@ -125,7 +125,7 @@ class FullMatcher(Matcher, Protocol):
         ...
 
 
-class CompletedMatcher:
+class MatcherWithDefaults:
     """A matcher with defaults in place of the members that it lacks: the only place of defaults."""
 
     def __init__(self, matcher: Matcher) -> None:
@@ -134,7 +134,9 @@ class CompletedMatcher:
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
-        self.fails_on_images = bool(getattr(matcher, "fails_on_images", False))
+        self.image_checks_can_fail = bool(
+            getattr(matcher, "image_checks_can_fail", getattr(matcher, "fails_on_images", False))
+        )  # fails_on_images: its former name
         self._locate = getattr(matcher, "locate", None)
         self._release = getattr(matcher, "release", None)
 
@@ -166,7 +168,7 @@ def to_full_matcher(matcher: Matcher) -> FullMatcher:
     Raises:
         ValueError: if it has less than one round.
     """
-    full = CompletedMatcher(matcher)
+    full = MatcherWithDefaults(matcher)
     if full.rounds < 1:
         raise ValueError(f"the matcher has {full.rounds} rounds, expected at least 1")
     return full

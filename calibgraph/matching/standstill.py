@@ -1,4 +1,4 @@
-"""Frames of one place: while the vehicle stands, all frames show the same, and err the same."""
+"""Stationary frames: while the vehicle stands, all frames show the same and share one error."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from calibgraph.model.rig import Rig
 
 Gray = NDArray[np.uint8]
 
-STANDING_PX = 0.5
-"""Median image motion of the recorded image, below which a camera stands: matches are not nearer
-than that, so they err alike."""
+STATIONARY_PX = 0.5
+"""Median image motion of the recorded image, below which a camera stands: matches are less
+precise, so they share one error."""
 
 _SCALE = 2  # times smaller than recorded, for speed; flow is good to some hundredths of a pixel
 _FEATURES, _MIN_FEATURES = 200, 20
@@ -72,14 +72,14 @@ class View:
         if good.mean() < _TRACKED:
             return False
         motion = np.linalg.norm((there - self.corners)[good, 0], axis=1)
-        return bool(_SCALE * np.median(motion) < STANDING_PX)
+        return bool(_SCALE * np.median(motion) < STATIONARY_PX)
 
 
-def same_places(dataset: Dataset, rig: Rig) -> list[list[int]]:
-    """The numbers of the frames at one place, of every place that has several.
+def find_stationary_frames(dataset: Dataset, rig: Rig) -> list[list[int]]:
+    """The frame numbers of every stop that has several frames.
 
-    A frame is where an earlier one is if no camera has moved, by the motion of its image; moving
-    traffic may fill less than half of it.
+    Two frames are of one stop if the median image motion is below ``STATIONARY_PX`` in every
+    camera; moving traffic may fill less than half of an image.
 
     Args:
         dataset: images.
@@ -88,15 +88,15 @@ def same_places(dataset: Dataset, rig: Rig) -> list[list[int]]:
     Raises:
         FileError: if an image cannot be read.
     """
-    places: list[tuple[_Views, list[int]]] = []
+    stops: list[tuple[_Views, list[int]]] = []
     for frame in dataset.frames:
         views = _Views(frame, rig)
-        members = next((found for first, found in places if first.same_place(views)), None)
+        members = next((found for first, found in stops if first.is_stationary(views)), None)
         if members is None:
-            places.append((views, [frame.index]))
+            stops.append((views, [frame.index]))
         else:
             members.append(frame.index)
-    return [members for _, members in places if len(members) > 1]
+    return [members for _, members in stops if len(members) > 1]
 
 
 class _Views:
@@ -112,7 +112,7 @@ class _Views:
             self._views[name] = View.of(gray)
         return self._views[name]
 
-    def same_place(self, later: _Views) -> bool:
+    def is_stationary(self, later: _Views) -> bool:
         """Whether no camera has moved, and at least one can tell."""
         names = [name for name in self._rig.cameras if self._sees(name) and later._sees(name)]
         return _none_moved(self.of(name).stands(later.of(name)) for name in names)

@@ -305,10 +305,9 @@ def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
 
 
 def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
-    doubt = None if verdict.doubt is None else vars(verdict.doubt)
     return {
         "status": verdict.status,
         "cannot_tell": verdict.cannot_tell,
-        "doubt": doubt,
+        "error_probability": verdict.error_probability and vars(verdict.error_probability),
         "reasons": list(verdict.reasons),
     }

@@ -96,7 +96,7 @@ CAUSES: dict[str, Cause] = {
         {"residual_spread": "", "inlier_share": "", "competing_solution": "", "held_out": "",
          "failed_frames": "", "restart_rotation": _SPREAD, "restart_translation": _SPREAD,
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
-         "start_dependence": _LEARNED, "recall": _LEARNED},
+         "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),
     "frames": Cause(
         "frames or places that contradict each other", _FRAMES,

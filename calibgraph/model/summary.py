@@ -50,7 +50,7 @@ class Summary:
     Attributes:
         status: PASS, WARN or FAIL.
         cannot_tell: whether the first reason is that the data cannot tell.
-        doubt: how probable it is that which cameras are off, in one sentence; empty for a PASS.
+        error_probability: per camera, that it is off, in one sentence; empty for a PASS.
         reasons: at most three, each of another cause, the worst first.
         actions: what to do, at most three sentences, each once.
         error_bar: the largest error bar beside the tolerance, and the shares of its sources; empty
@@ -60,7 +60,7 @@ class Summary:
 
     status: Status
     cannot_tell: bool
-    doubt: str
+    error_probability: str
     reasons: tuple[Reason, ...]
     actions: tuple[str, ...]
     error_bar: str
@@ -90,7 +90,9 @@ def summarize(
         sources: of the error bar, per camera.
     """
     of_rig, known = rig_verdict(verdicts), sources or {}
-    tolerance = TOLERANCE if of_rig.doubt is None else of_rig.doubt.tolerance
+    tolerance = (
+        TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance
+    )
     findings = [*_unsure(verdicts), *_findings(verdicts)] or _nearest(verdicts)
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
@@ -107,7 +109,7 @@ def summarize(
     return Summary(
         of_rig.status,
         of_rig.cannot_tell,
-        _doubt(verdicts),
+        _error_probabilities(verdicts),
         tuple(shown),
         tuple(actions)[:MOST],
         _error_bar(known, tolerance),
@@ -158,7 +160,9 @@ def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
 def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     """That the error bar is too wide for the tolerance, of the cameras where nothing is odd."""
     found = {
-        n: v.doubt for n, v in verdicts.items() if v.doubt is not None and v.doubt.of_error_bar
+        n: v.error_probability
+        for n, v in verdicts.items()
+        if v.error_probability is not None and v.error_probability.of_error_bar
     }
     if not found:
         return []
@@ -167,13 +171,17 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     return [Reason("WARN", tuple(found), text, "error bar")]
 
 
-def _doubt(verdicts: Mapping[str, Verdict]) -> str:
+def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
     """How probable it is that cameras are off, the worst first, in one sentence."""
-    found = {n: v.doubt for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+    found = {
+        n: v.error_probability
+        for n, v in verdicts.items()
+        if v.error_probability and v.error_probability.status != "PASS"
+    }
     ordered = sorted(found.items(), key=lambda item: (item[1].status, -item[1].probability))
     if not ordered:
         return ""
-    percents = ", ".join(f"{name} {doubt.percent}" for name, doubt in ordered)
+    percents = ", ".join(f"{name} {found.percent}" for name, found in ordered)
     return f"{ordered[0][1].sentence}: {percents}"
 
 
@@ -191,7 +199,11 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
 
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     """Of cameras that may be off though all their checks are PASS, the check nearest its limit."""
-    doubtful = {n: v for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+    doubtful = {
+        n: v
+        for n, v in verdicts.items()
+        if v.error_probability and v.error_probability.status != "PASS"
+    }
     checks = [(name, check) for name, verdict in doubtful.items() for check in verdict.checks]
     if not checks:
         return []

@@ -108,7 +108,7 @@ def _share(part: float, whole: float) -> float:
 
 
 @dataclass(frozen=True)
-class Doubt:
+class ErrorProbability:
     """The probability that a result is off by more than what the user tolerates, two ways.
 
     Attributes:
@@ -176,13 +176,13 @@ class Verdict:
 
     Attributes:
         checks: all checks, in order.
-        doubt: the probability that it is off; without it, as while driving, the checks alone
-            decide.
+        error_probability: that the result is off by more than the tolerance; None while driving,
+            where the checks alone decide.
         cameras: of a rig's verdict, those of its cameras.
     """
 
     checks: tuple[Check, ...] = ()
-    doubt: Doubt | None = None
+    error_probability: ErrorProbability | None = None
     cameras: tuple[Verdict, ...] = ()
 
     @property
@@ -194,25 +194,30 @@ class Verdict:
         worst: Status = max(
             (check.status for check in self.checks), key=_ORDER.index, default="PASS"
         )
-        if self.doubt is None:
+        if self.error_probability is None:
             return worst
-        if self.doubt.status == "PASS" and worst != "PASS":
+        if self.error_probability.status == "PASS" and worst != "PASS":
             return "WARN"
-        return self.doubt.status
+        return self.error_probability.status
+
+    @property
+    def doubt(self) -> ErrorProbability | None:
+        """Former name of ``error_probability``, for one release."""
+        return self.error_probability
 
     @property
     def cannot_tell(self) -> bool:
         """Whether it is WARN because the data determine too little, not because something is odd.
 
-        So if the error bar leaves more doubt than the checks do, or if the only checks beyond a
-        limit are of how much the data determine. Of a rig, if this is so of every camera that is
-        not PASS.
+        True if the error bar is more likely than the checks to hide an error, or if the only checks
+        beyond a limit measure how much the data determine. For a rig: if it is true for every
+        camera that is not PASS.
         """
         if self.status != "WARN":
             return False
         if self.cameras:
             return all(each.cannot_tell for each in self.cameras if each.status != "PASS")
-        if self.doubt is not None and self.doubt.of_error_bar:
+        if self.error_probability is not None and self.error_probability.of_error_bar:
             return True
         beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
         return bool(beyond) and beyond <= ABOUT_THE_DATA
@@ -223,10 +228,10 @@ class Verdict:
         failing = [check for check in self.checks if check.status != "PASS"]
         failing.sort(key=lambda check: -check.severity)
         texts = [check.text for check in failing]
-        if self.doubt is None or self.doubt.status == "PASS":
+        if self.error_probability is None or self.error_probability.status == "PASS":
             return tuple(texts)
-        doubt = self.doubt
-        return (f"{doubt.sentence} of {doubt.percent}{doubt.advice}", *texts)
+        found = self.error_probability
+        return (f"{found.sentence} of {found.percent}{found.advice}", *texts)
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
@@ -236,8 +241,8 @@ def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
         for name, verdict in cameras.items()
         for check in verdict.checks
     )
-    doubts = [verdict.doubt for verdict in cameras.values() if verdict.doubt is not None]
-    worst = max(doubts, key=lambda doubt: (doubt.status == "FAIL", doubt.probability), default=None)
+    known = [each.error_probability for each in cameras.values() if each.error_probability]
+    worst = max(known, key=lambda found: (found.status == "FAIL", found.probability), default=None)
     return Verdict(checks, worst, tuple(cameras.values()))
 
 

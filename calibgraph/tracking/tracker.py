@@ -34,12 +34,12 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
+from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.start import try_to_start
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
@@ -241,7 +241,7 @@ class IncrementalCalibrator:
         self._priors = Priors.of(self._state)
         self._closed_places = ClosedPlaces.of(self._state)
         self._closed = closed_posterior(self._state)
-        self._closed_halves = Halves.of_closed_epochs(self._state)
+        self._closed_halves = SplitHalf.of_closed_epochs(self._state)
 
     def _blocks_by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
         """The preprocessed matches of each camera that has enough."""

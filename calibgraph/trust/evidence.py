@@ -31,7 +31,7 @@ from calibgraph.solver.error_shares import (
 from calibgraph.solver.factor_graph import relative_pose_graph
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
+from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
@@ -146,7 +146,7 @@ class Evidence:
             return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.error_over_usual * self._shared(solution.inliers, self.curvature)
+        shared = self.shared_variance_ratio * self._shared(solution.inliers, self.curvature)
         return (
             self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
         )
@@ -175,7 +175,7 @@ class Evidence:
         inliers, T_camera_lidar = self.solution.inliers, self.solution.T_camera_lidar
         no_places = replace(self.findings, place_variance=0.0)
         every, common = (
-            self.error_over_usual * np.diag(self._shared(inliers, self.curvature, findings))
+            self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
             for findings in (self.findings, no_places)
         )
         between = np.diag(error_between(T_camera_lidar, inliers.pairs))
@@ -196,15 +196,17 @@ class Evidence:
             solution.correspondences.metadata,
             solution.held,
         )
-        return None if found is None else found.with_shared_size(self.error_over_usual)
+        return None if found is None else found.with_shared_size(self.shared_variance_ratio)
 
     @cached_property
-    def error_over_usual(self) -> float:
+    def shared_variance_ratio(self) -> float:
         """Variance of the shared error over its usual one, by what cameras see in common."""
         own = self.of_correspondences
         if own is self or own.joint_covariance is None:
             return 1.0
-        return error_over_usual(own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits)
+        return shared_variance_ratio(
+            own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits
+        )
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:

@@ -74,7 +74,7 @@ def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     shares = (
         (threshold("start_dependence"), findings.start_dependence.get(camera),
          "of a displaced start remains in the matches"),
-        (threshold("recall"), findings.recall.get(camera),
+        (threshold("memorization"), findings.memorization.get(camera),
          "of a displaced start is undone even without the image"),
         (threshold("failed_frames"), findings.failed_share.get(camera, 0.0),
          "of the frames failed to be matched"),

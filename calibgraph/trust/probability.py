@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
-from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ def judge(
     """
     of_checks = probability_of_checks(checks, model)
     of_error_bar = probability_beyond(covariance, tolerance)
-    return Verdict(tuple(checks), Doubt(of_checks, of_error_bar, *tolerance))
+    return Verdict(tuple(checks), ErrorProbability(of_checks, of_error_bar, *tolerance))
 
 
 def model_of(metadata: Mapping[str, Any]) -> str:

@@ -91,7 +91,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
               "How much of a displaced start does a learned matcher leave?", _CHOSEN,
               "the network does not measure here"),
-    Threshold("recall", "recall", "at most", 0.3, 0.6, "share",
+    Threshold("memorization", "memorization", "at most", 0.3, 0.6, "share",
               "How much of a displaced start does a learned matcher undo without the image?",
               _CHOSEN, "the network reproduces the rig it was trained on, and pulls towards it"),
     Threshold("failed_frames", "failed frames", "at most", 0.3, 0.7, "share",

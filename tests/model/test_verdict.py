@@ -7,7 +7,7 @@ import pytest
 
 from calibgraph import Check, Verdict
 from calibgraph.model.threshold import at_least, at_most, beside, in_unit
-from calibgraph.model.verdict import ABOUT_THE_DATA, COMMON_ERROR, Doubt, rig_verdict
+from calibgraph.model.verdict import ABOUT_THE_DATA, COMMON_ERROR, ErrorProbability, rig_verdict
 from calibgraph.trust.thresholds import threshold
 
 
@@ -52,10 +52,12 @@ ODD = threshold("z_score").check(12.0)
 
 def test_a_wide_error_bar_and_few_frames_cannot_tell() -> None:
     for verdict in (
-        Verdict((), Doubt(0.001, 0.05)),
-        Verdict((ODD,), Doubt(0.001, 0.05)),  # the error bar leaves more doubt than the checks
-        Verdict((FEW_FRAMES,), Doubt(0.01)),
-        Verdict((FEW_FRAMES,), Doubt(0.001)),
+        Verdict((), ErrorProbability(0.001, 0.05)),
+        Verdict(
+            (ODD,), ErrorProbability(0.001, 0.05)
+        ),  # the error bar leaves more doubt than the checks
+        Verdict((FEW_FRAMES,), ErrorProbability(0.01)),
+        Verdict((FEW_FRAMES,), ErrorProbability(0.001)),
         Verdict((FEW_FRAMES,)),
     ):
         assert (verdict.status, verdict.cannot_tell) == ("WARN", True)
@@ -63,20 +65,20 @@ def test_a_wide_error_bar_and_few_frames_cannot_tell() -> None:
 
 def test_what_looks_odd_right_or_wrong_is_no_lack_of_data() -> None:
     for verdict, status in (
-        (Verdict((ODD,), Doubt(0.05)), "WARN"),
-        (Verdict((FEW_FRAMES, ODD), Doubt(0.05, 0.01)), "WARN"),
+        (Verdict((ODD,), ErrorProbability(0.05)), "WARN"),
+        (Verdict((FEW_FRAMES, ODD), ErrorProbability(0.05, 0.01)), "WARN"),
         (Verdict((FEW_FRAMES, ODD)), "WARN"),
-        (Verdict((), Doubt(0.05)), "WARN"),
-        (Verdict((), Doubt(0.001)), "PASS"),
-        (Verdict((), Doubt(0.5, 0.6)), "FAIL"),
+        (Verdict((), ErrorProbability(0.05)), "WARN"),
+        (Verdict((), ErrorProbability(0.001)), "PASS"),
+        (Verdict((), ErrorProbability(0.5, 0.6)), "FAIL"),
     ):
         assert (verdict.status, verdict.cannot_tell) == (status, False)
         assert not any("cannot tell" in reason for reason in verdict.reasons)
 
 
 def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
-    unsure, odd = Verdict((), Doubt(0.001, 0.3)), Verdict((ODD,), Doubt(0.01))
-    good, wrong = Verdict((), Doubt(0.001)), Verdict((), Doubt(0.9))
+    unsure, odd = Verdict((), ErrorProbability(0.001, 0.3)), Verdict((ODD,), ErrorProbability(0.01))
+    good, wrong = Verdict((), ErrorProbability(0.001)), Verdict((), ErrorProbability(0.9))
     assert rig_verdict({"a": unsure, "b": good}).cannot_tell
     for other in (odd, wrong):
         assert not rig_verdict({"a": unsure, "b": other}).cannot_tell

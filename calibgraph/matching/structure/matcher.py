@@ -72,7 +72,7 @@ class StructureMatcher:
     """
 
     stage1: Stage1Source = "rig"
-    fails_on_images: bool = True
+    image_checks_can_fail: bool = True
 
     def __init__(
         self,
