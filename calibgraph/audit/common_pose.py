@@ -156,10 +156,6 @@ def compare(poses: Poses, limits: Limits) -> Deviations:
     The result that deviates most is removed from the mean of the others, until none that is left
     deviates. If no more than half are left, or the rest agrees as well with another result removed
     in place of this one, it is not known which of them changed: these are compared with each other.
-
-    Args:
-        poses: of one camera, at least two.
-        limits: of a deviation.
     """
     agreeing = _agreeing(poses, limits)
     if 2 * np.count_nonzero(agreeing) > len(poses):

@@ -100,11 +100,7 @@ def drift(
 
 
 def _times(days: Sequence[float] | None, count: int) -> Array:
-    """(n,) days, or places.
-
-    Raises:
-        ValueError: if there is not a day for each result, or one is none.
-    """
+    """(n,) days, or places."""
     at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
     if at.shape != (count,) or not (np.abs(at) <= _LATEST_DAY).all():
         raise ValueError(

@@ -145,14 +145,7 @@ def detectable(sigma: Array, quantile: float | Array) -> Array:
 
 
 def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance) -> CameraAudit:
-    """The audit of one camera.
-
-    Args:
-        evidence: of the solution; its guess is the deployed rig.
-        name: of the camera.
-        doubt: why the measurement cannot be trusted; empty if it can.
-        tolerance: on each axis.
-    """
+    """The audit of one camera."""
     z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
     if name in evidence.solution.held:
         return CameraAudit("CANNOT TELL", f"{doubt}; {SEARCHES_FARTHER}", z_score=z_score)
@@ -273,10 +266,6 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
     """The motion of the LiDAR, if one explains the deviations of all cameras.
 
     None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
-
-    Args:
-        evidence: of the solution; its guess is the deployed rig.
-        cameras: all of them, with trusted measurements.
     """
     wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
     if evidence.joint_covariance is None:

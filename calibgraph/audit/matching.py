@@ -90,12 +90,7 @@ def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> 
 
 
 def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:
-    """Whether every camera ended within reach, with a good z-score, after a short last step.
-
-    Args:
-        run: of the rounds.
-        still: the worst grade of the last step.
-    """
+    """Whether every camera ended within reach, with a good z-score, after a short last step."""
     z_scores, last = run.correspondences.findings.z_score, run.rounds[-1]
     deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
     for name, T in deployed.items():

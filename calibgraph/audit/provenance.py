@@ -23,10 +23,6 @@ def is_made_from(rig: Path, data: Dataset) -> bool:
 
     Only clouds with the name of one of its inputs are read.
 
-    Args:
-        rig: a result, its folder or file, or a rig, which does not name its recording.
-        data: the frames.
-
     Raises:
         FileError: if the result is malformed, or a cloud cannot be read.
     """

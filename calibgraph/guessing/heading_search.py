@@ -64,14 +64,6 @@ def search_headings(
     One after another, over headings all round, each within 20 degrees and 1.5 m per axis of a level
     camera at the LiDAR. Those that are found place others that see the same.
 
-    Args:
-        dataset: images and clouds.
-        rig: lenses; its extrinsics of these cameras do not count.
-        cameras: their names.
-        forward: the axis of the LiDAR frame that points ahead.
-        seed: of the search.
-        progress: called as headings are done.
-
     Raises:
         FileError: if an image or a cloud cannot be read.
     """

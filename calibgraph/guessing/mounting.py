@@ -79,11 +79,7 @@ class Mounting:
         return max(self.sigmas[name] for name in ("ahead", "left", "up"))
 
     def T_camera_lidar(self, forward: Forward = "+x") -> Array:
-        """(4, 4) of the camera's optical frame.
-
-        Args:
-            forward: the axis of the LiDAR frame that points ahead; z is up.
-        """
+        """(4, 4) of the camera's optical frame."""
         T_vehicle_link, T_lidar_vehicle = np.eye(4), np.eye(4)
         angles = (self.heading_deg, self.tilt_deg, self.roll_deg)
         T_vehicle_link[:3, :3] = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
@@ -108,10 +104,6 @@ def check_forward(text: str) -> Forward:
 
 def parse_mounting(text: str, camera: str) -> Mounting:
     """Read how a camera is mounted.
-
-    Args:
-        text: a heading, then turns of the camera from it and its place, see ``GRAMMAR``.
-        camera: its name, for errors.
 
     Raises:
         RigError: if a word is not understood, said twice, or the heading is missing.

@@ -96,10 +96,6 @@ class UprightCloud:
 def align_with_any(now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[int, Array] | None:
     """Which of some clouds shows the place of another one best, and the motion between them.
 
-    Args:
-        now: the one.
-        known: the others.
-
     Returns:
         The row of the most similar of them, and (4, 4) T_now_known of the LiDAR; None if they show
         other places. Of clouds within 10 m nearly all are found, beyond 20 m half of them.
@@ -150,13 +146,7 @@ def _from_above(points: Array) -> Array:
 
 
 def _correlate(known: UprightCloud, now: UprightCloud, turn: int) -> tuple[float, Array]:
-    """The best correlation of two images from above, and (4, 4) T_known_now there.
-
-    Args:
-        known: the one cloud.
-        now: the other.
-        turn: by how many of the _ANGLES one is turned, or by half a turn more.
-    """
+    """The best correlation of two images from above, and (4, 4) T_known_now there."""
     best, T_best = -1.0, np.eye(4)
     for angle in (turn * np.pi / _ANGLES, turn * np.pi / _ANGLES + np.pi):
         T = np.eye(4)

@@ -55,11 +55,6 @@ def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
 
     While the vehicle stands, one is taken. Of neighbours, that with the clearest images is: the
     largest product over the cameras of their images' mean gradient.
-
-    Args:
-        dataset: in the order of time.
-        rig: its cameras' names and sizes.
-        most: number of frames.
     """
     if len(dataset.frames) <= most:
         return FrameChoice(dataset)

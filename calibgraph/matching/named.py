@@ -40,10 +40,6 @@ class TableMatcher:
 def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> FullMatcher:
     """Find a matcher, and complete it with the defaults of the protocol.
 
-    Args:
-        matcher: ``structure``; a table of correspondences, or its file; a matcher.
-        seed: for a matcher by name that draws random numbers.
-
     Raises:
         ValueError: if it is a name, but not of a matcher; or if the matcher has no round.
         FileError, CorrespondenceError: if it is a file, but not a table.

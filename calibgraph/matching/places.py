@@ -45,12 +45,6 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
     another place; a cloud in which little stands upright is none, and its frame stays at the place
     before.
 
-    Args:
-        dataset: images and clouds.
-        camera: whose images are compared.
-        lens: the camera, at its extrinsic.
-        seed: of the robust fits.
-
     Raises:
         FileError: if an image or a cloud cannot be read.
     """
@@ -77,12 +71,7 @@ class PlaceWalk:
         self._most, self._in_sequence = most_places, in_sequence
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
-        """The number of the first frame of this frame's place.
-
-        Args:
-            frame: the next one.
-            step: from the frame before, as its images show it.
-        """
+        """The number of the first frame of this frame's place."""
         before, self._before = self._before, frame
         if before is None or before.cloud_path.parent != frame.cloud_path.parent:
             self._find_place(frame)

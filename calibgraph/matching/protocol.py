@@ -110,14 +110,7 @@ class FullMatcher(Matcher, Protocol):
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
-        """Find where the rounds begin; by default, at the initial guess.
-
-        Args:
-            dataset: images and clouds.
-            rig: lenses, and the initial guess.
-            out_of_time: whether the time limit has passed; then return what there is.
-            progress: called as the work goes on.
-        """
+        """Find where the rounds begin; by default, at the initial guess."""
         ...
 
     def release(self) -> None:

@@ -81,10 +81,6 @@ def find_stationary_frames(dataset: Dataset, rig: Rig) -> list[list[int]]:
     Two frames are of one stop if the median image motion is below ``STATIONARY_PX`` in every
     camera; moving traffic may fill less than half of an image.
 
-    Args:
-        dataset: images.
-        rig: its cameras' names and sizes.
-
     Raises:
         FileError: if an image cannot be read.
     """

@@ -82,13 +82,7 @@ def summarize(
     weaknesses: Mapping[str, Sequence[str]] | None = None,
     sources: Mapping[str, ErrorSources] | None = None,
 ) -> Summary:
-    """The verdict of a rig, or of one camera, in few words.
-
-    Args:
-        verdicts: per camera.
-        weaknesses: sentences per camera.
-        sources: of the error bar, per camera.
-    """
+    """The verdict of a rig, or of one camera, in few words."""
     of_rig, known = rig_verdict(verdicts), sources or {}
     tolerance = (
         TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance

@@ -62,13 +62,7 @@ class Threshold:
         return grade(not value >= self.warn, not value >= self.fail)
 
     def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
-        """The check of a value.
-
-        Args:
-            value: in the row's unit.
-            name: in place of the row's, where it depends on the data.
-            advice: likewise.
-        """
+        """The check of a value."""
         build = at_most if self.direction == "at most" else at_least
         limits = (self.warn, self.fail, self.unit)
         return build(name or self.name, value, *limits, advice or self.advice, self.key)
@@ -82,17 +76,7 @@ class Threshold:
 def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
     name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
 ) -> Check:
-    """A check that a number is at most its limits; NaN fails.
-
-    Args:
-        name: what was measured.
-        value: what was found.
-        warn: the largest value that is PASS.
-        fail: the largest value that is not FAIL.
-        unit: of the values; "share" is printed in percent.
-        advice: what to do if it is above.
-        kind: of the check.
-    """
+    """A check that a number is at most its limits; NaN fails."""
     status = grade(not value <= warn, not value <= fail)
     return _measured(name, status, "above", value, warn, fail, unit, advice, kind)
 
@@ -149,11 +133,6 @@ def beside(value: float, limit: float, unit: str) -> str:
     """A number with its unit, in three digits that tell it from a limit beyond which it lies.
 
     Where these would be the same, the number is rounded away from the limit.
-
-    Args:
-        value: of the number.
-        limit: that it is printed beside.
-        unit: of both.
     """
     text = in_unit(value, unit)
     if value == limit or text != in_unit(limit, unit):

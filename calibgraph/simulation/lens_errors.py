@@ -26,11 +26,6 @@ def draw_lens_errors(rig: Rig, size: float, rng: np.random.Generator) -> Rig:
     distortion by 0.03 % of it at the corners (standard deviations). Equirectangular images have no
     lens to be wrong.
 
-    Args:
-        rig: as it is.
-        size: multiplies all of them.
-        rng: draws them, camera by camera.
-
     Returns:
         The rig with other lenses. Its extrinsics are those with which they project, over the whole
         image and 5 to 40 m away, nearest to where the true cameras see.

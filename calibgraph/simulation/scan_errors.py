@@ -41,11 +41,6 @@ def draw_scan_errors(beams: int, size: float, rng: np.random.Generator) -> ScanE
     At size 1: elevations wrong by 0.05 deg all alike, by 0.05 deg at the outermost beams and
     linearly between, and by 0.04 deg each (standard deviations); beams 1 to 3.5 mrad wide; 0.1 m of
     motion left per turn (standard deviation); up to 3 cm of bias on black.
-
-    Args:
-        beams: of the LiDAR.
-        size: multiplies all of them.
-        rng: draws them.
     """
     tilt = np.linspace(-1.0, 1.0, beams)
     alike, along = rng.normal(0.0, 0.05, 2)

@@ -43,14 +43,6 @@ def simulate_table(
 ) -> list[Path]:
     """Write the correspondences of a scenario with its truth and a guess.
 
-    Args:
-        out: folder to write: ``correspondences.parquet``, ``reference.yaml`` and ``rig.yaml``.
-        name: of the scenario.
-        frames: number of frames.
-        rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
-        translation_m: its translation error.
-        seed: of all draws.
-
     Returns:
         The files.
 

@@ -160,14 +160,7 @@ HEDGE = (
 def place(
     parts: Iterable[Solid], xy_m: tuple[float, float], *, yaw_deg: float, body: Albedo
 ) -> list[Solid]:
-    """Place an object in the world.
-
-    Args:
-        parts: in a common frame.
-        xy_m: position of its origin.
-        yaw_deg: rotation about z.
-        body: albedo of the unpainted parts.
-    """
+    """Place an object in the world."""
     T_world_parts = to_transform((*xy_m, 0), yaw_deg * UNIT_Z)
     return [
         replace(

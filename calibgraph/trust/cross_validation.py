@@ -159,12 +159,7 @@ def competing_solution_checks(evidence: Evidence) -> Checks:
 
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:
-    """The matches that agree on another extrinsic alone, over those that agree on this one alone.
-
-    Args:
-        solution: of the joint solve, from correspondences.
-        camera: one that has correspondences.
-    """
+    """Ratio of the matches that agree on another extrinsic alone to those on this one alone."""
     row = threshold("competing_solution")
     block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
@@ -195,13 +190,7 @@ def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
 
 
 def _ransac_iterations(fewest: float, matches: int) -> int:
-    """Samples of 4 matches that find a competing solution if it is large enough for a warning.
-
-    Args:
-        fewest: matches of such a solution, if it shares none with the reported one; it may share
-            half of them.
-        matches: that were left out, among which they are.
-    """
+    """Samples of 4 matches that find a competing solution if it is large enough for a warning."""
     share = min(fewest / 2 / matches, 0.99)
     needed = math.log(_MISSED) / math.log1p(-(share**4)) if share > 0 else math.inf
     return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))

@@ -73,17 +73,7 @@ def measure_image_evidence(
     extrinsics_only: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, ImageEvidence]:
-    """Measure the image evidence on all cameras of a result.
-
-    Args:
-        dataset: images and clouds.
-        rig: lenses, and the extrinsics in question.
-        places: which frames share one.
-        seed: of the search for the lens.
-        extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
-            take most of the time.
-        progress: called as the work goes on.
-    """
+    """Measure the image evidence on all cameras of a result."""
     report = progress or no_progress
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}

@@ -108,12 +108,6 @@ def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
 def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str, ...]:
     """Warnings about a dataset and its guess, before cameras are searched for; they are logged.
 
-    Args:
-        data: images and clouds.
-        rig: the guess.
-        at_guess: whether a matcher starts there; others may do without clouds, and are warned of
-            the rig alone.
-
     Raises:
         FileError: if a cloud cannot be read.
         DatasetError: if no camera has points of a cloud in view. One that has none may still be

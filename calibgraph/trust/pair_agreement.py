@@ -70,13 +70,7 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
 
 
 def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
-    """The check of one camera of a pair, which other pairs may show to be the other's fault.
-
-    Args:
-        found: the pair.
-        camera: one of its two.
-        all_found: all pairs of the rig.
-    """
+    """The check of one camera of a pair, which other pairs may show to be the other's fault."""
     row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
     status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
     text = (

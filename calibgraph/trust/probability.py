@@ -80,13 +80,7 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
 def contributions(
     severities: Mapping[str, float], weights: Mapping[str, Sequence[float]], other: Sequence[float]
 ) -> dict[str, float]:
-    """Per kind of check, what it adds to the log odds; never negative.
-
-    Args:
-        severities: per kind.
-        weights: per kind, of each step of `steps`.
-        other: of kinds without.
-    """
+    """Per kind of check, what it adds to the log odds; never negative."""
     return {
         kind: sum(map(mul, steps(severity), weights.get(kind, other)))
         for kind, severity in severities.items()

@@ -62,10 +62,6 @@ class Architecture:
 def recognize_architecture(shapes: Shapes, *, reflectance: bool) -> Architecture:
     """The architecture that a state dict's shapes belong to.
 
-    Args:
-        shapes: by parameter name.
-        reflectance: as in the config; the parity of the LiDAR channels must agree.
-
     Raises:
         ValueError: if they belong to no supported architecture.
     """

@@ -212,11 +212,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _require_sound(config: Mapping[str, Any]) -> None:
-    """Check the keys of the config that anything depends on.
-
-    Raises:
-        ValueError: on the first that is missing or out of its range.
-    """
+    """Check the keys of the config that anything depends on."""
     for key, (least, most, required) in _NUMBERS.items():
         value: Any = config.get(key)
         if value is None and not required:
@@ -232,11 +228,7 @@ def _require_sound(config: Mapping[str, Any]) -> None:
 
 
 def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict, after comparing every name, shape and type with the network's.
-
-    Raises:
-        ValueError: on the first difference, and on numbers that are not finite.
-    """
+    """The state dict, after comparing every name, shape and type with the network's."""
     with torch.device("meta"):
         expected = CmrNext(architecture).state_dict()
     for kind, names in (

@@ -27,20 +27,11 @@ raises it by half the variance over the scale."""
 
 
 def least_z_score(tries: float) -> float:
-    """From which z-score on a pose is accepted.
-
-    Args:
-        tries: how much was searched, in searches for one roll; a single pose is less than one.
-    """
+    """From which z-score on a pose is accepted."""
     return _LOCATION + SCALE * math.log(tries / FALSE_ACCEPTANCE)
 
 
 def are_accepted(z_scores: Iterable[float], tries: float) -> bool:
-    """Whether poses of several cameras, one of each, are accepted together.
-
-    Args:
-        z_scores: of the poses; each excess over chance counts.
-        tries: of such sets of poses, as of :func:`least_z_score`.
-    """
+    """Whether poses of several cameras, one of each, are accepted together."""
     excess = sum(max(0.0, z_score - _LOCATION) for z_score in z_scores)
     return excess >= SCALE * math.log(tries / FALSE_ACCEPTANCE)

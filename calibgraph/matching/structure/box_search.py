@@ -97,13 +97,6 @@ def search_box(
 ) -> list[Array]:
     """Find the best extrinsics in a box.
 
-    Args:
-        maps: of a body.
-        box: where to search the lead.
-        cores: works on several starts in parallel.
-        effort: factor on the number of poses that go on from each stage.
-        seed: of the search.
-
     Returns:
         T_lead_lidar (4, 4), best first, without near duplicates.
     """

@@ -137,17 +137,7 @@ def correlate(
     max_windows: int,
     seed: int,
 ) -> CorrelationMaps:
-    """Correlate the images of a camera with their clouds, at all places.
-
-    Args:
-        grays: (height, width) images.
-        clouds: one per image.
-        camera: lens, and the guess, of which only the orientation is used.
-        cores: works on several frames in parallel.
-        range_rad: largest error of the orientation, per axis.
-        max_windows: per frame; fewer where the maps would be too large.
-        seed: of the choice of windows.
-    """
+    """Correlate the images of a camera with their clouds, at all places."""
     cells = _to_angular_image(grays[0], camera).log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
     one = partial(_correlate_frame, camera=camera, range_rad=range_rad, draw=(max_windows, seed))

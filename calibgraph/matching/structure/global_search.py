@@ -64,15 +64,6 @@ def locate_cameras(
 ) -> dict[str, Located]:
     """Locate all cameras of a rig.
 
-    Args:
-        rig: lenses, the guess, and relative poses if known.
-        frames: images and clouds, by the names of the cameras.
-        search_range: about the guess.
-        seed: of the search.
-        out_of_time: checked before each search, and after each pose that is tried.
-        pool: a thread per camera, which waits for the cores of its frames.
-        progress: called as the work goes on.
-
     Returns:
         The best pose per camera, accepted if the camera has been located.
     """
