@@ -1,4 +1,4 @@
-"""What can be seen of a dataset before anything is solved: what is there, and what to fix first."""
+"""Examine a dataset before anything is solved: its content, and the problems to fix first."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ORDER = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found in a dataset.
+    """The findings in a dataset.
 
     Attributes:
         findings: errors first, then warnings and notes.
@@ -118,7 +118,7 @@ def _load(
     bag: BagOptions | None,
     findings: list[Finding],
 ) -> Dataset | None:
-    """The dataset; where frames do not pair up, that of those that do; None if there is none."""
+    """The dataset, without frames that do not pair up; None if there is none."""
     try:
         return load_dataset(folders, rig, frames=frames, bag=bag)
     except (CalibrationError, OSError) as error:
@@ -136,7 +136,7 @@ def _load(
 
 
 def _describe(data: Dataset) -> Iterator[Finding]:
-    """What is there, and whether the frames are enough."""
+    """The content of the dataset, and whether there are enough frames."""
     count = len(data.frames)
     yield Finding(
         "note", f"{_counted(count, 'frame')}, {_counted(len(data.rig.cameras), 'camera')}"
@@ -171,7 +171,7 @@ def _examine_frames(
 
 
 def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, dict[str, str]]:
-    """The cloud, if it can be read; and what is wrong with it ("") and with a camera's image."""
+    """The cloud if readable, and the problems of the cloud ("") and of each camera's image."""
     problems: dict[str, str] = {}
     cloud = None
     try:
@@ -233,7 +233,7 @@ def _examine_places(data: Dataset) -> Iterator[Finding]:
 def _examine_guess(
     data: Dataset, cloud_of: tuple[Frame, NDArray[np.float32]], seen: Mapping[str, int]
 ) -> Iterator[Finding]:
-    """What cannot be right, whether cameras see points by the guess, and which see the same."""
+    """Impossible values, cameras that see no point at the guess, and overlapping cameras."""
     frame, cloud = cloud_of
     doubts = find_doubts(data.rig, frame, cloud)
     intended = explain_guess(data, data.rig, cloud)

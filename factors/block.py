@@ -63,7 +63,7 @@ class ProjectionBlock(RobustBlock):
         loss: name of the robust loss.
         scale: norm of a whitened residual, divided by sigma, at which the loss bends (the paper's
             delta).
-        sigma: what all whitened residuals are divided by.
+        sigma: divides all whitened residuals.
 
     Raises:
         ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma

@@ -1,4 +1,4 @@
-"""What blocks of correspondences share: their loss's scale, and arrays that cannot be written."""
+"""Shared by blocks of correspondences: the scale of the loss, and read-only arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RobustBlock:
 
     Attributes:
         scale: norm of a whitened residual, divided by sigma, at which the loss bends.
-        sigma: what all whitened residuals are divided by.
+        sigma: divides all whitened residuals.
     """
 
     scale: float

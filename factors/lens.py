@@ -200,7 +200,7 @@ def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
 def _radtan_limit(coefficients: Array) -> float:
     """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does; tangential terms apart.
 
-    At most that of a ray 85 degrees off the axis: polynomials are not fitted beyond.
+    At most the radius of a ray 85 degrees off the axis: polynomials are not fitted beyond.
     """
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])

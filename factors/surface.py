@@ -43,7 +43,7 @@ class SurfaceBlock(RobustBlock):
         pixels_b_px: (n, 2) the same features in B.
         loss: name of the robust loss.
         scale: of the residual over sigma, at which the loss bends.
-        sigma: what all residuals are divided by [px].
+        sigma: divides all residuals [px].
 
     Raises:
         ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
@@ -91,7 +91,7 @@ class SurfaceBlock(RobustBlock):
         return self.run_sums(T_lidar_a.matrix()[None], T_lidar_b.matrix()[None], edges)
 
     def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
-        """As :meth:`frame_sums`, with (r, 4, 4) poses of each run, or (1, 4, 4) of all."""
+        """Like :meth:`frame_sums`, with (r, 4, 4) poses per run, or one (1, 4, 4) for all."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums = _accumulate(
             self.lens_b.kind, self.lens_b.packed, contiguous(T_lidar_a), contiguous(T_lidar_b),

@@ -39,7 +39,7 @@ def omnidirectional_limit(coefficients: Array) -> float:
     """Field angle [rad] up to which the unified model is one-to-one, tangential terms apart.
 
     At the least of the angles at which the plane's radius stops growing (arccos(-1 / xi), xi > 1),
-    at which the polynomial does, and at which the radius is that of a pinhole 85 degrees off.
+    at which the polynomial does, and at which the radius equals a pinhole's at 85 degrees.
     """
     xi, k1, k2 = coefficients[:3]
     roots = np.polynomial.polynomial.polyroots(

@@ -161,7 +161,7 @@ def _judge_camera(
 
 
 def _whose_change(found: Deviations, row: int, names: list[str]) -> str:
-    """What else may have changed in place of a result; empty if nothing."""
+    """The other results that may have changed instead, as the end of a sentence; may be empty."""
     count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
     others = [names[found.poses.results[other]] for other in np.flatnonzero(found.ambiguous[row])]
     if not others:

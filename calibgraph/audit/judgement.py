@@ -8,7 +8,7 @@ Four statements about the deviation d of an axis with standard deviation sigma:
 * it is certainly within: |d| + p sigma <= tolerance, with 95 % confidence (p is 1.64 or more).
 
 Both are quantiles of Student's t: sigma is itself estimated, from the scatter of few frames. The
-part of it that is stated, for the error that all frames share, has no such doubt.
+stated part of it, for the error that all frames share, is taken as known.
 
 * these data would show a change as large as the tolerance: the smallest detectable one is below.
 
@@ -88,11 +88,11 @@ class Tolerance:
 
 @dataclass(frozen=True, eq=False)
 class Quantiles:
-    """How many sigmas mean something, by the degrees of freedom that the sigmas have.
+    """Significant and confident numbers of sigmas, by the degrees of freedom of the sigmas.
 
     Attributes:
-        significant: (6,) from where on a deviation is none of chance.
-        confident: (6,) below which an error is with probability CONFIDENCE.
+        significant: (6,) the largest deviation by chance.
+        confident: (6,) the upper bound of an error with probability CONFIDENCE.
     """
 
     significant: Array
@@ -110,7 +110,7 @@ class Quantiles:
         return cls(-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE))
 
     def beside_known(self, share: Array, known: Quantiles) -> Quantiles:
-        """Of a variance of which only a share is estimated: squares add up (after Cochran).
+        """Quantiles of a variance that is estimated in part: squares add up (after Cochran).
 
         It errs on the side of fewer alarms: a quarter of the stated ones if the shares are alike.
 
@@ -177,7 +177,7 @@ def _least_share(sources: ErrorSources | None) -> Array | float:
 
 
 def _unstated_error() -> Array:
-    """(6, 6) of the error that all frames share by a matcher that does not state it."""
+    """(6, 6) prior of the error that all frames share, for a matcher that states none."""
     usual = error_components().matchers[UNKNOWN]
     sigmas = pose_sigmas(
         rotation_rad=usual.systematic_rotation_rad, translation_m=usual.systematic_translation_m
@@ -186,14 +186,14 @@ def _unstated_error() -> Array:
 
 
 def has_too_few_frames(evidence: Evidence, name: str) -> bool:
-    """Whether a camera's error bar is none of its own frames, so that nothing can be told."""
+    """True if the covariance is not estimated from this camera's frames."""
     block = evidence.solution.inliers.blocks.get(name)
     few = block is not None and block.frames < ENOUGH_FRAMES
     return few and evidence.covariance_of(name) is not None
 
 
 def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
-    """Of a camera's error bar: of few frames' scatter, but for what is stated of shared errors."""
+    """Quantiles of a camera's error bar: Student's t for the scatter, normal for stated errors."""
     tail = tail_of_axis(len(evidence.cameras))
     known = Quantiles.of(np.inf, tail)
     block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
@@ -245,7 +245,7 @@ def judge_axes(
 
 
 def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
-    """What to do about axes that may be beyond the tolerance.
+    """Advice about axes that may be beyond the tolerance.
 
     Args:
         needed: (6,) the tolerance that these data could confirm, if nothing has changed.

@@ -26,7 +26,7 @@ _REACH_DEG, _REACH_CM = 0.7, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """What the rounds read.
+    """Input of the rounds of matching.
 
     Attributes:
         data: images and clouds.
@@ -49,7 +49,7 @@ class Matching:
 
 
 def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
-    """As few rounds as settle: the last tracking round, all of them, or after the first round.
+    """Match in as few rounds as settle: the last tracking round, all of these, or all rounds.
 
     Raises:
         CorrespondenceError: if no camera has enough correspondences.

@@ -1,4 +1,4 @@
-"""What the page of an audit shows of one camera: numbers, charts, points on an image."""
+"""One camera's section of an audit page: numbers, charts, points on an image."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Section:
-    """What the template prints of one camera.
+    """One camera's values for the template.
 
     Attributes:
         name: of the camera.

@@ -13,7 +13,7 @@ from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 
 
 class _Inputs(BaseModel):
-    """The key of a result's file that names what it was made from."""
+    """The inputs of a result, as its file names them."""
 
     inputs: dict[str, str] = {}
 

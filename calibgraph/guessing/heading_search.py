@@ -1,4 +1,4 @@
-"""The search for cameras of which nothing is known: over all headings, by images and clouds."""
+"""The search for cameras without any guess: over all headings, by images and clouds."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def search_headings(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> dict[str, FoundCamera]:
-    """Find cameras of which nothing is known but the lens, and that images are upright.
+    """Find cameras without a guess: only the lens is known, and that images are upright.
 
     One after another, over headings all round, each within 20 degrees and 1.5 m per axis of a level
     camera at the LiDAR. Those that are found place others that see the same.

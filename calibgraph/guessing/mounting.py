@@ -43,7 +43,7 @@ GRAMMAR = (
 _FORWARD_DEG: Mapping[Forward, float] = {"+x": 0.0, "+y": 90.0, "-x": 180.0, "-y": -90.0}
 
 WORD_SIGMAS = {"heading": 10.0, "tilt": 3.0, "roll": 3.0, "ahead": 0.8, "left": 0.4, "up": 0.9}
-"""Degrees and metres of what the words leave open: root mean squares over 21 cameras of 8 recorded
+"""Degrees and metres that the words leave open: root mean squares over 21 cameras of 8 recorded
 vehicles about the nearest of the eight headings, level and at the LiDAR (8.2, 2.0, 0.9 deg; 0.72,
 0.33, 0.85 m), rounded up."""
 SAID_DEG, SAID_M, SAID_SHARE = 5.0, 0.05, 0.1

@@ -1,8 +1,8 @@
 """Whether two clouds show the same place, and the motion between them, from the clouds alone.
 
-What stands upright is seen from above. The magnitude of that image's spectrum does not change with
-where the vehicle stands, so a correlation along its polar angle gives the heading (Fourier-Mellin),
-then one of the images the offset. ICP refines it, and upright points of both clouds must coincide.
+Upright structure is drawn as an image from above. The magnitude of its spectrum is invariant to the
+vehicle's position, so a correlation along its polar angle gives the heading (Fourier-Mellin), then
+one of the images the offset. ICP refines it, and upright points of both clouds must coincide.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class UprightCloud:
 
     @staticmethod
     def of(cloud: NDArray[np.floating]) -> UprightCloud:
-        """Of a cloud, (n, 3) or more columns [m], z up."""
+        """Extract upright structure from a cloud with (n, 3) or more columns [m], z up."""
         chosen = np.random.default_rng(0).random(len(cloud)) * len(cloud) < _MOST_POINTS
         points = _upright_points(np.asarray(cloud[chosen, :3], dtype=np.float64))
         image = _from_above(points)
@@ -115,7 +115,7 @@ def align_with_any(now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[in
 
 
 def _upright_points(points: Array) -> Array:
-    """Those above the ground in cells with points at several heights, one per voxel."""
+    """Points above the ground in cells with points at several heights, one per voxel."""
     ranges = np.hypot(points[:, 0], points[:, 1])
     near = (ranges > _LEAST_RANGE_M) & (ranges < _REACH_M) & (np.abs(points[:, 2]) < _HEIGHT_M)
     points = points[near]
@@ -201,6 +201,6 @@ def _share(target: UprightCloud, source: UprightCloud, T_target_source: Array) -
 
 
 def _some(points: NDArray[np.floating], most: int) -> Array:
-    """At most so many of (n, 3) points, evenly chosen."""
+    """An evenly spread selection of (n, 3) points."""
     rows = np.linspace(0, len(points) - 1, min(most, len(points)))
     return points[rows.astype(np.intp)].astype(np.float64)

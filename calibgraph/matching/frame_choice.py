@@ -1,4 +1,4 @@
-"""Which frames of a long recording are matched: of places apart, neither blurred nor dark."""
+"""Choose the frames of a long recording that are matched: distant places, sharp and bright."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
 
 CANDIDATES = 3
-"""Images are read of so many frames for each that is chosen: there is a clear one in three, unless
+"""Frames whose images are read, per chosen frame: there is a clear one in three, unless
 a lens is covered, and more would take longer than the matching."""
 
 
@@ -51,7 +51,7 @@ class _Candidate:
 
 
 def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
-    """At most so many frames, spread over the recording; all of them if there are no more.
+    """Choose frames spread over the recording; all of them if there are no more.
 
     While the vehicle stands, one is taken. Of neighbours, that with the clearest images is: the
     largest product over the cameras of their images' mean gradient.

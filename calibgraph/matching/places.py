@@ -2,7 +2,7 @@
 
 The motion from one frame to the next follows from features of a camera's images that both see,
 with depths from the cloud: robust PnP, in metres, without odometry; or from the two clouds. Who
-comes back to a place, in whatever direction, is recognised by the cloud of the place's first frame.
+returns to a place, in any direction, is recognised by the cloud of the place's first frame.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class PlaceWalk:
         return self._first
 
     def remember(self, frame: Frame) -> None:
-        """Know the place of which this is the first frame."""
+        """Register a place by its first frame."""
         self._visit(frame.index, _upright_cloud(frame))
 
     def _find_place(self, frame: Frame, *, left: int | None = None, may_stay: bool = False) -> None:
@@ -124,7 +124,7 @@ def _are_comparable(before: Frame, now: Frame) -> bool:
 
 
 def _upright_cloud(frame: Frame) -> UprightCloud | None:
-    """What stands in a frame's cloud; None if it cannot be read, which the matcher reports."""
+    """The upright structure of a frame's cloud; None if unreadable, which the matcher reports."""
     try:
         return frame.derive("upright", lambda: UprightCloud.of(frame.load_cloud()))
     except (CalibrationError, OSError):
@@ -151,7 +151,7 @@ class PlaceFinder:
         self._before: _SeenFrame | None = None
 
     def remember(self, frame: Frame) -> None:
-        """Know the place of which this is the first frame, without being there."""
+        """Register a place by its first frame, without moving to it."""
         self._walk.remember(frame)
 
     def first_of_place(self, frame: Frame) -> int:
@@ -211,7 +211,7 @@ def _motion(
     lens: Camera,
     seed: int,
 ) -> Motion:
-    """From features of the earlier frame with depth to where the later one sees them."""
+    """Matches of the earlier frame's features that have depth to the later frame's pixels."""
     (frame, before), (_, after) = both
     if before is None or after is None:
         return None

@@ -1,10 +1,10 @@
 """The matcher protocol: three members that every matcher has, and five more that it may have.
 
-`Matcher` is what a matcher of your own needs. The program works with `FullMatcher`, which has every
-member; `to_full_matcher` adds the defaults of those that are missing. In calibration they are used
-in this order:
+`Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
+members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
+order:
 
-1. `most_frames`: so many frames of the dataset are used.
+1. `most_frames`: the largest number of frames that is used.
 2. `locate`: from where the rounds begin, and with which round.
 3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
 4. `tracking_rounds`: run again from a start displaced from the result.
@@ -42,7 +42,7 @@ class Start:
 
 
 class Matcher(Protocol):
-    """Finds correspondences: the least that a matcher of your own needs.
+    """Finds correspondences: the required members of a matcher.
 
     The members of :class:`FullMatcher` are optional. A class attribute, an attribute or a property
     will do for each member but ``match``.
@@ -114,7 +114,7 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     def release(self) -> None:
-        """Drop what is kept from round to round; by default, nothing is."""
+        """Release memory that is kept between rounds; does nothing by default."""
         ...
 
 
@@ -150,7 +150,7 @@ class MatcherWithDefaults:
         return replace(table, metadata={STAGE1: self.stage1, **table.metadata})
 
     def release(self) -> None:
-        """Drop what the matcher keeps from round to round."""
+        """Release the memory that the matcher keeps between rounds."""
         if self._release is not None:
             self._release()
 

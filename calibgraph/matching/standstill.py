@@ -44,7 +44,7 @@ class View:
 
     @staticmethod
     def of(gray: Gray) -> View:
-        """Of a (height, width) image as recorded."""
+        """Prepare a (height, width) image as recorded."""
         size = (gray.shape[1] // _SCALE, gray.shape[0] // _SCALE)
         image = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         thumb = cv2.resize(image, _THUMB, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()

@@ -178,7 +178,7 @@ class Calibration:
 
     @property
     def not_included(self) -> str:
-        """What the error bars leave out, in words: relative poses show the scale of the clouds."""
+        """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         if self.rig.relative_poses:
             return "errors of the intrinsics are not included"
         return "errors of the intrinsics, and of the clouds' scale, are not included"

@@ -49,7 +49,7 @@ def perturb_extrinsics(
     seed: int = 0,
     uniform: bool = False,
 ) -> dict[str, Array]:
-    """As :func:`perturb`, of (4, 4) T_camera_lidar by camera."""
+    """Like :func:`perturb`, for (4, 4) T_camera_lidar by camera."""
     if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
         raise ValueError(
             f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "

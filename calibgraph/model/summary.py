@@ -1,4 +1,4 @@
-"""A verdict for people: at most three reasons by their causes, and what to do; the rest folded.
+"""A verdict for people: at most three reasons by their causes, and actions; the rest folded.
 
 Terminal, report, service, fleet and files show the same :class:`Summary`.
 """
@@ -114,7 +114,7 @@ def summarize(
 def _with_action_for(
     reason: Reason, sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]
 ) -> Reason:
-    """With what would shrink the largest error bar of its cameras, if that is the reason."""
+    """The reason with the action that shrinks the largest error bar, if the bar is the reason."""
     known = [sources[name] for name in reason.cameras if name in sources]
     if CAUSES[reason.cause].action or not known:
         return reason
@@ -136,7 +136,7 @@ def _rank(reason: Reason) -> tuple[int, int]:
 
 
 def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
-    """Those of how much the data determine before others, and the first named as such."""
+    """Reasons about too little data before others, the first marked "cannot tell"."""
     first, *others = sorted(reasons, key=lambda reason: reason.cause not in _OF_DATA)
     text = f"{_CANNOT_TELL}{first.text.removeprefix(_CANNOT_TELL)}"
     return [replace(first, text=text), *others]
@@ -152,7 +152,7 @@ def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
 
 
 def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """That the error bar is too wide for the tolerance, of the cameras where nothing is odd."""
+    """The reason that the error bar is too wide for the tolerance, with its cameras."""
     found = {
         n: v.error_probability
         for n, v in verdicts.items()
@@ -166,7 +166,7 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
 
 
 def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
-    """How probable it is that cameras are off, the worst first, in one sentence."""
+    """The probabilities that cameras are off, the worst first, in one sentence."""
     found = {
         n: v.error_probability
         for n, v in verdicts.items()
@@ -192,7 +192,7 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
 
 
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """Of cameras that may be off though all their checks are PASS, the check nearest its limit."""
+    """The check nearest its limit, of cameras that may be off though all their checks PASS."""
     doubtful = {
         n: v
         for n, v in verdicts.items()

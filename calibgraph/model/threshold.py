@@ -29,7 +29,7 @@ class Threshold:
         question: what the check answers, in words.
         reason: why these limits: what they mean, or the data that they were read from.
         advice: the meaning if it is not PASS; for what to do, see ``model.causes``.
-        of_tolerance: whether the limits are for the usual tolerance, and follow another one.
+        of_tolerance: whether the limits are for the default tolerance, and scale with another one.
     """
 
     key: str
@@ -46,7 +46,7 @@ class Threshold:
     def at(self, tolerance: tuple[float, float]) -> Threshold:
         """The row for a tolerance [deg, cm].
 
-        A tolerance below the usual one moves the limit of PASS alone: an error of that size is too
+        A tolerance below the default moves the limit of PASS alone: an error of that size is too
         large for the user, but no sign of a wrong result.
         """
         if not self.of_tolerance:

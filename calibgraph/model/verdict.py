@@ -32,7 +32,7 @@ ABOUT_THE_DATA = frozenset(
         "terms",
     }
 )
-"""Kinds of checks of how much the data determine: beyond a limit, nothing seems wrong yet."""
+"""Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
 _SURE = 0.99
 
 
@@ -48,7 +48,7 @@ class Check:
         warn: the limit of PASS, which itself passes, if there is one.
         fail: the limit of WARN, which itself does not fail, if there is one.
         unit: of value, warn and fail.
-        kind: what it is of, the same for all cameras and numbers; the name if it is empty.
+        kind: the same for all cameras and numbers; the name if it is empty.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Check:
 
 
 def _between(value: float, warn: float, fail: float) -> float:
-    """Where a value is: below 1 before the limit of PASS, 2 at that of WARN, 3 far beyond it.
+    """Severity of a value: below 1 before the PASS limit, 2 at the WARN limit, 3 far beyond it.
 
     Which side is good is seen from the limits; of equal ones, or of one without a FAIL limit, the
     share of the first limit counts.
@@ -109,7 +109,7 @@ def _share(part: float, whole: float) -> float:
 
 @dataclass(frozen=True)
 class ErrorProbability:
-    """The probability that a result is off by more than what the user tolerates, two ways.
+    """The probability that a result is off by more than the tolerance, from two sources.
 
     Attributes:
         by_checks: that it is grossly wrong.
@@ -125,7 +125,7 @@ class ErrorProbability:
 
     @property
     def probability(self) -> float:
-        """Of either."""
+        """The probability of either."""
         return 1.0 - (1.0 - self.by_checks) * (1.0 - self.by_error_bar)
 
     @property
@@ -154,7 +154,7 @@ class ErrorProbability:
 
     @property
     def sentence(self) -> str:
-        """What it is the probability of, without the number."""
+        """The event that the probability is about, without the number."""
         return f"off by more than {self.tolerated} with a probability"
 
     @property
@@ -164,7 +164,7 @@ class ErrorProbability:
 
     @property
     def advice(self) -> str:
-        """That the data cannot tell more; empty if something seems wrong."""
+        """The note that the data cannot tell more; empty if something seems wrong."""
         if not self.of_error_bar:
             return ""
         return ": cannot tell, by the error bar"
@@ -235,7 +235,7 @@ class Verdict:
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: that of its worst camera, with the checks of all, by their names."""
+    """The verdict of a rig: its worst camera's, with the checks of all, by their names."""
     checks = tuple(
         replace(check, text=f"{name}: {check.text}")
         for name, verdict in cameras.items()

@@ -32,7 +32,7 @@ class Lidar:
         ring_spread: standard deviation of the beams' gains, about 1.
         dropout: share of shots that are lost at random.
         weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
-        errors: none, or those of a real sensor.
+        errors: of the sensor; none for an ideal one.
     """
 
     elevations_deg: tuple[float, ...]

@@ -13,7 +13,7 @@ from calibgraph.model.rig import Camera, Intrinsics, Rig
 Array = NDArray[np.float64]
 
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Rotation of a camera that looks along the LiDAR's x axis, z of which is up."""
+"""Rotation of a camera that looks along the LiDAR's x axis; the LiDAR's z axis is up."""
 
 
 def rig_of(name: str) -> Rig:

@@ -67,7 +67,7 @@ _KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What streets may differ in; by default, all are laid out alike.
+    """The layout of a street; by default all streets have the same.
 
     Attributes:
         width: factor of all distances across: of lanes, kerbs, pavements, houses' fronts.

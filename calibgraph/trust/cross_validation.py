@@ -34,7 +34,7 @@ _MISSED = 1e-6  # probability that no sample of a competing solution large enoug
 
 
 def held_out_checks(evidence: Evidence) -> Checks:
-    """The error of frames that a solution was not fitted to, over that of those it was."""
+    """Ratio of the error of held-out frames to the error of fitted frames."""
     row = threshold("held_out")
     return {
         name: [row.check(_held_out_ratio(block, evidence.halves[name], evidence.even_frames))]
@@ -46,7 +46,7 @@ def held_out_checks(evidence: Evidence) -> Checks:
 def _held_out_ratio(
     block: CameraBlock, halves: tuple[Array, Array], even_frames: NDArray[np.int64]
 ) -> float:
-    """The median error of held-out frames over that of fitted ones.
+    """Ratio of the median error of held-out frames to the median error of fitted frames.
 
     Args:
         block: a camera's matches, not only those within the gate.
@@ -89,7 +89,7 @@ def restart_checks(evidence: Evidence) -> Checks:
 
 @cache
 def _displacements(cameras: int) -> list[list[Array]]:
-    """Per restart, the (4, 4) T_delta of so many cameras."""
+    """Per restart, the (4, 4) T_delta of each camera."""
     unmoved = {str(camera): np.eye(4) for camera in range(cameras)}
     return [
         [
@@ -182,7 +182,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
 
 
 def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
-    """A camera's matches, also those of the frames that are left out: they may agree elsewhere."""
+    """All matches of a camera, outlier frames included: they may agree on another pose."""
     if not solution.counts[camera]["outlier_frames"]:
         return solution.objective.blocks[camera]
     rows = solution.correspondences.of_camera(camera)

@@ -1,4 +1,4 @@
-"""What several checks share, each computed once, when the first check needs it."""
+"""The values that checks share, each computed once, when the first check needs it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class DataOnly:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A solution and what its checks compute from it.
+    """A solution and the values that its checks compute from it.
 
     Attributes:
         solution: of the joint solve.
@@ -79,7 +79,7 @@ class Evidence:
 
     @property
     def of_correspondences(self) -> Evidence:
-        """The same of the solution without what cameras see in common."""
+        """The evidence of the solution without camera-to-camera matches."""
         return self if self.solution.before_pairs is None else self._without_pairs
 
     @cached_property
@@ -88,7 +88,7 @@ class Evidence:
 
     @property
     def findings(self) -> MatcherFindings:
-        """What the matcher reported."""
+        """The findings of the matcher."""
         return self.solution.correspondences.findings
 
     @cached_property
@@ -108,7 +108,7 @@ class Evidence:
 
     @cached_property
     def curvature(self) -> Curvature:
-        """Of all terms at the solution."""
+        """The curvature of all terms at the solution."""
         solution = self.solution
         return curvature_at(
             solution.inliers, solution.T_camera_lidar, self.robust_hessians, solution.held
@@ -200,7 +200,7 @@ class Evidence:
 
     @cached_property
     def shared_variance_ratio(self) -> float:
-        """Variance of the shared error over its usual one, by what cameras see in common."""
+        """Variance of the shared error relative to its prior, from co-visible features."""
         own = self.of_correspondences
         if own is self or own.joint_covariance is None:
             return 1.0
@@ -210,7 +210,7 @@ class Evidence:
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
-        """Where the images place pairs of cameras, the first of each held near the solution."""
+        """The relative poses of pairs by images, the first camera held near the solution."""
         matches = self.solution.camera_matches
         if matches is None:
             return []
@@ -219,7 +219,7 @@ class Evidence:
 
     @cached_property
     def pair_covariance(self) -> Array:
-        """(6 N, 6 N) of the solution; where it is not determined, of what is usual."""
+        """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
         if self.joint_covariance is not None:
             return self.joint_covariance
         held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
@@ -228,7 +228,7 @@ class Evidence:
     def _shared(
         self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
     ) -> Array:
-        """(6 N, 6 N) covariance of a solution by the error that all frames share, if as usual."""
+        """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
         places = self.solution.correspondences.places
         repeats = {
             name: places.frames_per_place(block.frame_numbers)
@@ -334,7 +334,7 @@ class Evidence:
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
-        """Of the relative poses between cameras that both have correspondences."""
+        """The factors of relative poses between cameras that both have correspondences."""
         if self.data_only is None:
             return ()
         T_camera_lidar, covariance = self.data_only.T_camera_lidar, self.data_only.covariance
@@ -363,7 +363,7 @@ class Evidence:
         return pose_difference(joint, own)
 
     def estimate(self, camera: str) -> Estimate:
-        """What the checks of one camera's estimate need."""
+        """The input of the checks of one camera's estimate."""
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
         sigmas = self.data_sigmas
         return Estimate(
@@ -400,7 +400,7 @@ class RunEvidence:
 
     @cached_property
     def solution(self) -> Evidence:
-        """Of the solution of the last round."""
+        """The evidence of the last round's solution."""
         return Evidence(self.run.solution, self.run.guess)
 
 

@@ -1,4 +1,4 @@
-"""Image evidence: what a second pass over images and clouds shows about a result.
+"""Image evidence: a second pass over images and clouds tests a result.
 
 Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`:
 
@@ -116,7 +116,7 @@ def _measure_camera(
 
 
 def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
-    """Compare the score at the result with those of displaced poses, over the same windows."""
+    """Compare the score at the result with displaced poses, over the same windows."""
     frames, per_frame = score_displaced(scores)
     best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
     return {

@@ -1,4 +1,4 @@
-"""What is seen of a dataset and its guess in a moment, before anything is matched."""
+"""Quick checks of a dataset and its guess, before anything is matched."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def explain_guess(data: Dataset, rig: Rig, cloud: Cloud) -> str | None:
 
 
 def count_points_in_view(rig: Rig, cloud: Cloud) -> dict[str, int]:
-    """By camera, how many points of a cloud lie in the image by the guess."""
+    """Per camera, the number of cloud points in the image at the guess."""
     return {name: _count_seen(camera, cloud) for name, camera in rig.cameras.items()}
 
 
@@ -97,7 +97,7 @@ def _count_seen(camera: Camera, cloud: Cloud) -> int:
 
 
 def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
-    """A line per camera of whose view the cloud is out, by :func:`count_points_in_view`."""
+    """A line per camera without cloud points in view, by :func:`count_points_in_view`."""
     return [
         f"{name}: by the guess, no point of the cloud lies in the image"
         for name, count in in_view.items()

@@ -1,4 +1,4 @@
-"""Clouds that hold the same surfaces twice, some way apart: joined with a wrong extrinsic."""
+"""Clouds that hold the same surfaces twice, displaced: joined with a wrong extrinsic."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _EXPLAINED = 3.0  # root mean square of the motion along the normals, over what 
 
 
 def displacement_of_parts(points_m: NDArray[np.floating]) -> tuple[float, float] | None:
-    """How far apart two parts of a cloud show the same surfaces: degrees and metres.
+    """Displacement of two parts of a cloud that show the same surfaces: degrees and metres.
 
     Args:
         points_m: (n, >= 3) x y z, in the order of the file.
@@ -74,7 +74,7 @@ def _register(target: Array, source: Array) -> Array | None:
 
 
 def _spread_m(offsets_m: Array) -> float:
-    """Their robust standard deviation, at least that of a good LiDAR."""
+    """The robust standard deviation of distances, at least the noise of a good LiDAR."""
     return max(_LEAST_M, 1.5 * float(np.median(np.abs(offsets_m))))
 
 

@@ -1,4 +1,4 @@
-"""Whether two cameras' relative pose from their images agrees with that of the calibration."""
+"""Whether two cameras' relative pose from their images agrees with the calibration."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from calibgraph.trust.thresholds import threshold
 Array = NDArray[np.float64]
 
 BLAME_SIGMAS = 1.0
-"""By so much more the one camera of a pair must disagree with its other neighbours than the other
+"""Factor by which one camera of a pair must disagree more with its other neighbours than the other
 one with its own, to be taken for the one that is wrong."""
 
 
 @dataclass(frozen=True)
 class PairAgreement:
-    """The relative pose of two cameras from images against that of a calibration.
+    """The relative pose of two cameras from images against the calibration.
 
     Attributes:
         a: the one camera.
@@ -86,7 +86,7 @@ def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairA
 
 
 def _elsewhere(camera: str, pair: PairAgreement, found: Sequence[PairAgreement]) -> float:
-    """By how many sigmas a camera disagrees with others than that of a pair; 0 without others."""
+    """Sigmas by which a camera disagrees with the cameras outside a pair; 0 without others."""
     others = [one for one in found if one is not pair and camera in (one.a, one.b)]
     return max((one.sigmas for one in others), default=0.0)
 

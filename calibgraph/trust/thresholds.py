@@ -208,7 +208,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides whether a check counts, or what it is compared with.
+    """A number that decides whether a check counts, or that it is compared with.
 
     Attributes:
         key: by which checks look it up.

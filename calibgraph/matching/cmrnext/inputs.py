@@ -141,7 +141,7 @@ class LidarImage:
         )
 
     def without_occluded(self) -> LidarImage:
-        """Without points that have nearer points in all four quadrants around them."""
+        """The points without those that have nearer points in all four quadrants around them."""
         radius = _OCCLUDER_RADIUS_PX
         depth = self.rasterize(self.depth_m)
         depth[depth == 0] = np.inf

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable
 
 FALSE_ACCEPTANCE = 1e-3
-"""Share of cameras with nothing to find of which a pose may be accepted."""
+"""Accepted share of wrong poses, among cameras whose true pose is out of reach."""
 
 PRIOR_LOCATION, PRIOR_SIGMA, SCALE = 5.7, 3.0, 0.92
 """Of the best z-score of a search for one roll: mean and standard deviation over scenes of the
@@ -27,7 +27,7 @@ raises it by half the variance over the scale."""
 
 
 def least_z_score(tries: float) -> float:
-    """From which z-score on a pose is accepted."""
+    """The smallest z-score of an accepted pose."""
     return _LOCATION + SCALE * math.log(tries / FALSE_ACCEPTANCE)
 
 

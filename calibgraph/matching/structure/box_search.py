@@ -82,7 +82,7 @@ class BodyMaps:
     T_camera_lead: Sequence[Array]
 
     def blur(self, sigma_cells: float, every: int = 1) -> BodyMaps:
-        """With maps blurred, of only every so many rows and columns."""
+        """The body with its maps blurred and subsampled."""
         return replace(self, maps=[maps.blur(sigma_cells, every) for maps in self.maps])
 
     def z_scores(self, T_lead_lidar: Array) -> Array:

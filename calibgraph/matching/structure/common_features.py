@@ -1,4 +1,4 @@
-"""What the cameras of a rig see in common in the frames of a search, and where that places them."""
+"""Co-visible features of a rig's cameras in the frames of a search, and the poses they imply."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class CorrelationMaps:
         return np.asarray(np.array(squares) / self.maps[0].size - np.array(means) ** 2)
 
     def blur(self, sigma_cells: float, every: int = 1) -> CorrelationMaps:
-        """Blur the maps by a Gaussian, and keep only every so many rows and columns."""
+        """Blur the maps by a Gaussian and subsample their rows and columns."""
         maps = [cv2.GaussianBlur(m, (0, 0), sigma_cells)[::every, ::every] for m in self.maps]
         step_rad = every * self.step_rad
         return CorrelationMaps(np.stack(maps), self.points_lidar_m, self.origin_rad, step_rad)

@@ -149,7 +149,7 @@ class StructureMatcher:
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
 
     def _require_structure(self, cache: FrameCache, frames: Sequence[Frame], rig: Rig) -> None:
-        """Refuse clouds none of which has enough windows."""
+        """Raise if no cloud has enough windows."""
         camera, finest = next(iter(rig.cameras.values())), self.levels[-1]
         spacings = finest.spacing_rad, finest.stride_spacings
         most, best = -1, frames[0]
@@ -170,7 +170,7 @@ class StructureMatcher:
         self._cache = FrameCache()
 
     def _cache_of(self, dataset: Dataset) -> FrameCache:
-        """Of a dataset's frames, and no others."""
+        """The caches of this dataset's frames alone."""
         cache = cache_of(dataset.frames, self._cache)
         cache.keep_only(dataset.frames)
         return cache

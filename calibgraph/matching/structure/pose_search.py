@@ -70,7 +70,7 @@ class PoseSearch:
         return CommonFeatures(self.rig, self._frames, seed=self._seed)
 
     def near(self, body: Body) -> Candidate:
-        """The body about its guess, refined on: from there, and from what an approach leads to."""
+        """Refine the body from its guess, and from the best pose of a coarse approach."""
         direct = refine(self._frames, body)
         if direct.is_beyond_doubt or self.out_of_time():
             return direct
