@@ -63,49 +63,18 @@ class Threshold:
 
     def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
         """The check of a value."""
-        build = at_most if self.direction == "at most" else at_least
-        limits = (self.warn, self.fail, self.unit)
-        return build(name or self.name, value, *limits, advice or self.advice, self.key)
+        status, name, meaning = self.grade(value), name or self.name, advice or self.advice
+        limit = self.fail if status == "FAIL" else self.warn
+        text = f"{name} {beside(value, limit, self.unit)}"
+        if status != "PASS":
+            side = "above" if self.direction == "at most" else "below"
+            text += f" is {side} {in_unit(limit, self.unit)}" + (f": {meaning}" if meaning else "")
+        return self.describe(float(value), status, text, name=name)
 
     def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
         """A check whose sentence, and perhaps status, depend on more than the value."""
         limits = (self.warn, self.fail, self.unit)
         return Check(name or self.name, status, text, value, *limits, kind=self.key)
-
-
-def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
-) -> Check:
-    """A check that a number is at most its limits; NaN fails."""
-    status = grade(not value <= warn, not value <= fail)
-    return _measured(name, status, "above", value, warn, fail, unit, advice, kind)
-
-
-def at_least(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
-) -> Check:
-    """A check that a number is at least its limits; NaN fails. Arguments as of `at_most`."""
-    status = grade(not value >= warn, not value >= fail)
-    return _measured(name, status, "below", value, warn, fail, unit, advice, kind)
-
-
-def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
-    name: str,
-    status: Status,
-    side: str,
-    value: float,
-    warn: float,
-    fail: float,
-    unit: str,
-    advice: str,
-    kind: str,
-) -> Check:
-    limit = fail if status == "FAIL" else warn
-    text = f"{name} {beside(value, limit, unit)}"
-    if status != "PASS":
-        text += f" is {side} {in_unit(limit, unit)}"
-        text += f": {advice}" if advice else ""
-    return Check(name, status, text, float(value), warn, fail, unit, kind)
 
 
 def is_reachable(limit: float, unit: str, direction: Direction) -> bool:

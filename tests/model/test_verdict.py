@@ -1,37 +1,53 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from calibgraph import Check, Verdict
-from calibgraph.model.threshold import at_least, at_most, beside, in_unit
+from calibgraph.model.threshold import Direction, Threshold, beside, in_unit
 from calibgraph.model.verdict import ABOUT_THE_DATA, COMMON_ERROR, ErrorProbability, rig_verdict
 from calibgraph.trust.thresholds import threshold
 
 
+def check_of(
+    name: str, value: float, direction: Direction, *limits: float, unit: str = ""
+) -> Check:
+    return Threshold(name, name, direction, *limits, unit, "", "").check(value)
+
+
 def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
     verdict = Verdict(
-        (at_most("a", 2, 1, 3, "m"), at_most("b", 0, 1, 3, "m"), at_least("c", 0, 2, 1, ""))
+        (
+            check_of("a", 2, "at most", 1, 3, unit="m"),
+            check_of("b", 0, "at most", 1, 3, unit="m"),
+            check_of("c", 0, "at least", 2, 1),
+        )
     )
     assert verdict.status == "FAIL"
     assert [reason[0] for reason in verdict.reasons] == ["c", "a"]
     assert rig_verdict({"front": verdict}).reasons[0] == "front: c 0 is below 1"
 
 
-@pytest.mark.parametrize("check", [at_most, at_least])
-def test_nan_fails(check: Callable[..., Check]) -> None:
-    assert check("a", float("nan"), 1, 2, "m").status == "FAIL"
+@pytest.mark.parametrize("direction", ["at most", "at least"])
+def test_nan_fails(direction: Direction) -> None:
+    assert check_of("a", float("nan"), direction, 1, 2, unit="m").status == "FAIL"
 
 
 def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
-    assert at_least("kept", 0.59999, 0.6, 0.3, "share").text == "kept 59.9% is below 60%"
-    assert at_most("x", 0.150057698, 0.15, 0.5, "deg").text == "x 0.151 deg is above 0.15 deg"
-    assert at_most("x", 0.2, 0.15, 0.5, "deg").text == "x 0.2 deg is above 0.15 deg"
+    assert (
+        check_of("kept", 0.59999, "at least", 0.6, 0.3, unit="share").text
+        == "kept 59.9% is below 60%"
+    )
+    assert (
+        check_of("x", 0.150057698, "at most", 0.15, 0.5, unit="deg").text
+        == "x 0.151 deg is above 0.15 deg"
+    )
+    assert (
+        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text == "x 0.2 deg is above 0.15 deg"
+    )
     assert beside(0.14999, 0.15, "deg") == "0.149 deg"
     assert beside(-0.2001, -0.2, "share") == "-20.1%"
-    assert at_most("x", 1.0, 1.0, 2.0, "m").status == "PASS"
+    assert check_of("x", 1.0, "at most", 1.0, 2.0, unit="m").status == "PASS"
 
 
 @pytest.mark.parametrize("seed", range(20))
