@@ -64,7 +64,7 @@ def calibrate(
     """
     report = progress or no_progress
     run = match_in_rounds(                                   # match -> solve_joint, in rounds
-        dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
+        dataset, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
     )  # fmt: skip
     run = refine_with_camera_pairs(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):

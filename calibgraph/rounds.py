@@ -55,8 +55,8 @@ def match_in_rounds(
     rig: Rig | None = None,
     matcher: AnyMatcher = "structure",
     config: Config | None = None,
-    terms: Terms = "full",
     *,
+    terms: Terms = "full",
     time_limit_s: float | None = None,
     progress: Progress,
 ) -> MatchingRun:
@@ -81,7 +81,7 @@ def match_in_rounds(
             table = full.match(data, estimate, round_index=index, progress=progress)
             table = replace(table, metadata={**table.metadata, **found}).with_places(places)
         with watch("solve"):
-            solution = _solve(data, guess, (estimate, table), config, terms)
+            solution = _solve(data, guess, (estimate, table), config, terms=terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
         _log.info("round %d: %s", index, _in_words(rounds[-1]))
         estimate = solution.solved_rig
@@ -162,6 +162,7 @@ def _solve(
     guess: Rig,
     matched: tuple[Rig, Correspondences],
     config: Config,
+    *,
     terms: Terms,
 ) -> Solution:
     """The joint solve; where there is too little to solve from, with a hint about the guess.

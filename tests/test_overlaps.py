@@ -37,7 +37,7 @@ def table_of(seen: Rig, missed: dict[str, float] | None = None) -> Correspondenc
 
 
 def matched(data: Dataset, table: Correspondences, terms: Terms = "full") -> MatchingRun:
-    return match_in_rounds(data, data.rig, table, Config(), terms, progress=no_progress)
+    return match_in_rounds(data, data.rig, table, Config(), terms=terms, progress=no_progress)
 
 
 def pair_error(rig: Rig, truth: Rig) -> tuple[float, float]:

@@ -40,6 +40,7 @@ def cluster_robust_covariance(
     T_camera_lidar: Transforms,
     scales: Scales,
     curvature: Curvature,
+    *,
     held: Sequence[str] = (),
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few + M) H^-1``.

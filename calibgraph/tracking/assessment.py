@@ -41,7 +41,7 @@ class Assessment:
 
 
 def assess(
-    state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces, priors: Priors
+    state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces, *, priors: Priors
 ) -> Assessment:
     """Assess the present estimates.
 
@@ -163,7 +163,7 @@ def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
     halves = SplitHalf.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, ClosedPlaces.of(state), Priors.of(state))
+    assessment = assess(state, sums, halves, ClosedPlaces.of(state), priors=Priors.of(state))
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

@@ -174,7 +174,7 @@ class IncrementalCalibrator:
         events += seen + self._restart_after_step()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
-        return make_update(self._state, self.rig, self._assess(), tuple(events), used)
+        return make_update(self._state, self.rig, self._assess(), tuple(events), used=used)
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
@@ -182,7 +182,7 @@ class IncrementalCalibrator:
         if self._assessed is None or self._assessed[0] is not state:
             sums, halves = with_open_epoch(self._closed, state), self._closed_halves
             halves = halves.add(state.epochs[-1].frames)
-            found = assess(state, sums, halves, self._closed_places, self._priors)
+            found = assess(state, sums, halves, self._closed_places, priors=self._priors)
             self._assessed = state, found
         return self._assessed[1]
 

@@ -62,12 +62,7 @@ class DataOnly:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A solution and the values that its checks compute from it.
-
-    Attributes:
-        solution: of the joint solve.
-        guess: the rig as it was first guessed.
-    """
+    """A solution, the first guess, and the values that checks compute from them."""
 
     solution: Solution
     guess: Rig
@@ -123,7 +118,7 @@ class Evidence:
             solution.T_camera_lidar,
             solution.scales,
             self.curvature,
-            solution.held,
+            held=solution.held,
         )
 
     @cached_property
@@ -386,13 +381,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """All rounds of matching and solving, and the files they read.
-
-    Attributes:
-        run: the outcome of the rounds.
-        hashes: SHA-256 of the files, by path.
-        progress: called as the images are checked.
-    """
+    """All rounds of matching and solving, and the SHA-256 of the files they read."""
 
     run: MatchingRun
     hashes: Mapping[str, str]
