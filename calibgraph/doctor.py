@@ -90,7 +90,7 @@ def diagnose(
         ValueError: if the options do not fit.
     """
     findings: list[Finding] = []
-    data = _load(folders, rig, frames, bag, findings)
+    data = _load(folders, rig, frames, bag, findings=findings)
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
@@ -116,6 +116,7 @@ def _load(
     rig: Rig | None,
     frames: str | None,
     bag: BagOptions | None,
+    *,
     findings: list[Finding],
 ) -> Dataset | None:
     """The dataset, without frames that do not pair up; None if there is none."""

@@ -81,7 +81,9 @@ def drift(
     found = {name: _compare_camera(loaded, name, limits) for name in cameras}
     compared = {name: each for name, each in found.items() if each is not None}
     judged = {
-        name: _judge_camera([*opened], loaded, name, compared.get(name), limits, tolerance)
+        name: _judge_camera(
+            [*opened], loaded, name, compared.get(name), limits=limits, tolerance=tolerance
+        )
         for name in cameras
     }
     unit = "result" if days is None else "day"
@@ -91,7 +93,7 @@ def drift(
         at=at,
         cameras=judged,
         trends={name: trend for name, trend in trends.items() if trend is not None},
-        lidar=tuple(_lidar(place, loaded, compared, judged, limits)
+        lidar=tuple(_lidar(place, loaded, compared, judged, limits=limits)
                     for place in range(len(loaded))),
         tolerance_deg=tolerance_deg,
         tolerance_cm=tolerance_cm,
@@ -138,6 +140,7 @@ def _judge_camera(
     results: list[Calibration],
     camera: str,
     found: Deviations | None,
+    *,
     limits: Limits,
     tolerance: Tolerance,
 ) -> tuple[CameraDrift, ...]:
@@ -210,6 +213,7 @@ def _lidar(
     results: list[Calibration],
     compared: dict[str, Deviations],
     judged: dict[str, tuple[CameraDrift, ...]],
+    *,
     limits: Limits,
 ) -> LidarAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate, if one does."""
@@ -225,7 +229,9 @@ def _lidar(
     deviation = np.concatenate([each.deviation[row] for each, row in parts])
     freedom = np.min([each.freedom[row] for each, row in parts])
     bases = [each.poses.base for each in seen.values()]
-    return find_lidar_motion(deviation, covariance, bases, moved, float(limits.sigmas(freedom)))
+    return find_lidar_motion(
+        deviation, covariance, bases, moved=moved, quantile=float(limits.sigmas(freedom))
+    )
 
 
 def _joint_covariance(

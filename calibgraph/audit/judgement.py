@@ -245,13 +245,7 @@ def judge_axes(
 
 
 def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
-    """Advice about axes that may be beyond the tolerance.
-
-    Args:
-        needed: (6,) the tolerance that these data could confirm, if nothing has changed.
-        blind: (6,) which axes need more than the tolerance.
-        recording_helps: whether enough frames would do.
-    """
+    """Advice about axes that may be beyond the tolerance."""
     if not blind.any():
         return "too near to the tolerance to decide: check another recording, of other places"
     enough = f"{np.degrees(needed[:3].max()):.2g} deg and {100 * needed[3:].max():.2g} cm"
@@ -273,13 +267,16 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
     deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
     T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
     quantile = float(ndtri(1 - tail_of_axis(len(cameras))))
-    return find_lidar_motion(deviation, evidence.joint_covariance, T_camera_lidar, wrong, quantile)
+    return find_lidar_motion(
+        deviation, evidence.joint_covariance, T_camera_lidar, moved=wrong, quantile=quantile
+    )
 
 
 def find_lidar_motion(
     deviation: Array,
     covariance: Array,
     T_camera_lidar: Sequence[Array],
+    *,
     moved: Collection[int],
     quantile: float,
 ) -> LidarAudit | None:

@@ -26,15 +26,7 @@ _REACH_DEG, _REACH_CM = 0.7, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Input of the rounds of matching.
-
-    Attributes:
-        data: images and clouds.
-        deployed: the rig that the rounds begin at.
-        matcher: its search is not used.
-        config: of the solves.
-        progress: called as the work goes on.
-    """
+    """Input of the rounds of matching."""
 
     data: Dataset
     deployed: Rig

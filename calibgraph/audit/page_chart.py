@@ -102,7 +102,7 @@ def _chart(
     return Chart(
         title=f"{title} [{unit}]",
         bars=tuple(
-            _bar(name, k, values[k], reach, _style(camera, values[k, 0], tolerance))
+            _bar(name, k, values[k], reach, style=_style(camera, values[k, 0], tolerance))
             for k, name in enumerate(names)
         ),
         tolerance=(_MIDDLE - band, _MIDDLE + band),
@@ -117,16 +117,8 @@ def _style(camera: CameraAudit, deviation: float, tolerance: float) -> str:
     return "beyond" if abs(deviation) > tolerance else "within"
 
 
-def _bar(name: str, row: int, values: Array, reach: float, style: str) -> Bar:
-    """The bar of an axis.
-
-    Args:
-        name: of the axis.
-        row: of the chart, from above.
-        values: (3,) deviation, sigma and smallest detectable change; NaN where unknown.
-        reach: value at the end of the axis.
-        style: of the bar.
-    """
+def _bar(name: str, row: int, values: Array, reach: float, *, style: str) -> Bar:
+    """The bar of an axis."""
     deviation, sigma, detectable = values * _HALF / reach
     x, known = _MIDDLE + deviation, bool(np.isfinite(sigma))
     return Bar(

@@ -74,7 +74,7 @@ def search_headings(
     with core_pool() as cores:
         chosen = spread_out(dataset.frames, SEARCH_FRAMES)
         frames = load_camera_frames(FrameCache(), chosen, only, cores)
-        search = PoseSearch(only, frames, RANGE, seed, lambda: False)
+        search = PoseSearch(only, frames, RANGE, seed=seed, out_of_time=lambda: False)
         for index, name in enumerate(names):
             body = {name: lenses[name]}
             starts = [Mounting(float(deg)).T_camera_lidar(forward) for deg in HEADINGS_DEG]

@@ -24,12 +24,7 @@ a lens is covered, and more would take longer than the matching."""
 
 @dataclass(frozen=True, eq=False)
 class FrameChoice:
-    """Some frames of a dataset.
-
-    Attributes:
-        dataset: with these alone.
-        text: how they were chosen, in one line; empty if they are all.
-    """
+    """Some frames of a dataset."""
 
     dataset: Dataset
     text: str = ""

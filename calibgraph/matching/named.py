@@ -17,11 +17,7 @@ from calibgraph.progress import Progress
 
 
 class TableMatcher:
-    """A matcher that returns correspondences found before: a table, from a file or in memory.
-
-    Args:
-        table: of any frames; those that the dataset lacks are left out.
-    """
+    """A matcher that returns correspondences found before: a table, from a file or in memory."""
 
     rounds = 1
     stage1: Stage1Source = "pnp"

@@ -28,13 +28,7 @@ from calibgraph.progress import Progress
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a matcher's rounds begin.
-
-    Attributes:
-        rig: with the extrinsics to begin from.
-        first_round: index of the first round.
-        findings: of the search; they are added to those of every round.
-    """
+    """Where a matcher's rounds begin."""
 
     rig: Rig
     first_round: int = 0

@@ -82,7 +82,7 @@ def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
 
 
 def scan(
-    world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, rng: np.random.Generator
+    world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, *, rng: np.random.Generator
 ) -> Points:
     """Scan the world in one instant, as a moving sensor after motion compensation.
 

@@ -21,12 +21,7 @@ MATCHES = 1000  # per camera and frame: the paper's grid keeps at most as many
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A rig in a street, and a matcher.
-
-    Attributes:
-        rig: its extrinsics are the truth.
-        errors: of the matcher, per camera.
-    """
+    """A rig in a street, and a matcher."""
 
     rig: Rig
     errors: Mapping[str, MatcherErrors]

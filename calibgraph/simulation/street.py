@@ -189,7 +189,7 @@ def _band(
     paint: Paint,
 ) -> Mesh:
     marks_m = line.along_m + line.layout.marks_from_m
-    return ribbon(line.with_left, marks_m, edges_m, albedo, paint)
+    return ribbon(line.with_left, marks_m, edges_m, albedo=albedo, paint=paint)
 
 
 def _place(

@@ -79,7 +79,7 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_camera, scorer, seed, places)
+        measure = partial(_measure_camera, scorer, seed=seed, places=places)
         if extrinsics_only:
             measure = partial(_measure_extrinsic, scorer)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
@@ -98,7 +98,7 @@ def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageE
 
 
 def _measure_camera(
-    scorer: FrameScorer, seed: int, places: Places, name: str, camera: Camera
+    scorer: FrameScorer, name: str, camera: Camera, *, seed: int, places: Places
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)

@@ -46,15 +46,7 @@ _MAX_TEXT, _MAX_INTEGER = 200, 2**53
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A network's weights and the config of their training.
-
-    Attributes:
-        path: of the file.
-        sha256: of the file.
-        architecture: of the network, recognised from the shapes.
-        config: of the training; plain values only.
-        state: the state dict.
-    """
+    """A network's weights and the config of their training."""
 
     path: Path
     sha256: str

@@ -103,9 +103,11 @@ def search_box(
     rng = np.random.default_rng(seed)
     coarse = maps.blur(COARSE_BLUR_CELLS, COARSE_EVERY)
     starts = _suppress_duplicates(_sample(coarse, box, rng), effort * COARSE_STARTS)
-    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng, cores)[: effort * FINE_STARTS]
+    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng=rng, cores=cores)[
+        : effort * FINE_STARTS
+    ]
     fine = maps.blur(FINE_BLUR_CELLS)
-    refined = _refine(fine, box, [start for start, _ in rough], FINE_SIGMAS, rng, cores)
+    refined = _refine(fine, box, [start for start, _ in rough], FINE_SIGMAS, rng=rng, cores=cores)
     best_first = [displacement for displacement, _ in refined]
     return list(box.transforms(np.array(_suppress_duplicates(best_first, effort * CANDIDATES))))
 
@@ -164,6 +166,7 @@ def _refine(
     box: Box,
     starts: Sequence[Array],
     sigmas: Array,
+    *,
     rng: np.random.Generator,
     cores: Executor,
 ) -> list[tuple[Array, float]]:

@@ -153,13 +153,14 @@ def correlate(
 def _correlate_frame(
     gray: NDArray[np.uint8],
     cloud: PreparedCloud,
+    *,
     camera: Camera,
     range_rad: float,
     draw: tuple[int, int],
 ) -> CorrelationMaps:
     """The maps of one frame; the windows are drawn by their largest number and a seed."""
     image = _to_angular_image(gray, camera)
-    windows = _cut_windows_in_reach(image, cloud, camera, range_rad, draw)
+    windows = _cut_windows_in_reach(image, cloud, camera, range_rad, draw=draw)
     if not len(windows.counts):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
@@ -180,6 +181,7 @@ def _cut_windows_in_reach(
     cloud: PreparedCloud,
     camera: Camera,
     range_rad: float,
+    *,
     draw: tuple[int, int],
 ) -> Windows:
     """Windows of the part of the cloud that the camera may see from anywhere in the range."""

@@ -67,7 +67,7 @@ def locate_cameras(
     Returns:
         The best pose per camera, accepted if the camera has been located.
     """
-    search = PoseSearch(rig, frames, search_range, seed, out_of_time)
+    search = PoseSearch(rig, frames, search_range, seed=seed, out_of_time=out_of_time)
     return Locator(search, pool, progress).locate()
 
 

@@ -138,7 +138,7 @@ class StructureMatcher:
         tables, z_scores = [], {}
         with core_pool() as cores, core_pool() as pool:  # a few cameras' scores are copied at once
             level = self.levels[round_index]
-            waiting = self._submit_scores(cache, dataset.frames, rig, level, cores)
+            waiting = self._submit_scores(cache, dataset.frames, rig, level, cores=cores)
             matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
             for index, name in enumerate(rig.cameras):
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
@@ -180,7 +180,7 @@ class StructureMatcher:
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
     def _submit_scores(
-        self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
+        self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, *, cores: Executor
     ) -> dict[str, deque[Future[ShiftScores]]]:
         """Score every camera in every frame; frame by frame, so that cameras share its windows.
 

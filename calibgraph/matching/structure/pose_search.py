@@ -59,6 +59,7 @@ class PoseSearch:
         rig: Rig,
         frames: Mapping[str, CameraFrames],
         search_range: SearchRange,
+        *,
         seed: int,
         out_of_time: Callable[[], bool],
     ) -> None:

@@ -72,7 +72,13 @@ class PreparedCloud:
         return np.zeros(3) if self.seen_from_origin else camera_center(T)
 
     def windows(
-        self, camera: Camera, usable: Mask, spacing_rad: float, stride_spacings: float, fine: bool
+        self,
+        camera: Camera,
+        usable: Mask,
+        spacing_rad: float,
+        stride_spacings: float,
+        *,
+        fine: bool,
     ) -> WindowTable:
         """The windows of the cloud: if it was seen from the origin, the same for every camera.
 

@@ -106,7 +106,7 @@ def select_windows(
         in_view if level.fine else clear,
         level.spacing_rad,
         level.stride_spacings,
-        level.fine,
+        fine=level.fine,
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
     return table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)

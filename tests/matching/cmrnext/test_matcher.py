@@ -47,7 +47,7 @@ def replace_networks(
             full = np.zeros((2, *network_size(*lidar.shape)), np.float32)
             full[:, lidar.cells[:, 0], lidar.cells[:, 1]] = (target - lidar.pixels_px).T
             coarse = np.stack([np.zeros_like(full[0]), np.ones_like(full[0])])[:, ::8, ::8]
-            tables.append(to_table(job, lidar, full, coarse, 8))
+            tables.append(to_table(job, lidar, full, coarse, cell=8))
         return tables
 
     monkeypatch.setattr(FlowMatcher, "match", match)
