@@ -12,13 +12,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause that several checks may notice.
-
-    Attributes:
-        title: in words.
-        action: what to do about it, a sentence.
-        kinds: of the checks that notice it, each with an action of its own or an empty one.
-    """
+    """A cause that several checks may notice."""
 
     title: str
     action: str

@@ -123,12 +123,7 @@ def likely_intended_guess(dataset: Dataset, guess: Rig) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Tries corrected guesses of some cameras of a rig.
-
-    Attributes:
-        frames: the cameras' images and clouds.
-        guess: of all cameras.
-    """
+    """Tries corrected guesses of some cameras of a rig."""
 
     frames: Mapping[str, CameraFrames]
     guess: Rig

@@ -46,13 +46,7 @@ def held_out_checks(evidence: Evidence) -> Checks:
 def _held_out_ratio(
     block: CameraBlock, halves: tuple[Array, Array], even_frames: NDArray[np.int64]
 ) -> float:
-    """Ratio of the median error of held-out frames to the median error of fitted frames.
-
-    Args:
-        block: a camera's matches, not only those within the gate.
-        halves: (4, 4) T_camera_lidar from the even frames, and from the odd ones.
-        even_frames: their numbers.
-    """
+    """Ratio of the median error of held-out frames to the median error of fitted frames."""
     even = block.in_frames(even_frames)
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])

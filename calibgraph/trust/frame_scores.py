@@ -28,13 +28,7 @@ WIDE, FINER = LEVELS[1], LEVELS[2]
 
 
 class FrameScorer:
-    """Scores frames in parallel; clouds are decoded once.
-
-    Args:
-        dataset: images and clouds.
-        frames: those to score.
-        pool: of threads.
-    """
+    """Scores frames in parallel; clouds are decoded once."""
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames

@@ -208,14 +208,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides whether a check counts, or that it is compared with.
-
-    Attributes:
-        key: by which checks look it up.
-        value: the limit.
-        unit: of the value.
-        meaning: what it decides, in words.
-    """
+    """A number that decides whether a check counts, or that it is compared with."""
 
     key: str
     value: float
