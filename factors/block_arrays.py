@@ -25,7 +25,7 @@ class RobustBlock:
 
     def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
-        other = self._copy()  # not checked again: its correspondences are those of a good block
+        other = self._copy()  # not checked again: its correspondences are of a good block
         other._replace(scale=scale, sigma=sigma)
         other._check_scale()
         return other

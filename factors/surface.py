@@ -7,7 +7,7 @@ X = T_lidar_camera = (R, c), its inverse range w from A, and w times its place i
 
 and the residual is pi_b(y) - u_b. Here the range follows from the pose of A, as that of the real
 feature does: where A moves, its ray meets the surface in another point. With w held constant (then
-f / w is the point X_a, fixed in A's frame), the residual is that of ``pair_projection_factor``, and
+f / w is the point X_a, fixed in A's frame), the residual equals ``pair_projection_factor``, and
 a wrong pose of A becomes a wrong relative pose. Written with the inverse range, a ray that no
 longer meets the plane passes smoothly through infinity.
 """

@@ -6,13 +6,13 @@ from collections.abc import Callable, Collection
 
 from calibgraph.audit.judgement import (
     SEARCHES_FARTHER,
-    Tolerance,
     has_too_few_frames,
     judge_camera,
     judge_lidar,
 )
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
+from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
@@ -143,8 +143,8 @@ def _doubts_by_frames(
 ) -> dict[str, list[str]]:
     """Per camera, the frames that fit another extrinsic: something moved during the recording.
 
-    The solve leaves such frames out, and what is left agrees. Of matchers that may use what these
-    scores do not, nothing is concluded.
+    The solve leaves such frames out, and the rest agrees. Nothing is concluded about matchers that
+    use other information than these scores.
     """
     if not run.matcher.image_checks_can_fail or not cameras:
         return {}

@@ -14,14 +14,12 @@ from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,
-    Quantiles,
-    Tolerance,
     describe_motion,
-    detectable,
     find_lidar_motion,
     judge_axes,
 )
 from calibgraph.audit.result import LidarAudit
+from calibgraph.audit.significance import Quantiles, Tolerance, detectable
 from calibgraph.audit.trend import fit_slope
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
@@ -33,7 +31,7 @@ Array = NDArray[np.float64]
 FALSE_ALARM_RATE = 0.01
 """Probability of a significant axis in one call, over all cameras, results and trends."""
 
-_LATEST_DAY = 1e9  # a number of seconds would still be one, twice that of the present
+_LATEST_DAY = 1e9  # twice the present time in seconds
 
 _FAILED = "its verdict is FAIL, so that nothing is known of its error: do what its report advises"
 _NO_ERROR_BAR = "it has no error bar: its matches do not determine the camera"
@@ -150,7 +148,7 @@ def _judge_camera(
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
         deviation, sigma = found.leave_one_out.deviation[row], found.leave_one_out.sigma[row]
-        quantiles = Quantiles.of(found.leave_one_out.freedom[row], limits.tail)
+        quantiles = Quantiles.from_freedom(found.leave_one_out.freedom[row], limits.tail)
         audit, reason = judge_axes(deviation, sigma, quantiles, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()

@@ -1,4 +1,4 @@
-"""The page of an audit: is what is on the vehicle still right?"""
+"""The page of an audit: is the deployed calibration still right?"""
 
 from __future__ import annotations
 

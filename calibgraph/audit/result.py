@@ -50,7 +50,7 @@ class LidarAudit:
     """A motion of the LiDAR, which explains the deviations of all cameras.
 
     Attributes:
-        reason: one sentence: by how much it moved.
+        reason: the motion in one sentence.
         motion: (6,) xi in T_deployed_now = exp(xi), the pose of the LiDAR now in the LiDAR frame
             as deployed: rotation [rad], translation [m].
         sigma: (6,) standard deviations of ``motion``.

@@ -47,7 +47,7 @@ WORD_SIGMAS = {"heading": 10.0, "tilt": 3.0, "roll": 3.0, "ahead": 0.8, "left": 
 vehicles about the nearest of the eight headings, level and at the LiDAR (8.2, 2.0, 0.9 deg; 0.72,
 0.33, 0.85 m), rounded up."""
 SAID_DEG, SAID_M, SAID_SHARE = 5.0, 0.05, 0.1
-"""Of numbers that are given: chosen for estimates by eye; a length by so much and such a share."""
+"""Sigmas of given numbers: chosen for estimates by eye; of a length, a constant and a share."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class UprightCloud:
     polar: NDArray[np.complex64]
 
     @staticmethod
-    def of(cloud: NDArray[np.floating]) -> UprightCloud:
+    def from_cloud(cloud: NDArray[np.floating]) -> UprightCloud:
         """Extract upright structure from a cloud with (n, 3) or more columns [m], z up."""
         chosen = np.random.default_rng(0).random(len(cloud)) * len(cloud) < _MOST_POINTS
         points = _upright_points(np.asarray(cloud[chosen, :3], dtype=np.float64))

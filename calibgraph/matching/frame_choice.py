@@ -80,7 +80,7 @@ def _examine(frame: Frame, rig: Rig) -> _Candidate:
         except (CalibrationError, OSError, KeyError):
             continue
         clarity[index] = _clarity(gray)
-        view = view or (index, View.of(gray))
+        view = view or (index, View.from_image(gray))
     return _Candidate(frame, clarity, view)
 
 

@@ -28,7 +28,7 @@ from calibgraph.parallel import core_pool
 Array = NDArray[np.float64]
 
 PLACE_M = 20.0
-"""Frames within so many metres of a place's first frame are of that place: a camera that looks
+"""Radius [m] of a place about its first frame: a camera that looks
 ahead matches objects at 10 to 50 m."""
 
 Motion = NDArray[np.float64] | None
@@ -126,7 +126,7 @@ def _are_comparable(before: Frame, now: Frame) -> bool:
 def _upright_cloud(frame: Frame) -> UprightCloud | None:
     """The upright structure of a frame's cloud; None if unreadable, which the matcher reports."""
     try:
-        return frame.derive("upright", lambda: UprightCloud.of(frame.load_cloud()))
+        return frame.derive("upright", lambda: UprightCloud.from_cloud(frame.load_cloud()))
     except (CalibrationError, OSError):
         return None
 

@@ -43,7 +43,7 @@ class View:
     corners: NDArray[np.float32]
 
     @staticmethod
-    def of(gray: Gray) -> View:
+    def from_image(gray: Gray) -> View:
         """Prepare a (height, width) image as recorded."""
         size = (gray.shape[1] // _SCALE, gray.shape[0] // _SCALE)
         image = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
@@ -102,16 +102,16 @@ class _Views:
         self._frame, self._rig = frame, rig
         self._views: dict[str, View] = {}
 
-    def of(self, name: str) -> View:
+    def view(self, name: str) -> View:
         if name not in self._views:
             gray = self._frame.load_gray(name, self._rig.cameras[name])
-            self._views[name] = View.of(gray)
+            self._views[name] = View.from_image(gray)
         return self._views[name]
 
     def is_stationary(self, later: _Views) -> bool:
         """Whether no camera has moved, and at least one can tell."""
         names = [name for name in self._rig.cameras if self._sees(name) and later._sees(name)]
-        return _none_moved(self.of(name).stands(later.of(name)) for name in names)
+        return _none_moved(self.view(name).stands(later.view(name)) for name in names)
 
     def _sees(self, name: str) -> bool:
         return name in self._frame.image_paths

@@ -29,7 +29,7 @@ class MatcherComponents:
         elevation_rad: of an offset of all beams' elevations.
         elevation_stretch: of the share by which elevations are too far from the horizon.
         scan_motion_m: of the motion during a turn for which clouds are not corrected.
-        place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
+        place_rotation_rad, place_translation_m: further error that all cameras share at one place.
         place_variance: of what a camera's frames of a place share besides, over the variance of one
             frame's matches if they were independent.
     """
@@ -55,7 +55,7 @@ class ErrorComponents:
             images, which all frames share.
         pair_correlation: of the errors of two features of a pair in one frame.
         frame_correlation: of the errors of two matches of one frame, where frames are few.
-        usual_frames: weight of that prior in frames.
+        prior_frames: weight of that prior in frames.
         pseudo_frames: frames that are added with the scatter along each principal direction.
         shared_dof, place_dof: degrees of freedom of the priors.
         least_places: number of places from which their variance may fall below its prior.
@@ -69,7 +69,7 @@ class ErrorComponents:
     pair_translation_m: float
     pair_correlation: float
     frame_correlation: float
-    usual_frames: float
+    prior_frames: float
     pseudo_frames: float
     shared_dof: float
     place_dof: float
@@ -110,7 +110,7 @@ def error_components() -> ErrorComponents:
         pair_translation_m=pairs["translation_m"],
         pair_correlation=pairs["correlation"],
         frame_correlation=frames["correlation"],
-        usual_frames=frames["usual_frames"],
+        prior_frames=frames["prior_frames"],
         pseudo_frames=frames["pseudo_frames"],
         shared_dof=sizes["shared_dof"],
         place_dof=sizes["place_dof"],

@@ -37,8 +37,8 @@ class ErrorSources:
         rotation_deg: standard deviation about the axis where it is largest.
         translation_cm: the same along an axis.
         rotation: share of each source in the variance; they add up to 1.
-        translation: likewise.
-        forecast: the error bar [deg, cm] of so many times more frames and places.
+        translation: the same shares for the translation.
+        forecast: the error bar [deg, cm] with that factor more frames and places.
     """
 
     rotation_deg: float

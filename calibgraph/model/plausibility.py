@@ -24,12 +24,12 @@ _CENTRE_SHARE, _CENTRE_SHARE_OF_BOTH = 0.35, 0.12
 """Offset of the principal point over the image's size, along either axis and along both. A crop at
 one edge, as of the sky, and a rectified pair offset it along one; few lenses are off by 0.05."""
 _COVERED_SHARE, _COVERED_DEG = 0.95, 75.0
-"""Share of the image that the lens projects to; less is usual of fisheye lenses that see farther
+"""Share of the image that the lens projects to; less is normal for fisheye lenses that see farther
 than this from the axis, whose images are circles."""
 _DISTORTED = 0.4, 3.0
 """Field angle at the image's border over that without distortion; 0.8 to 2 for normal lenses."""
 _DECENTRED = 0.1
-"""Shift of the image's border by p1 and p2, over its distance from the axis; below 0.02 for usual
+"""Shift of the image's border by p1 and p2, over its distance from the axis; below 0.02 for normal
 lenses. The coefficients k3 and k4 of a fisheye lens, read as p1 and p2, shift it by more."""
 _DIRECTIONS, _BISECTIONS = 96, 40  # in which a lens is examined, and how finely
 _PINHOLE_LIMIT = 19.0  # of the tangent of a field angle, 87 deg

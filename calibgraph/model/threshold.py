@@ -21,7 +21,7 @@ class Threshold:
 
     Attributes:
         key: by which checks look the row up.
-        name: what is measured; the name of the check.
+        name: of the measured number and its check.
         direction: "at most" or "at least": on which side of the limits PASS lies.
         warn: the last value that is PASS.
         fail: the last value that is not FAIL.

@@ -41,7 +41,7 @@ class Check:
     """One check of one camera's result.
 
     Attributes:
-        name: what was measured or searched for.
+        name: of the measured number, or of the search.
         status: PASS, WARN or FAIL.
         text: one sentence: what was found and, if that is not PASS, what to do.
         value: the number that was found, if it is one.
@@ -178,7 +178,7 @@ class Verdict:
         checks: all checks, in order.
         error_probability: that the result is off by more than the tolerance; None while driving,
             where the checks alone decide.
-        cameras: of a rig's verdict, those of its cameras.
+        cameras: the verdicts of the cameras, if this is a rig's.
     """
 
     checks: tuple[Check, ...] = ()

@@ -31,7 +31,7 @@ class Lidar:
         intensity_noise: standard deviation.
         ring_spread: standard deviation of the beams' gains, about 1.
         dropout: share of shots that are lost at random.
-        weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
+        weakest: albedo at which 1 - 1/e of the shots return from 100 m at normal incidence.
         errors: of the sensor; none for an ideal one.
     """
 

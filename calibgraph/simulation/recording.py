@@ -99,7 +99,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
             the seed draws them.
         lens_errors: size of the errors of the lenses in the rig files, 1 for those that a good
             calibration with a target leaves; the truth is then what goes best with these lenses.
-        vary_layout: draw the street's width, curves, gardens, heights and what stands in it by the
+        vary_layout: draw the street's width, curves, gardens, heights and objects by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
         progress: called with the stage, its steps done, and their number.
 

@@ -60,7 +60,7 @@ def cast_beams(
 
     Args:
         world: surfaces.
-        errors: of the sensor; those of its elevations are in the shots.
+        errors: of the sensor; its elevation errors are in the shots.
         T_world_lidar: (4, 4) when the sensor looks ahead.
         shots: (n, 3) unit vectors in the LiDAR's frame.
 

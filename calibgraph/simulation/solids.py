@@ -61,7 +61,7 @@ class Solid:
         albedo: its colour.
         paint: over the albedo.
         yaw_deg: rotation about z.
-        taper: extents of its top along x and y, as shares of those of the underside.
+        taper: extents of its top along x and y, relative to the underside.
         bumps: standard deviation of the radius of its surface, as a share, for leaves.
         uv_from_m: (u, v) of the surface's corner on the paint.
     """

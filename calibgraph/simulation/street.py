@@ -75,7 +75,7 @@ class Layout:
         spacing: factor of the distances between furniture along it.
         margin_m: its length behind the first stop and beyond the last.
         marks_from_m: where along it the markings of the road begin.
-        setback_m: of the houses on the left and on the right, beyond the usual one.
+        setback_m: of the houses on the left and on the right, beyond the default.
         storeys: fewest and most.
         parked: share of the bays that are taken.
         oncoming: chance of an oncoming car every 12 m.
@@ -122,7 +122,7 @@ class Centreline:
         along_m: (k,) distances s along it, rising.
         xy_m: (k, 2) in the world.
         heading_rad: (k,) directions, unwrapped.
-        layout: distances to the left of the line are of a street of the usual width.
+        layout: distances to the left of the line are of a street of the default width.
     """
 
     along_m: Array

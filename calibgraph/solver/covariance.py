@@ -151,8 +151,8 @@ def with_pseudo_frames(
         mean = along * count / np.maximum(count - 1.0, 1.0)
     else:
         prior = _along(vectors, usual * of_frame) / PSEUDO_FRAMES
-        usual_frames = error_components().usual_frames
-        mean = (usual_frames * prior + count * along) / (usual_frames + count - 1.0)
+        prior_frames = error_components().prior_frames
+        mean = (prior_frames * prior + count * along) / (prior_frames + count - 1.0)
     allowed: Array = scatter + (vectors * (PSEUDO_FRAMES * mean)) @ vectors.T
     return allowed
 

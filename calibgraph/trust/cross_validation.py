@@ -27,9 +27,9 @@ RESTARTS, RESTART_DEG, RESTART_M = 3, 2.0, 0.2
 """How many displaced starts, and how far they are from the solution."""
 
 _RESTART_SAMPLE = 5000  # matches of a camera that first lead back from a displaced start
-_MET_DEG, _MET_CM = 0.01, 0.3  # a tenth of what the check allows: starts that have come together
+_MET_DEG, _MET_CM = 0.01, 0.3  # a tenth of the check's limit: starts that have come together
 _ROUGH = 1e-6  # relative change of the cost at which their first pass stops: the gate needs no more
-_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes what it finds
+_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
 
 

@@ -180,8 +180,8 @@ class Evidence:
     def errors(self) -> ErrorFit | None:
         """The error model of the solution; None with the paper's presets.
 
-        What all matches share is at least as large as the images of pairs show, also where the loss
-        has given these up.
+        The shared error is at least as large as pairs of images show, even if the loss rejects
+        them.
         """
         solution = self.solution
         found = solution.errors or fit_errors(

@@ -23,7 +23,10 @@ from calibgraph.model.rig import Camera
 Images = Sequence[NDArray[np.uint8]]
 """Gray images of one camera, (height, width) each, one per frame."""
 
-MAX_WINDOWS, SHARING_FRAMES = 10_000, 10  # per camera, over so many frames; of more, as many each
+MAX_WINDOWS, SHARING_FRAMES = (
+    10_000,
+    10,
+)  # per camera over that many frames; with more frames, as many each
 WIDE, FINER = LEVELS[1], LEVELS[2]
 
 

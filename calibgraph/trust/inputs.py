@@ -51,11 +51,12 @@ def _doubts_about_cloud(frame: Frame, cloud: Cloud) -> Iterator[str]:
     if distance.status != "PASS":
         yield distance.text
         return
-    apart = displacement_of_parts(cloud)
-    if apart is not None:
+    displacement = displacement_of_parts(cloud)
+    if displacement is not None:
+        turned, moved = displacement
         yield (
-            f"the cloud of frame {frame.name} holds the same surfaces twice, {apart[0]:.2g} deg "
-            f"and {apart[1]:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
+            f"the cloud of frame {frame.name} holds the same surfaces twice, {turned:.2g} deg "
+            f"and {moved:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
             "motion was corrected?"
         )
     if frame.is_corrected and scan_duration_s(frame.cloud_path) == 0:
@@ -111,7 +112,7 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
     Raises:
         FileError: if a cloud cannot be read.
         DatasetError: if no camera has points of a cloud in view. One that has none may still be
-            placed by what it sees in common with others.
+            placed by co-visible features.
     """
     warnings = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
     for text in warnings:

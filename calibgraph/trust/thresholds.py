@@ -85,7 +85,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
               "Are there enough frames?",
-              "With fewer, the error bar is mostly what is usual of matches.",
+              "With fewer, the error bar is mostly a prior.",
               "the error bar is mostly a default, not measured"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
@@ -107,7 +107,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at most", 0.25, 0.5, "share",
               "Do the matches that were left out agree on another extrinsic?", _COUNTED),
     Threshold("outlier_frames", "share of outlier frames", "at most", 0.35, 0.9, "share",
-              "How many frames lie apart from where frames are densest?", _COUNTED,
+              "How many frames lie far from where frames are densest?", _COUNTED,
               "a minority of the frames decides; check what differs between them"),
     Threshold("place_distance", "distance of a place from the others", "at most", 5.0, math.inf,
               "sigma", "Does each place agree with the others, of three and more?",
@@ -201,7 +201,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # while driving
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?",
-              "Above half, most of what is measured now contradicts the estimate."),
+              "Above half, most new measurements contradict the estimate."),
 )
 # fmt: on
 
@@ -219,7 +219,7 @@ class Limit:
 # fmt: off
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
-          "A pull within this of what a camera's own solution leaves open is zero."),
+          "A pull within this many sigmas of a camera's own solution is zero."),
     Limit("lens_usual", 0.002, "", "The usual error of a lens parameter, before residuals are "
           "looked at: relative, or in focal lengths."),
     Limit("lens_wrong", 0.04, "", "The error of one that is wrong."),
@@ -264,7 +264,7 @@ def thresholds_markdown() -> str:
         "|---|---|---|---|---|---|",
         *(_line(row) for row in THRESHOLDS),
         "",
-        "\\* At the usual tolerance of "
+        "\\* At the default tolerance of "
         f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. The limit of "
         "FAIL grows with the tolerance, and does not fall below this value.",
         "",

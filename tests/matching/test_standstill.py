@@ -53,7 +53,7 @@ def test_one_camera_that_moves_is_enough(tmp_path: Path) -> None:
 
 
 def test_an_image_without_features_cannot_tell() -> None:
-    blank = View.of(np.full((240, 320), 80, dtype=np.uint8))
+    blank = View.from_image(np.full((240, 320), 80, dtype=np.uint8))
     assert blank.stands(blank) is None
 
 
@@ -64,7 +64,7 @@ def test_a_motion_of_half_a_pixel_is_a_motion() -> None:
 
     def shifted(pixels: float) -> View:
         moved = cv2.warpAffine(image, np.array([[1, 0, pixels], [0, 1, 0]]), (640, 480))
-        return View.of(moved.astype(np.uint8))
+        return View.from_image(moved.astype(np.uint8))
 
     assert shifted(0.0).stands(shifted(0.3)) is True
     assert shifted(0.0).stands(shifted(0.8)) is False

@@ -17,8 +17,8 @@ Body = Mapping[str, Camera]
 """Cameras with fixed relative poses; the extrinsic of the first is the pose of the body."""
 
 RIGID_RAD, RIGID_M = np.radians(0.5), 0.1
-"""Sigmas of a known relative pose up to which two cameras are one body: what is left of them, the
-rounds correct camera by camera."""
+"""Sigmas of a known relative pose up to which two cameras are one body; the rounds correct the
+remaining error camera by camera."""
 
 
 def rigid_bodies(rig: Rig) -> list[Body]:

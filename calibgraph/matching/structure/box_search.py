@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 COARSE_BLUR_CELLS, COARSE_EVERY, FINE_BLUR_CELLS = 2.0, 2, 1.0
 SAMPLES = 1024  # of the box
-SHIFT_DOWN_RAD = np.radians(6.0)  # a rotation down is nearly a shift of the maps within so much
+SHIFT_DOWN_RAD = np.radians(6.0)  # a smaller rotation down is nearly a shift of the maps
 COARSE_STARTS, FINE_STARTS, CANDIDATES = 24, 12, 8  # how many go on from each stage
 DUPLICATE = np.repeat([np.radians(3.0), 0.6], 3)  # nearer poses are duplicates
 COARSE_SIGMAS = np.repeat([np.radians(1.5), 0.3], 3)
@@ -134,7 +134,7 @@ def _sample_camera(
     own = replace(box, guess_T_camera_lidar=T_camera_lead @ box.guess_T_camera_lidar)
     unit = qmc.Sobol(6, seed=rng).random(SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
-    displacements[:, 1] = 0.0  # the rotation to the right, of which all values are tried
+    displacements[:, 1] = 0.0  # all rotations to the right are tried by the shift
     down = min(SHIFT_DOWN_RAD, box.rotation_rad)
     transforms = own.transforms(displacements)
     z_scores, shifts = coarse.find_best_shifts(transforms, (box.rotation_rad, down))

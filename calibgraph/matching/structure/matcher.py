@@ -42,14 +42,14 @@ lower z-scores were 2 degrees off, and the first rounds corrected them."""
 
 FRAME_WINDOWS = 6_000  # bounds the time of a single frame
 SHARING_FRAMES = 20
-"""At most so many frames share a level's windows: with fewer windows per frame, few of its groups
-have enough of them, and more frames would give fewer matches."""
+"""Largest number of frames that share a level's windows: with fewer windows per frame, few of its
+groups have enough of them, and more frames would give fewer matches."""
 MOST_FRAMES = 30  # bounds time and memory, which are proportional from SHARING_FRAMES on
 SEARCH_FRAMES = 7
 SEARCH_DEG, SEARCH_M = 20.0, 1.5
 MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
 LEAST_WINDOWS, TRIED_WINDOWS = 300, 2_000
-"""So many of so many fine windows of a cloud must have structure, else the search fails slowly. Of
+"""Least number of fine windows with structure, of those tried; with fewer the search fails. Of
 scans thinned to 2000, 3000, 4000 and 5000 points 25, 250, 750 and 1300 have it: with 4000 cameras
 are found. Whole scans of 16 beams have 1600."""
 

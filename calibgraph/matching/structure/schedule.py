@@ -25,7 +25,7 @@ class Level:
         group_rad: cell of directions in which the shift is nearly constant.
         max_windows: per camera, over all frames: bounds the time. More windows average more of
             the image; errors that all windows of a place share remain.
-        searches: number of pose searches, of which the best counts. One is enough where a single
+        searches: number of pose searches; the best counts. One is enough where a single
             maximum is in reach.
         min_quality: least mean score of a group's windows at its peak, above the grid's mean.
     """

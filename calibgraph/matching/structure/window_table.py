@@ -73,7 +73,7 @@ class WindowTable:
             in_view: (n,) of all points of the cloud.
             clear: (n,) those that nothing nearer covers.
             max_covered: share of a window that may be covered.
-            max_windows: at most so many centres in view are taken.
+            max_windows: largest number of centres in view.
             seed: of the choice.
         """
         chosen = np.flatnonzero(in_view[self._rows[self._centres]])
