@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.errors import RigError
-from calibgraph.model.geometry import T_OPTICAL_LINK, invert
+from calibgraph.model.geometry import T_OPTICAL_LINK, invert, transform
 
 Array = NDArray[np.float64]
 Forward = Literal["+x", "-x", "+y", "-y"]
@@ -80,12 +80,9 @@ class Mounting:
 
     def T_camera_lidar(self, forward: Forward = "+x") -> Array:
         """(4, 4) of the camera's optical frame."""
-        T_vehicle_link, T_lidar_vehicle = np.eye(4), np.eye(4)
         angles = (self.heading_deg, self.tilt_deg, self.roll_deg)
-        T_vehicle_link[:3, :3] = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
-        T_vehicle_link[:3, 3] = self.place_m
-        turned = Rotation.from_euler("Z", _FORWARD_DEG[forward], degrees=True)
-        T_lidar_vehicle[:3, :3] = turned.as_matrix()
+        T_vehicle_link = transform(Rotation.from_euler("ZYX", angles, degrees=True), self.place_m)
+        T_lidar_vehicle = transform(Rotation.from_euler("Z", _FORWARD_DEG[forward], degrees=True))
         T: Array = T_OPTICAL_LINK @ invert(T_lidar_vehicle @ T_vehicle_link)
         return T
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 
 Array = NDArray[np.float64]
 
@@ -179,10 +179,8 @@ def _rigid_fit(source: Array, target: Array) -> Array:
     """(4, 4) that moves (n, 3) points onto others, least squares (Kabsch, 1976)."""
     means = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((source - means[0]).T @ (target - means[1]))
-    T = np.eye(4)
-    T[:3, :3] = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    T[:3, 3] = means[1] - T[:3, :3] @ means[0]
-    return T
+    R = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    return transform(R, means[1] - R @ means[0])
 
 
 def _overlap(known: UprightCloud, now: UprightCloud, T_known_now: Array) -> float:

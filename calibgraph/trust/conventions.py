@@ -23,7 +23,7 @@ from calibgraph.matching.structure.pose_refinement import (
     approach,
     refine,
 )
-from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert
+from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert, transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.thresholds import limit
@@ -69,9 +69,7 @@ def undo_convention_errors(guess: Array) -> dict[str, Array]:
 
 def _turned(degrees: float) -> Array:
     """(4, 4) a turn about z."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return turn
+    return transform(Rotation.from_euler("z", degrees, degrees=True))
 
 
 def _in_millimetres(guess: Array) -> Array:

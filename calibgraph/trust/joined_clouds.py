@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from calibgraph.model.geometry import angle_deg
+from calibgraph.model.geometry import angle_deg, transform
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,4 @@ def _step(points: Array, normals: Array, offsets_m: Array) -> Array:
     information = (jacobian * weights[:, None]).T @ jacobian
     information += 1e-5 * np.trace(information) * np.eye(6)  # a plane alone does not hold it
     step = -np.linalg.solve(information, (jacobian * weights[:, None]).T @ offsets_m)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-    T[:3, 3] = step[3:]
-    return T
+    return transform(Rotation.from_rotvec(step[:3]), step[3:])

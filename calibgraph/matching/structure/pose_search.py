@@ -23,7 +23,7 @@ from calibgraph.matching.structure.pose_refinement import (
     refine,
     refine_on,
 )
-from calibgraph.model.geometry import relative_transform
+from calibgraph.model.geometry import relative_transform, transform
 from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS = 2100  # of the maps, per camera over all frames
@@ -194,6 +194,5 @@ def _by_z_score(candidate: Candidate) -> float:
 
 def _turn_about_axis(body: Body, angle_rad: float) -> Body:
     """The body after a turn about the axis of its lead."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
+    turn = transform(Rotation.from_rotvec([0.0, 0.0, angle_rad]))
     return place(body, turn @ lead(body).T_camera_lidar)
