@@ -88,7 +88,7 @@ accumulate_shared = compiled(parallel=True)(_accumulate_runs)
 def linearize_alone(kind, lens, T, columns, whitening, loss, scale, sigma, runs):  # type: ignore[no-untyped-def]
     """(7,) error and transposed (6, 7) Jacobian of the block factor, see ``block.square_root``.
 
-    Sums are added run by run, as in ``accumulate_alone``.
+    Sums are added run by run, as of ``accumulate_alone``.
     """
     sums = np.zeros(28)
     for i in range(len(runs)):
@@ -205,7 +205,7 @@ def _norms_of_tile(whitening, start, n, tile, factor, norms):  # type: ignore[no
 
 @compiled()
 def norms_alone(kind, lens, poses, columns, whitening, factor, runs):  # type: ignore[no-untyped-def]
-    """(1, n) norms of the residuals [px] times a factor; with whitening (2, n), plain and whitened.
+    """(1, n) norms of the residuals [px] times a factor, and, with whitening, (2, n) those of both.
 
     Infinite where a point is not projectable; ``poses`` and ``runs`` as above.
     """

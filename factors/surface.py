@@ -7,7 +7,7 @@ X = T_lidar_camera = (R, c), its inverse range w from A, and w times its place i
 
 and the residual is pi_b(y) - u_b. Here the range follows from the pose of A, as that of the real
 feature does: where A moves, its ray meets the surface in another point. With w held constant (then
-f / w is the point X_a, fixed in A's frame), the residual equals ``pair_projection_factor``, and
+f / w is the point X_a, fixed in A's frame), the residual is that of ``pair_projection_factor``, and
 a wrong pose of A becomes a wrong relative pose. Written with the inverse range, a ray that no
 longer meets the plane passes smoothly through infinity.
 """
@@ -43,7 +43,7 @@ class SurfaceBlock(RobustBlock):
         pixels_b_px: (n, 2) the same features in B.
         loss: name of the robust loss.
         scale: of the residual over sigma, at which the loss bends.
-        sigma: divides all residuals [px].
+        sigma: what all residuals are divided by [px].
 
     Raises:
         ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
@@ -91,7 +91,7 @@ class SurfaceBlock(RobustBlock):
         return self.run_sums(T_lidar_a.matrix()[None], T_lidar_b.matrix()[None], edges)
 
     def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
-        """Like :meth:`frame_sums`, with (r, 4, 4) poses per run, or one (1, 4, 4) for all."""
+        """As :meth:`frame_sums`, with (r, 4, 4) poses of each run, or (1, 4, 4) of all."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums = _accumulate(
             self.lens_b.kind, self.lens_b.packed, contiguous(T_lidar_a), contiguous(T_lidar_b),

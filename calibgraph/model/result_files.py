@@ -90,7 +90,7 @@ def is_table_of_result(path: Path) -> bool:
 
 
 def _table_metadata(path: Path) -> dict[str, Any] | None:
-    """The metadata of a Parquet table; None if it is no table of this program."""
+    """What a Parquet file's matcher reported; None if it is no table of this program."""
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -219,7 +219,7 @@ class Limit:
 # fmt: off
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
-          "A pull within this many sigmas of a camera's own solution is zero."),
+          "A pull within this of what a camera's own solution leaves open is zero."),
     Limit("lens_usual", 0.002, "", "The usual error of a lens parameter, before residuals are "
           "looked at: relative, or in focal lengths."),
     Limit("lens_wrong", 0.04, "", "The error of one that is wrong."),
