@@ -1,4 +1,4 @@
-"""What can be seen of a dataset before anything is solved: what is there, and what to fix first."""
+"""Examine a dataset before anything is solved: its content, and the problems to fix first."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.frame_choice import choose_frames
-from calibgraph.matching.standstill import same_places
+from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
@@ -38,7 +38,7 @@ _ORDER = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found in a dataset.
+    """The findings in a dataset.
 
     Attributes:
         findings: errors first, then warnings and notes.
@@ -80,7 +80,7 @@ def diagnose(
 
     Args:
         folders: dataset folders, KITTI odometry sequences or bags of one rig.
-        rig: the guess; that of the data if None.
+        rig: the guess; the data's own if None.
         frames: which frames to keep, see :meth:`calibgraph.Dataset.select`.
         bag: how ROS bags are read.
         pictures: folder for ``guess_CAMERA.png``: the guess on an image of each camera; written
@@ -90,7 +90,7 @@ def diagnose(
         ValueError: if the options do not fit.
     """
     findings: list[Finding] = []
-    data = _load(folders, rig, frames, bag, findings)
+    data = _load(folders, rig, frames, bag, findings=findings)
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
@@ -116,9 +116,10 @@ def _load(
     rig: Rig | None,
     frames: str | None,
     bag: BagOptions | None,
+    *,
     findings: list[Finding],
 ) -> Dataset | None:
-    """The dataset; where frames do not pair up, that of those that do; None if there is none."""
+    """The dataset, without frames that do not pair up; None if there is none."""
     try:
         return load_dataset(folders, rig, frames=frames, bag=bag)
     except (CalibrationError, OSError) as error:
@@ -136,7 +137,7 @@ def _load(
 
 
 def _describe(data: Dataset) -> Iterator[Finding]:
-    """What is there, and whether the frames are enough."""
+    """The content of the dataset, and whether there are enough frames."""
     count = len(data.frames)
     yield Finding(
         "note", f"{_counted(count, 'frame')}, {_counted(len(data.rig.cameras), 'camera')}"
@@ -171,7 +172,7 @@ def _examine_frames(
 
 
 def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, dict[str, str]]:
-    """The cloud, if it can be read; and what is wrong with it ("") and with a camera's image."""
+    """The cloud if readable, and the problems of the cloud ("") and of each camera's image."""
     problems: dict[str, str] = {}
     cloud = None
     try:
@@ -215,7 +216,7 @@ def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding
 def _examine_places(data: Dataset) -> Iterator[Finding]:
     """How many places the frames are of, if the vehicle stands in some."""
     try:
-        places = same_places(data, data.rig)
+        places = find_stationary_frames(data, data.rig)
     except (CalibrationError, OSError):  # which is a finding already
         return
     if places:
@@ -233,7 +234,7 @@ def _examine_places(data: Dataset) -> Iterator[Finding]:
 def _examine_guess(
     data: Dataset, cloud_of: tuple[Frame, NDArray[np.float32]], seen: Mapping[str, int]
 ) -> Iterator[Finding]:
-    """What cannot be right, whether cameras see points by the guess, and which see the same."""
+    """Impossible values, cameras that see no point at the guess, and overlapping cameras."""
     frame, cloud = cloud_of
     doubts = find_doubts(data.rig, frame, cloud)
     intended = explain_guess(data, data.rig, cloud)

@@ -14,7 +14,7 @@ from calibgraph.solver.joint import add_camera_pairs
 _TIMES_SURFACES = 2  # the second changes results by up to 0.003 deg and 0.2 cm, a third by 0.1 cm
 
 
-def tie_cameras(run: MatchingRun, progress: Progress) -> MatchingRun:
+def refine_with_camera_pairs(run: MatchingRun, progress: Progress) -> MatchingRun:
     """Match the cameras with each other, and refine the solution with what they see in common.
 
     Not the cameras that the matcher did not find: they would spoil the others.

@@ -21,7 +21,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.overlaps import tie_cameras
+from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
@@ -64,9 +64,9 @@ def calibrate(
     """
     report = progress or no_progress
     run = match_in_rounds(                                   # match -> solve_joint, in rounds
-        dataset, rig, matcher, config, terms, time_limit_s=time_limit_s, progress=report
+        dataset, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
     )  # fmt: skip
-    run = tie_cameras(run, report)  # what cameras see in common
+    run = refine_with_camera_pairs(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
     with run.watch("checks"):

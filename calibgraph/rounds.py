@@ -25,7 +25,7 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
-from calibgraph.matching.standstill import same_places
+from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
@@ -55,8 +55,8 @@ def match_in_rounds(
     rig: Rig | None = None,
     matcher: AnyMatcher = "structure",
     config: Config | None = None,
-    terms: Terms = "full",
     *,
+    terms: Terms = "full",
     time_limit_s: float | None = None,
     progress: Progress,
 ) -> MatchingRun:
@@ -81,7 +81,7 @@ def match_in_rounds(
             table = full.match(data, estimate, round_index=index, progress=progress)
             table = replace(table, metadata={**table.metadata, **found}).with_places(places)
         with watch("solve"):
-            solution = _solve(data, guess, (estimate, table), config, terms)
+            solution = _solve(data, guess, (estimate, table), config, terms=terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
         _log.info("round %d: %s", index, _in_words(rounds[-1]))
         estimate = solution.solved_rig
@@ -144,7 +144,7 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
 def find_stationary(data: Dataset, rig: Rig) -> Places:
     """During which frames the vehicle stands."""
     try:
-        return Places(stationary=as_groups(same_places(data, rig)))
+        return Places(stationary=as_groups(find_stationary_frames(data, rig)))
     except (CalibrationError, OSError):  # the checks on images report it
         return Places()
 
@@ -162,6 +162,7 @@ def _solve(
     guess: Rig,
     matched: tuple[Rig, Correspondences],
     config: Config,
+    *,
     terms: Terms,
 ) -> Solution:
     """The joint solve; where there is too little to solve from, with a hint about the guess.

@@ -63,7 +63,7 @@ class ProjectionBlock(RobustBlock):
         loss: name of the robust loss.
         scale: norm of a whitened residual, divided by sigma, at which the loss bends (the paper's
             delta).
-        sigma: what all whitened residuals are divided by.
+        sigma: divides all whitened residuals.
 
     Raises:
         ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
@@ -249,7 +249,7 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @lru_cache
 def _cut(count: int) -> NDArray[np.int64]:
-    """(c, 2) the runs of so many correspondences, see _CHUNK."""
+    """(c, 2) runs of _CHUNK correspondences at most."""
     edges = np.arange(0, count + _CHUNK, _CHUNK)
     edges[-1] = count
     return to_runs(edges)

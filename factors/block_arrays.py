@@ -1,4 +1,4 @@
-"""What blocks of correspondences share: their loss's scale, and arrays that cannot be written."""
+"""Shared by blocks of correspondences: the scale of the loss, and read-only arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RobustBlock:
 
     Attributes:
         scale: norm of a whitened residual, divided by sigma, at which the loss bends.
-        sigma: what all whitened residuals are divided by.
+        sigma: divides all whitened residuals.
     """
 
     scale: float
@@ -25,7 +25,7 @@ class RobustBlock:
 
     def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
-        other = self._copy()  # not checked again: its correspondences are those of a good block
+        other = self._copy()  # not checked again: its correspondences are of a good block
         other._replace(scale=scale, sigma=sigma)
         other._check_scale()
         return other

@@ -37,7 +37,7 @@ _COLUMNS = 18  # of a feature: f_a, F_a by columns, f_b, F_b by columns
 
 @dataclass(frozen=True, eq=False)
 class EpipolarBlock(RobustBlock):
-    """Features that two cameras see, with what their epipolar residuals need. Immutable.
+    """Co-visible features of two cameras, for epipolar residuals. Immutable.
 
     Attributes:
         lens_a: of the one camera.
@@ -46,7 +46,7 @@ class EpipolarBlock(RobustBlock):
         pixels_b_px: (n, 2) the same features in the other.
         loss: name of the robust loss.
         scale: of the residual over sigma, at which the loss bends.
-        sigma: what all residuals are divided by [px].
+        sigma: divides all residuals [px].
 
     Raises:
         ValueError: on wrong shapes, pixels without a ray, an unknown loss, a scale or sigma <= 0.
@@ -102,7 +102,7 @@ class EpipolarBlock(RobustBlock):
         return self.run_sums(T_a_b.matrix()[None], edges)
 
     def run_sums(self, T_a_b: Array, edges: NDArray[np.int64]) -> BlockSums:
-        """As :meth:`frame_sums`, with an (r, 4, 4) pose of each run, or (1, 4, 4) of all."""
+        """Like :meth:`frame_sums`, with an (r, 4, 4) pose per run, or one (1, 4, 4) for all."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         packed = _accumulate(
             contiguous(T_a_b), self._rays, loss_id(self.loss), self.scale * self.sigma, edges

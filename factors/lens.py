@@ -165,7 +165,7 @@ class Lens:
         """Project points in the LiDAR frame, with derivatives by a twist of the camera, by columns.
 
         Args:
-            T_camera_lidar: (4, 4); the twist xi is that of exp(xi) T_camera_lidar.
+            T_camera_lidar: (4, 4); the twist xi perturbs it as exp(xi) T_camera_lidar.
             points_lidar_m: (n, 3) in the LiDAR frame.
             columns: (6, 2, n), filled: derivatives by rotation [px/rad] and translation [px/m].
 
@@ -198,9 +198,9 @@ def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
 
 
 def _radtan_limit(coefficients: Array) -> float:
-    """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does; tangential terms apart.
+    """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does, without tangential terms.
 
-    At most that of a ray 85 degrees off the axis: polynomials are not fitted beyond.
+    At most the radius of a ray 85 degrees off the axis: polynomials are not fitted beyond.
     """
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])

@@ -148,7 +148,7 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
 
 @compiled()
 def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """As :func:`is_projectable`, of a lens that looks ahead."""
+    """Like :func:`is_projectable`, for a lens that looks ahead."""
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[_LIMIT] * z) ** 2)
 
 

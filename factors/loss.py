@@ -1,6 +1,6 @@
 """Robust losses rho(s) of the squared whitened residual s, scaled so that rho(s) ~ s for small s.
 
-All are concave in s with rho(0) = 0, which is what the lossless block factor needs
+All are concave in s with rho(0) = 0, as the lossless block factor needs
 (``factors.block``). That includes Tukey's: it rises to its bound and stays there; its weight is
 exactly zero beyond, so far outliers do not pull at all, and a start from which *every* residual is
 beyond the bound gives no gradient and cannot be improved. Start such a solve with Cauchy.

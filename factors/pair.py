@@ -1,4 +1,4 @@
-"""Factors of what two cameras both see, on ``T_lidar_a`` and ``T_lidar_b``.
+"""Factors of co-visible features of two cameras, on ``T_lidar_a`` and ``T_lidar_b``.
 
 A feature at u_a whose place X_a in A's frame is known (its depth comes from the LiDAR) is predicted
 in B at pi_b(T_b T_a^-1 X_a), with T = T_camera_lidar. Only the relative pose enters:
@@ -137,7 +137,7 @@ def pair_run_sums(
 
 
 def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
-    """(6, 12) derivative of the tangent of ``T_a_b`` by those of both poses."""
+    """(6, 12) derivative of the tangent of ``T_a_b`` by the tangents of both poses."""
     T_b_a = T_lidar_b.between(T_lidar_a)
     return np.hstack([-T_b_a.AdjointMap(), np.eye(6)])
 

@@ -6,7 +6,7 @@ A tile is a (ROWS, TILE) array; each row holds one quantity, so that the loops o
 from __future__ import annotations
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
-"""What LLVM may assume of the arithmetic; NaN and infinity keep their meaning."""
+"""The arithmetic that LLVM may assume; NaN and infinity keep their meaning."""
 
 TILE = 256
 """Correspondences in a tile: its intermediate values fill the first-level cache."""

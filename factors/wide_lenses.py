@@ -36,10 +36,10 @@ def check_mirror(xi: float) -> None:
 
 
 def omnidirectional_limit(coefficients: Array) -> float:
-    """Field angle [rad] up to which the unified model is one-to-one, tangential terms apart.
+    """Field angle [rad] up to which the unified model is one-to-one, without tangential terms.
 
     At the least of the angles at which the plane's radius stops growing (arccos(-1 / xi), xi > 1),
-    at which the polynomial does, and at which the radius is that of a pinhole 85 degrees off.
+    at which the polynomial does, and at which the radius equals a pinhole's at 85 degrees.
     """
     xi, k1, k2 = coefficients[:3]
     roots = np.polynomial.polynomial.polyroots(
@@ -78,7 +78,7 @@ def equirectangular_rays(angles_rad: Array) -> Array:
 
 @compiled()
 def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Longitude and latitude times fx and fy, with the Jacobian, as of ``project_one``."""
+    """Longitude and latitude times fx and fy, with the Jacobian, like ``project_one``."""
     fx, fy = lens[0], lens[1]
     n2 = x * x + y * y + z * z
     # At the poles there is no longitude: the derivative is held, so that it is finite.
@@ -116,7 +116,7 @@ def _distort(lens, a, b):  # type: ignore[no-untyped-def]
 
 @compiled()
 def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """The unified model with its Jacobian, as of ``project_one``.
+    """The unified model with its Jacobian, like ``project_one``.
 
     Past the limiting field angle t0 the pixel moves on outwards from the limiting circle, in
     proportion to 1 + t - t0, so that it stays finite and continuous right to behind the camera.

@@ -13,7 +13,7 @@ from calibgraph import Correspondences, Dataset, Rig, perturb, simulate_correspo
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import pose_difference, relative_transform
-from calibgraph.overlaps import tie_cameras
+from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import SAMPLE
@@ -37,7 +37,7 @@ def table_of(seen: Rig, missed: dict[str, float] | None = None) -> Correspondenc
 
 
 def matched(data: Dataset, table: Correspondences, terms: Terms = "full") -> MatchingRun:
-    return match_in_rounds(data, data.rig, table, Config(), terms, progress=no_progress)
+    return match_in_rounds(data, data.rig, table, Config(), terms=terms, progress=no_progress)
 
 
 def pair_error(rig: Rig, truth: Rig) -> tuple[float, float]:
@@ -51,7 +51,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
 ) -> None:
     off = perturb(truth, rotation_deg=0.3, translation_m=0.0, seed=1).T_camera_lidar
     run = matched(data, table_of(truth.moved_to({PAIR[1]: off[PAIR[1]]})))
-    tied = tie_cameras(run, no_progress)
+    tied = refine_with_camera_pairs(run, no_progress)
     assert tied.solution.camera_matches is not None
     assert tied.solution.camera_matches.pairs() == [PAIR]
     before, after = (pair_error(each.solution.solved_rig, truth) for each in (run, tied))
@@ -70,7 +70,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
 
 def test_cameras_that_were_not_found_are_not_tied(data: Dataset, truth: Rig) -> None:
     run = matched(data, table_of(truth, missed={PAIR[1]: 5.0}))
-    tied = tie_cameras(run, no_progress)
+    tied = refine_with_camera_pairs(run, no_progress)
     assert tied.solution.before_pairs is None
     assert tied.solution.optimum is run.solution.optimum
 
@@ -81,13 +81,13 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
     table = table_of(truth)
     run = matched(data, table)
     late = replace(run, out_of_time=True)
-    assert tie_cameras(late, no_progress) is late
+    assert refine_with_camera_pairs(late, no_progress) is late
     stage1 = matched(data, table, "stage1")
-    assert tie_cameras(stage1, no_progress) is stage1
+    assert refine_with_camera_pairs(stage1, no_progress) is stage1
     gone = {name: tmp_path / "gone.png" for name in truth.cameras}
     frames = tuple(replace(frame, image_paths=gone) for frame in data.frames)
     blind = replace(run, dataset=replace(data, frames=frames))
-    assert tie_cameras(blind, no_progress) is blind
+    assert refine_with_camera_pairs(blind, no_progress) is blind
 
 
 def test_a_single_camera_is_untouched(data: Dataset, truth: Rig) -> None:
@@ -95,7 +95,7 @@ def test_a_single_camera_is_untouched(data: Dataset, truth: Rig) -> None:
     alone = replace(data, rig=one)
     table = simulate_correspondences(one, frames=6, matches=100)
     run = match_in_rounds(alone, one, table, progress=no_progress)
-    assert tie_cameras(run, no_progress) is run
+    assert refine_with_camera_pairs(run, no_progress) is run
 
 
 def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: Path) -> None:

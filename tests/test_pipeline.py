@@ -49,7 +49,7 @@ def table_of(rig: Rig, *, places: bool = True) -> Correspondences:
     """With an error that its frames share, found where places can be found."""
     errors = MatcherErrors(outlier_share=0.1, frame_noise_px=0.5)
     table = simulate_correspondences(rig, frames=FRAMES, matches=100, errors=errors)
-    stated = STATED | {"contrast": dict.fromkeys(rig.cameras, 30.0)} if places else {}
+    stated = STATED | {"z_score": dict.fromkeys(rig.cameras, 30.0)} if places else {}
     return replace(table, metadata={**table.metadata, **stated})
 
 

@@ -32,8 +32,8 @@ from benchmarks.accuracy.audit_tables import report
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.tables import ROOT, add_record_option
 from calibgraph import Audit, CalibrationError, CameraAudit, Rig, check
-from calibgraph.audit.judgement import tail_of_axis
 from calibgraph.audit.result import by_unit
+from calibgraph.audit.significance import tail_of_axis
 
 Array = NDArray[np.float64]
 

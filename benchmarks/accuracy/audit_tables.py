@@ -10,7 +10,8 @@ from scipy.special import ndtr
 
 from benchmarks.accuracy.ledger import Record
 from benchmarks.tables import Table
-from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER
+from calibgraph.audit.judgement import CAMERA_AXES
+from calibgraph.audit.significance import FALSE_ALARM_RATE, POWER
 
 AXES = [
     f"{name} [{unit}]" for name, unit in zip(CAMERA_AXES, ["deg"] * 3 + ["cm"] * 3, strict=True)

@@ -162,7 +162,7 @@ def run_case(case: Key, scenes: Path) -> Record:
     spreads = {name: r.sigma_px for name, r in result.residuals.items()}
     return {**ledger.to_record(result, truth), "spread_px": spreads,
             "z_score": dict(result.correspondences.findings.z_score),
-            "probability": {n: None if v.doubt is None else v.doubt.probability
+            "probability": {n: v.error_probability and v.error_probability.probability
                             for n, v in result.camera_verdicts.items()}}  # fmt: skip
 
 

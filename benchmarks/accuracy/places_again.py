@@ -89,8 +89,8 @@ def stops_of(seed: int, count: int, beams: int, *, vary_layout: bool) -> Iterato
     back[1, 3] = OTHER_LANE_M
     for number, T in enumerate(drive.T_world_lidar):
         pose = T @ back if number % 3 == 2 else T  # noqa: PLR2004
-        cloud = scan(drive.world, lidar, gains, pose, np.random.default_rng([seed, number]))
-        yield Stop(seed, pose, UprightCloud.of(cloud))
+        cloud = scan(drive.world, lidar, gains, pose, rng=np.random.default_rng([seed, number]))
+        yield Stop(seed, pose, UprightCloud.from_cloud(cloud))
 
 
 def compare(one: Stop, other: Stop) -> Pair:

@@ -33,7 +33,7 @@ from benchmarks.accuracy import data_cases, ledger, table_cases
 from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import class_of
 from benchmarks.tables import ROOT, Table, add_record_option
-from calibgraph.model.verdict import FAIL_ABOVE, Check, Doubt, Verdict
+from calibgraph.model.verdict import FAIL_ABOVE, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import probability_of_lens
 from calibgraph.trust.probability import (
     STRUCTURE,
@@ -163,7 +163,7 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
-def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[Doubt]:
+def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbability]:
     """Of every sample."""
     weights, other = model["weights"], model["other"]
     grossly = [
@@ -171,7 +171,7 @@ def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[Doubt]:
         for s in samples
     ]
     return [
-        Doubt(1 - (1 - p) * (1 - s.by_lens), s.by_bar)
+        ErrorProbability(1 - (1 - p) * (1 - s.by_lens), s.by_bar)
         for p, s in zip(grossly, samples, strict=True)
     ]
 
@@ -181,7 +181,7 @@ def probabilities(model: dict[str, Any], samples: Sequence[Sample]) -> Array:
     return np.array([doubt.probability for doubt in doubts(model, samples)])
 
 
-def status_of(sample: Sample, doubt: Doubt) -> str:
+def status_of(sample: Sample, doubt: ErrorProbability) -> str:
     """The verdict, by the probability that it is off."""
     checks = (Check("worst", sample.vote, ""),)  # type: ignore[arg-type]
     return Verdict(checks, doubt).status

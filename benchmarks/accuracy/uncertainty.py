@@ -247,14 +247,14 @@ def copied(drawn: Drawn, rng: Rng, *, noise_px: float = 0.0, named: bool = False
         drawn: a full table.
         rng: draws the noise.
         noise_px: standard deviation per axis; copies are equal to the last bit without any.
-        named: whether the table states which frames are of one place (``same_place``).
+        named: whether the table states which frames are of one place (``stationary``).
     """
     first = drawn.table.select(drawn.table.frame < COPIED)
     numbers = [COPIED * copy for copy in range(COPIES)]
     table = concatenate([replace(first, frame=first.frame + number) for number in numbers])
     noise = noise_px * rng.standard_normal(table.pixels_px.shape)
     same = [[frame + number for number in numbers] for frame in range(COPIED)] if named else []
-    metadata = {**first.metadata, "same_place": same}
+    metadata = {**first.metadata, "stationary": same}
     return replace(
         drawn, table=replace(table, pixels_px=table.pixels_px + noise, metadata=metadata)
     )

@@ -187,7 +187,7 @@ def solve_gtsam_python(problem: Problem) -> Passes:
 
 def _start(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """The priors, and the start."""
-    priors = objective_graph(problem.rig, {}, problem.T_hat, CONFIG, "full")
+    priors = objective_graph(problem.rig, {}, problem.T_hat, CONFIG, terms="full")
     return priors, to_values(list(problem.rows), problem.T_hat)
 
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Collection
 
 from calibgraph.audit.judgement import (
     SEARCHES_FARTHER,
-    Tolerance,
     has_too_few_frames,
     judge_camera,
     judge_lidar,
 )
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
+from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
@@ -22,7 +22,7 @@ from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
-from calibgraph.overlaps import tie_cameras
+from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places
 from calibgraph.trust.cross_validation import competing_solution_checks
@@ -89,7 +89,7 @@ def check(
         run = match_from_deployed(matching, watch)
         with watch("places"):
             run = assign_places(run)
-        run = tie_cameras(run, report)
+        run = refine_with_camera_pairs(run, report)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
@@ -143,10 +143,10 @@ def _doubts_by_frames(
 ) -> dict[str, list[str]]:
     """Per camera, the frames that fit another extrinsic: something moved during the recording.
 
-    The solve leaves such frames out, and what is left agrees. Of matchers that may use what these
-    scores do not, nothing is concluded.
+    The solve leaves such frames out, and the rest agrees. Nothing is concluded about matchers that
+    use other information than these scores.
     """
-    if not run.matcher.fails_on_images or not cameras:
+    if not run.matcher.image_checks_can_fail or not cameras:
         return {}
     rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})

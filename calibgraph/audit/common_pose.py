@@ -49,7 +49,7 @@ class Poses:
         return len(self.results)
 
     def scatter(self, kept: Mask) -> float:
-        """Squared sigmas by which these results are apart: of 6 (n - 1) degrees of freedom."""
+        """Chi-squared of these results about their mean, with 6 (n - 1) degrees of freedom."""
         W, y = self.information[kept], self.twist[kept]
         mean = np.linalg.solve(W.sum(axis=0), np.einsum("nij,nj->i", W, y))
         return float(np.einsum("ni,nij,nj->", y - mean, W, y - mean))
@@ -64,8 +64,8 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freed
         covariance: (n, 6, 6) of xi in T_camera_lidar = exp(xi) estimate; positive definite.
         freedom: (n,) degrees of freedom of the covariances.
     """
-    apart = [np.linalg.norm(twists_between(T_camera_lidar, T), axis=1) for T in T_camera_lidar]
-    base = T_camera_lidar[int(np.argmin(np.sum(apart, axis=1)))]
+    distances = [np.linalg.norm(twists_between(T_camera_lidar, T), axis=1) for T in T_camera_lidar]
+    base = T_camera_lidar[int(np.argmin(np.sum(distances, axis=1)))]
     twist = -twists_between(T_camera_lidar, base)
     information: Array = np.asarray(np.linalg.inv(covariance), np.float64)
     return Poses(np.array(results, np.intp), base, twist, covariance, information, freedom)
@@ -73,7 +73,7 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freed
 
 @dataclass(frozen=True)
 class Limits:
-    """From where on an axis deviates: both have to be exceeded.
+    """An axis deviates if both limits are exceeded.
 
     Attributes:
         tail: probability of a larger deviation by chance, to either side.
@@ -84,19 +84,19 @@ class Limits:
     tolerance: Array
 
     def sigmas(self, freedom: Array) -> Array:
-        """How many sigmas are significant with these degrees of freedom."""
+        """Number of sigmas that is significant with these degrees of freedom."""
         return np.asarray(-stdtrit(freedom, self.tail), np.float64)
 
     def exceeded(self, deviation: Array, sigma: Array, freedom: Array) -> Mask:
-        """(..., 6) which axes of deviations are beyond both."""
+        """(..., 6) True for axes beyond both limits."""
         size = np.abs(deviation)
         beyond: Mask = (size > self.sigmas(freedom) * sigma) & (size > self.tolerance)
         return beyond
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
-    """How far each result is from the mean of others.
+class LeaveOneOutDeviation:
+    """Deviation of each result from the weighted mean of the others.
 
     Attributes:
         deviation: (n, 6) d_r.
@@ -118,7 +118,7 @@ class Apart:
         return limits.exceeded(self.deviation, self.sigma, self.freedom)
 
     def beyond(self, limits: Limits) -> Mask:
-        """(n,) whether an axis of a result is."""
+        """(n,) True for results with an axis beyond the limits."""
         return np.asarray(self.axes_beyond(limits).any(axis=1))
 
 
@@ -130,18 +130,18 @@ class Deviations:
         poses: of the camera.
         pool: (n,) the results whose mean each is compared with, itself excepted.
         agreeing: (n,) the largest part found that agrees.
-        apart: how far each is from that mean.
-        rivals: (n, n) whether result s may have changed in place of result r.
+        leave_one_out: deviation of each from that mean.
+        ambiguous: (n, n) True where result s may have changed in place of result r.
     """
 
     poses: Poses
     pool: Mask
     agreeing: Mask
-    apart: Apart
-    rivals: Mask
+    leave_one_out: LeaveOneOutDeviation
+    ambiguous: Mask
 
     def coefficients(self, r: int) -> Array:
-        """(n, 6, 6) by which the twist of each result enters d_r."""
+        """(n, 6, 6) derivative of d_r by the twist of each result."""
         others = self.pool.copy()
         others[r] = False
         W = np.where(others[:, None, None], self.poses.information, 0.0)
@@ -156,22 +156,18 @@ def compare(poses: Poses, limits: Limits) -> Deviations:
     The result that deviates most is removed from the mean of the others, until none that is left
     deviates. If no more than half are left, or the rest agrees as well with another result removed
     in place of this one, it is not known which of them changed: these are compared with each other.
-
-    Args:
-        poses: of one camera, at least two.
-        limits: of a deviation.
     """
     agreeing = _agreeing(poses, limits)
     if 2 * np.count_nonzero(agreeing) > len(poses):
-        rivals = _rivals(poses, agreeing, limits)
+        ambiguous = _ambiguous_pairs(poses, agreeing, limits)
     else:
-        rivals = ~np.eye(len(poses), dtype=np.bool_)
-    pool = agreeing | rivals.any(axis=1)
-    return Deviations(poses, pool, agreeing, _from_others(poses, pool), rivals)
+        ambiguous = ~np.eye(len(poses), dtype=np.bool_)
+    pool = agreeing | ambiguous.any(axis=1)
+    return Deviations(poses, pool, agreeing, _leave_one_out(poses, pool), ambiguous)
 
 
-def _from_others(poses: Poses, kept: Mask) -> Apart:
-    """Each result from the mean of the others among those that are kept."""
+def _leave_one_out(poses: Poses, kept: Mask) -> LeaveOneOutDeviation:
+    """Deviation of each result from the mean of the other kept results."""
     W = np.where(kept[:, None, None], poses.information, 0.0)
     of_mean = np.linalg.inv(_sums_of_others(W))
     weighted = _sums_of_others(np.einsum("nij,nj->ni", W, poses.twist))
@@ -180,7 +176,7 @@ def _from_others(poses: Poses, kept: Mask) -> Apart:
     own = _variances(poses.covariance) / _variances(covariance)
     of_others = _sums_of_others(poses.freedom * kept)[:, None]
     freedom = 1 / (own**2 / poses.freedom[:, None] + (1 - own) ** 2 / of_others)
-    return Apart(poses.twist - mean, covariance, freedom)
+    return LeaveOneOutDeviation(poses.twist - mean, covariance, freedom)
 
 
 def _sums_of_others(values: Array) -> Array:
@@ -195,29 +191,29 @@ def _agreeing(poses: Poses, limits: Limits) -> Mask:
     """(n,) the results that are left, one at least."""
     kept = np.ones(len(poses), np.bool_)
     while np.count_nonzero(kept) > 1:
-        apart = _from_others(poses, kept)
-        beyond = kept & apart.beyond(limits)
+        found = _leave_one_out(poses, kept)
+        beyond = kept & found.beyond(limits)
         if not beyond.any():
             break
-        # By so much less would the rest scatter without each result.
-        solved = np.linalg.solve(apart.covariance, apart.deviation[..., None])[..., 0]
-        less = np.einsum("ni,ni->n", apart.deviation, solved)
+        # Decrease of the chi-squared of the rest when each result is removed.
+        solved = np.linalg.solve(found.covariance, found.deviation[..., None])[..., 0]
+        less = np.einsum("ni,ni->n", found.deviation, solved)
         kept[np.argmax(np.where(beyond, less, -1.0))] = False
     return kept
 
 
-def _rivals(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
+def _ambiguous_pairs(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
     """(n, n) pairs of a removed result and one that is left, where the rest agrees either way."""
-    rivals = np.zeros((len(poses), len(poses)), np.bool_)
+    ambiguous = np.zeros((len(poses), len(poses)), np.bool_)
     for removed in np.flatnonzero(~agreeing):
         for left in np.flatnonzero(agreeing):
             swapped = agreeing.copy()
             swapped[[removed, left]] = True, False
-            agrees = not (swapped & _from_others(poses, swapped).beyond(limits)).any()
-            rivals[removed, left] = rivals[left, removed] = agrees
-    return rivals
+            agrees = not (swapped & _leave_one_out(poses, swapped).beyond(limits)).any()
+            ambiguous[removed, left] = ambiguous[left, removed] = agrees
+    return ambiguous
 
 
 def _variances(covariance: Array) -> Array:
-    """(n, 6) of (n, 6, 6)."""
+    """(n, 6) diagonals of (n, 6, 6) covariances."""
     return np.asarray(np.diagonal(covariance, axis1=1, axis2=2))

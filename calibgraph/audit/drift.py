@@ -14,14 +14,12 @@ from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,
-    Quantiles,
-    Tolerance,
     describe_motion,
-    detectable,
     find_lidar_motion,
     judge_axes,
 )
 from calibgraph.audit.result import LidarAudit
+from calibgraph.audit.significance import Quantiles, Tolerance, detectable
 from calibgraph.audit.trend import fit_slope
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
@@ -33,7 +31,7 @@ Array = NDArray[np.float64]
 FALSE_ALARM_RATE = 0.01
 """Probability of a significant axis in one call, over all cameras, results and trends."""
 
-_LATEST_DAY = 1e9  # a number of seconds would still be one, twice that of the present
+_LATEST_DAY = 1e9  # twice the present time in seconds
 
 _FAILED = "its verdict is FAIL, so that nothing is known of its error: do what its report advises"
 _NO_ERROR_BAR = "it has no error bar: its matches do not determine the camera"
@@ -81,7 +79,9 @@ def drift(
     found = {name: _compare_camera(loaded, name, limits) for name in cameras}
     compared = {name: each for name, each in found.items() if each is not None}
     judged = {
-        name: _judge_camera([*opened], loaded, name, compared.get(name), limits, tolerance)
+        name: _judge_camera(
+            [*opened], loaded, name, compared.get(name), limits=limits, tolerance=tolerance
+        )
         for name in cameras
     }
     unit = "result" if days is None else "day"
@@ -91,7 +91,7 @@ def drift(
         at=at,
         cameras=judged,
         trends={name: trend for name, trend in trends.items() if trend is not None},
-        lidar=tuple(_lidar(place, loaded, compared, judged, limits)
+        lidar=tuple(_lidar(place, loaded, compared, judged, limits=limits)
                     for place in range(len(loaded))),
         tolerance_deg=tolerance_deg,
         tolerance_cm=tolerance_cm,
@@ -100,11 +100,7 @@ def drift(
 
 
 def _times(days: Sequence[float] | None, count: int) -> Array:
-    """(n,) days, or places.
-
-    Raises:
-        ValueError: if there is not a day for each result, or one is none.
-    """
+    """(n,) days, or places."""
     at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
     if at.shape != (count,) or not (np.abs(at) <= _LATEST_DAY).all():
         raise ValueError(
@@ -142,6 +138,7 @@ def _judge_camera(
     results: list[Calibration],
     camera: str,
     found: Deviations | None,
+    *,
     limits: Limits,
     tolerance: Tolerance,
 ) -> tuple[CameraDrift, ...]:
@@ -150,13 +147,13 @@ def _judge_camera(
     if found is None:
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
-        deviation, sigma = found.apart.deviation[row], found.apart.sigma[row]
-        quantiles = Quantiles.of(found.apart.freedom[row], limits.tail)
+        deviation, sigma = found.leave_one_out.deviation[row], found.leave_one_out.sigma[row]
+        quantiles = Quantiles.from_freedom(found.leave_one_out.freedom[row], limits.tail)
         audit, reason = judge_axes(deviation, sigma, quantiles, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":
-            axes = tuple(np.flatnonzero(found.apart.axes_beyond(limits)[row]).tolist())
+            axes = tuple(np.flatnonzero(found.leave_one_out.axes_beyond(limits)[row]).tolist())
             reason += _whose_change(found, row, names)
             reason += SINGLE_CAMERA if len(results[0].rig.cameras) == 1 else ""
         smallest = detectable(sigma, quantiles.significant)
@@ -165,16 +162,16 @@ def _judge_camera(
 
 
 def _whose_change(found: Deviations, row: int, names: list[str]) -> str:
-    """What else may have changed in place of a result; empty if nothing."""
+    """The other results that may have changed instead, as the end of a sentence; may be empty."""
     count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
-    rivals = [names[found.poses.results[other]] for other in np.flatnonzero(found.rivals[row])]
-    if not rivals:
+    others = [names[found.poses.results[other]] for other in np.flatnonzero(found.ambiguous[row])]
+    if not others:
         return ""
     if count == 2:  # noqa: PLR2004 - no majority
-        return f" from {rivals[0]}; of two results it is not known which changed: give a third"
+        return f" from {others[0]}; of two results it is not known which changed: give a third"
     if 2 * agreeing <= count:
         return "; no more than half of the results agree, so that it is not known which changed"
-    return f"; it may be {' or '.join(rivals)} that changed, not this result: give more results"
+    return f"; it may be {' or '.join(others)} that changed, not this result: give more results"
 
 
 def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | None:
@@ -214,6 +211,7 @@ def _lidar(
     results: list[Calibration],
     compared: dict[str, Deviations],
     judged: dict[str, tuple[CameraDrift, ...]],
+    *,
     limits: Limits,
 ) -> LidarAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate, if one does."""
@@ -225,11 +223,13 @@ def _lidar(
     if covariance is None:
         return None
     rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
-    parts = [(each.apart, row) for each, row in zip(seen.values(), rows, strict=True)]
-    deviation = np.concatenate([apart.deviation[row] for apart, row in parts])
-    freedom = np.min([apart.freedom[row] for apart, row in parts])
+    parts = [(each.leave_one_out, row) for each, row in zip(seen.values(), rows, strict=True)]
+    deviation = np.concatenate([each.deviation[row] for each, row in parts])
+    freedom = np.min([each.freedom[row] for each, row in parts])
     bases = [each.poses.base for each in seen.values()]
-    return find_lidar_motion(deviation, covariance, bases, moved, float(limits.sigmas(freedom)))
+    return find_lidar_motion(
+        deviation, covariance, bases, moved=moved, quantile=float(limits.sigmas(freedom))
+    )
 
 
 def _joint_covariance(

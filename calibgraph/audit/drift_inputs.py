@@ -19,10 +19,6 @@ Results: TypeAlias = Sequence[Result] | Mapping[str, Result]
 def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
     """The results by their names: those given, of files the paths below their common folder.
 
-    Args:
-        given: results, or their folders or files.
-        own_lenses: whether the parameters of the lenses may differ.
-
     Raises:
         FileError: if one cannot be read.
         CalibrationError: if there are fewer than two, or they are not of one rig.
@@ -59,11 +55,7 @@ def _names(given: Sequence[Result]) -> list[str]:
 def _require_same_rig(
     first: str, one: Calibration, name: str, two: Calibration, *, own_lenses: bool
 ) -> None:
-    """Check that two results have the same cameras.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that two results have the same cameras."""
     a, b = one.rig.cameras, two.rig.cameras
     if a.keys() != b.keys():
         raise CalibrationError(

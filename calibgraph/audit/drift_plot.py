@@ -49,10 +49,6 @@ def _is_ours(path: Path) -> bool:
 def draw_drift(drift: Drift, path: Path) -> None:
     """Draw the deviations with their sigmas and the tolerance; PNG, atomically.
 
-    Args:
-        drift: the comparison.
-        path: of the picture.
-
     Raises:
         FileError: if it cannot be written there.
     """

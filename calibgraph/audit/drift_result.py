@@ -1,4 +1,4 @@
-"""What a comparison of results gives: per camera and result the deviation, and what follows."""
+"""The comparison of several results: per camera and result the deviation and its status."""
 
 from __future__ import annotations
 

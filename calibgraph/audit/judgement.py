@@ -8,7 +8,7 @@ Four statements about the deviation d of an axis with standard deviation sigma:
 * it is certainly within: |d| + p sigma <= tolerance, with 95 % confidence (p is 1.64 or more).
 
 Both are quantiles of Student's t: sigma is itself estimated, from the scatter of few frames. The
-part of it that is stated, for the error that all frames share, has no such doubt.
+stated part of it, for the error that all frames share, is taken as known.
 
 * these data would show a change as large as the tolerance: the smallest detectable one is below.
 
@@ -19,13 +19,20 @@ smallest detectable changes are below the tolerance. Else the data cannot tell.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri, ndtri, stdtrit
+from numpy.typing import NDArray
+from scipy.special import chdtri, ndtri
 
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
+from calibgraph.audit.significance import (
+    DISPLAY,
+    FALSE_ALARM_RATE,
+    Quantiles,
+    Tolerance,
+    detectable,
+    tail_of_axis,
+)
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.error_sources import MOST_TIMES, ErrorSources
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
@@ -37,18 +44,8 @@ from factors import pose_sigmas
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FALSE_ALARM_RATE = 1e-3
-"""Probability of a significant axis on a rig, of all its cameras, that has not changed."""
-
-POWER = 0.9
-"""Probability with which the smallest detectable change is told from none."""
-
-CONFIDENCE = 0.95
-"""Probability that an axis that counts as within the tolerance is."""
-
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
-_DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
 _UNSEEN = "a change as large as the tolerance could go unseen"
 _NO_ERROR_BAR = "the matches do not determine it: record structure near and far, all over the image"
 
@@ -63,96 +60,8 @@ _TOO_FEW_FRAMES = (
 )
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """The largest deviation per axis that is OK.
-
-    Raises:
-        ValueError: if one is not positive.
-    """
-
-    degrees: float
-    centimetres: float
-
-    def __post_init__(self) -> None:
-        for value, option in ((self.degrees, "tolerance_deg"), (self.centimetres, "tolerance_cm")):
-            if not 0 < value < np.inf:
-                raise ValueError(f"{option} must be positive and finite, found {value}")
-
-    @property
-    def twist(self) -> Array:
-        """(6,) rotation [rad], translation [m]."""
-        twist: Array = np.repeat([self.degrees, self.centimetres], 3) / _DISPLAY
-        return twist
-
-
-@dataclass(frozen=True, eq=False)
-class Quantiles:
-    """How many sigmas mean something, by the degrees of freedom that the sigmas have.
-
-    Attributes:
-        significant: (6,) from where on a deviation is none of chance.
-        confident: (6,) below which an error is with probability CONFIDENCE.
-    """
-
-    significant: Array
-    confident: Array
-
-    @classmethod
-    def of(cls, freedom: ArrayLike, tail: float) -> Quantiles:
-        """Of Student's t.
-
-        Args:
-            freedom: degrees of freedom of the sigmas, (6,) or of all; infinite where known.
-            tail: probability of a larger deviation by chance, to either side.
-        """
-        freedom = np.broadcast_to(np.asarray(freedom, np.float64), 6)
-        return cls(-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE))
-
-    def beside_known(self, share: Array, known: Quantiles) -> Quantiles:
-        """Of a variance of which only a share is estimated: squares add up (after Cochran).
-
-        It errs on the side of fewer alarms: a quarter of the stated ones if the shares are alike.
-
-        Args:
-            share: (6,) of the variances that is estimated.
-            known: quantiles of the rest.
-        """
-
-        def blend(ours: Array, theirs: Array) -> Array:
-            blended: Array = np.sqrt(share * ours**2 + (1 - share) * theirs**2)
-            return blended
-
-        return Quantiles(
-            blend(self.significant, known.significant), blend(self.confident, known.confident)
-        )
-
-
-def tail_of_axis(cameras: int) -> float:
-    """Probability of a significant deviation by chance, of one of six axes, to either side."""
-    return FALSE_ALARM_RATE / (2 * 6 * cameras)
-
-
-def detectable(sigma: Array, quantile: float | Array) -> Array:
-    """(6,) the smallest change per axis that is beyond a quantile with probability POWER.
-
-    Args:
-        sigma: (6,) standard deviations.
-        quantile: how many of them count, per axis or of all.
-    """
-    smallest: Array = (quantile + float(ndtri(POWER))) * sigma
-    return smallest
-
-
 def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance) -> CameraAudit:
-    """The audit of one camera.
-
-    Args:
-        evidence: of the solution; its guess is the deployed rig.
-        name: of the camera.
-        doubt: why the measurement cannot be trusted; empty if it can.
-        tolerance: on each axis.
-    """
+    """The audit of one camera."""
     z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
     if name in evidence.solution.held:
         return CameraAudit("CANNOT TELL", f"{doubt}; {SEARCHES_FARTHER}", z_score=z_score)
@@ -184,29 +93,29 @@ def _least_share(sources: ErrorSources | None) -> Array | float:
 
 
 def _unstated_error() -> Array:
-    """(6, 6) of the error that all frames share by a matcher that does not state it."""
-    usual = error_components().matchers[UNKNOWN]
+    """(6, 6) prior of the error that all frames share, for a matcher that states none."""
+    prior = error_components().matchers[UNKNOWN]
     sigmas = pose_sigmas(
-        rotation_rad=usual.systematic_rotation_rad, translation_m=usual.systematic_translation_m
+        rotation_rad=prior.systematic_rotation_rad, translation_m=prior.systematic_translation_m
     )
     return np.asarray(np.diag(sigmas**2))
 
 
 def has_too_few_frames(evidence: Evidence, name: str) -> bool:
-    """Whether a camera's error bar is none of its own frames, so that nothing can be told."""
+    """True if the covariance is not estimated from this camera's frames."""
     block = evidence.solution.inliers.blocks.get(name)
     few = block is not None and block.frames < ENOUGH_FRAMES
     return few and evidence.covariance_of(name) is not None
 
 
 def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
-    """Of a camera's error bar: of few frames' scatter, but for what is stated of shared errors."""
+    """Quantiles of a camera's error bar: Student's t for the scatter, normal for stated errors."""
     tail = tail_of_axis(len(evidence.cameras))
-    known = Quantiles.of(np.inf, tail)
+    known = Quantiles.from_freedom(np.inf, tail)
     block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
     if block is None or scatter is None:
         return known
-    estimated = Quantiles.of(block.frames - 1 + PSEUDO_FRAMES, tail)
+    estimated = Quantiles.from_freedom(block.frames - 1 + PSEUDO_FRAMES, tail)
     return estimated.beside_known(np.diag(scatter) / np.diag(covariance), known)
 
 
@@ -252,13 +161,7 @@ def judge_axes(
 
 
 def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
-    """What to do about axes that may be beyond the tolerance.
-
-    Args:
-        needed: (6,) the tolerance that these data could confirm, if nothing has changed.
-        blind: (6,) which axes need more than the tolerance.
-        recording_helps: whether enough frames would do.
-    """
+    """Advice about axes that may be beyond the tolerance."""
     if not blind.any():
         return "too near to the tolerance to decide: check another recording, of other places"
     enough = f"{np.degrees(needed[:3].max()):.2g} deg and {100 * needed[3:].max():.2g} cm"
@@ -273,10 +176,6 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
     """The motion of the LiDAR, if one explains the deviations of all cameras.
 
     None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
-
-    Args:
-        evidence: of the solution; its guess is the deployed rig.
-        cameras: all of them, with trusted measurements.
     """
     wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
     if evidence.joint_covariance is None:
@@ -284,13 +183,16 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
     deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
     T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
     quantile = float(ndtri(1 - tail_of_axis(len(cameras))))
-    return find_lidar_motion(deviation, evidence.joint_covariance, T_camera_lidar, wrong, quantile)
+    return find_lidar_motion(
+        deviation, evidence.joint_covariance, T_camera_lidar, moved=wrong, quantile=quantile
+    )
 
 
 def find_lidar_motion(
     deviation: Array,
     covariance: Array,
     T_camera_lidar: Sequence[Array],
+    *,
     moved: Collection[int],
     quantile: float,
 ) -> LidarAudit | None:
@@ -330,7 +232,7 @@ def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, .
         which: (6,) the axes to name.
         axes: (6) their names.
     """
-    values, errors = motion * _DISPLAY, sigma * _DISPLAY
+    values, errors = motion * DISPLAY, sigma * DISPLAY
     verbs = ["turned about"] * 3 + ["moved along"] * 3
     units = ["deg"] * 3 + ["cm"] * 3
     return ", ".join(

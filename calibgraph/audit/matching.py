@@ -26,15 +26,7 @@ _REACH_DEG, _REACH_CM = 0.7, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """What the rounds read.
-
-    Attributes:
-        data: images and clouds.
-        deployed: the rig that the rounds begin at.
-        matcher: its search is not used.
-        config: of the solves.
-        progress: called as the work goes on.
-    """
+    """Input of the rounds of matching."""
 
     data: Dataset
     deployed: Rig
@@ -49,7 +41,7 @@ class Matching:
 
 
 def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
-    """As few rounds as settle: the last tracking round, all of them, or after the first round.
+    """Match in as few rounds as settle: the last tracking round, all of these, or all rounds.
 
     Raises:
         CorrespondenceError: if no camera has enough correspondences.
@@ -90,12 +82,7 @@ def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> 
 
 
 def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:
-    """Whether every camera ended within reach, with a good z-score, after a short last step.
-
-    Args:
-        run: of the rounds.
-        still: the worst grade of the last step.
-    """
+    """Whether every camera ended within reach, with a good z-score, after a short last step."""
     z_scores, last = run.correspondences.findings.z_score, run.rounds[-1]
     deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
     for name, T in deployed.items():

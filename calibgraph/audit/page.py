@@ -1,4 +1,4 @@
-"""The page of an audit: is what is on the vehicle still right?"""
+"""The page of an audit: is the deployed calibration still right?"""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _reasons(audit: Audit) -> list[Reason]:
 
 
 def _advice(audit: Audit) -> list[str]:
-    """What to do, and what to record where the data cannot tell."""
+    """Advice by status: calibrate again, record again, or nothing."""
     statuses = {camera.status for camera in audit.cameras.values()}
     wrong = [_CALIBRATE] if "WRONG" in statuses else []
     unknown = [_RECORD] if "CANNOT TELL" in statuses else []
@@ -111,7 +111,7 @@ def _advice(audit: Audit) -> list[str]:
 
 
 def _detectable(audit: Audit) -> str:
-    """From which size on a change of any camera would have been seen."""
+    """The smallest detectable change over all cameras."""
     known = [c.detectable for c in audit.cameras.values() if c.detectable is not None]
     missing = [name for name, c in audit.cameras.items() if c.detectable is None]
     sentences = []

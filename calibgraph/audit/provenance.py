@@ -13,7 +13,7 @@ from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 
 
 class _Inputs(BaseModel):
-    """The key of a result's file that names what it was made from."""
+    """The inputs of a result, as its file names them."""
 
     inputs: dict[str, str] = {}
 
@@ -22,10 +22,6 @@ def is_made_from(rig: Path, data: Dataset) -> bool:
     """Whether a cloud of the recording is one that the calibration was made from.
 
     Only clouds with the name of one of its inputs are read.
-
-    Args:
-        rig: a result, its folder or file, or a rig, which does not name its recording.
-        data: the frames.
 
     Raises:
         FileError: if the result is malformed, or a cloud cannot be read.

@@ -1,4 +1,4 @@
-"""The result of an audit: per camera and axis what was measured, and what follows from it."""
+"""The result of an audit: per camera and axis the measurement, and its status."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class LidarAudit:
     """A motion of the LiDAR, which explains the deviations of all cameras.
 
     Attributes:
-        reason: one sentence: by how much it moved.
+        reason: the motion in one sentence.
         motion: (6,) xi in T_deployed_now = exp(xi), the pose of the LiDAR now in the LiDAR frame
             as deployed: rotation [rad], translation [m].
         sigma: (6,) standard deviations of ``motion``.
@@ -95,7 +95,7 @@ class Audit:
     same_recording: bool = False
 
     def of_recording(self, deployed: Rig, data: Dataset) -> Audit:
-        """The audit with what its page shows besides its numbers.
+        """The audit with the rig and the frame that its page shows.
 
         Args:
             deployed: the rig that was compared.
@@ -112,7 +112,7 @@ class Audit:
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """What is WRONG: the LiDAR alone, or the cameras by name."""
+        """The names that are WRONG: the LiDAR alone, or cameras."""
         if self.lidar is not None:
             return ("LiDAR",)
         return tuple(name for name, camera in self.cameras.items() if camera.status == "WRONG")

@@ -31,14 +31,14 @@ class Slope:
 
     @property
     def squared_sigmas(self) -> float:
-        """By so much less do the deviations scatter about the slope than about their means."""
+        """Decrease of chi-squared by the slope, relative to constant means."""
         return float(self.change @ np.linalg.solve(self.covariance, self.change))
 
 
 def fit_slope(x: Array, batch: NDArray[np.intp], information: Array, y: Array) -> Slope | None:
     """The slope of deviations over x, within batches, by generalised least squares.
 
-    Each batch has a centre of its own, so that what changed between batches is no slope.
+    Each batch has its own centre, so that a change between batches is no slope.
 
     Args:
         x: (n,) where each was measured; NaN where that is not known.

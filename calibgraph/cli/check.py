@@ -41,9 +41,9 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.judgement import Tolerance
     from calibgraph.audit.provenance import is_made_from
     from calibgraph.audit.result import audit_of
+    from calibgraph.audit.significance import Tolerance
     from calibgraph.io.rigs import load_rig
 
     with checked_arguments():

@@ -56,9 +56,11 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
 def print_summary(console: Console, summary: Summary) -> None:
     """Print the verdict, at most three reasons, what to do, and how much is folded."""
     status = summary.status
-    doubt = f": {summary.doubt}" if summary.doubt else ""
+    probability = f": {summary.error_probability}" if summary.error_probability else ""
     console.print(
-        f"[bold {_COLOURS[status]}]{status}[/]{escape(doubt)}", highlight=False, soft_wrap=True
+        f"[bold {_COLOURS[status]}]{status}[/]{escape(probability)}",
+        highlight=False,
+        soft_wrap=True,
     )
     for reason in summary.reasons:
         print_plain(console, f"  {reason.status}  {', '.join(reason.cameras)}: {reason.text}")
@@ -107,7 +109,7 @@ def result_table(result: Calibration) -> Table:
         table.add_row(
             escape(name),
             f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
-            "-" if verdict.doubt is None else verdict.doubt.percent,
+            "-" if verdict.error_probability is None else verdict.error_probability.percent,
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",
             "-" if residuals is None else f"{residuals.median_px:.2f}",

@@ -121,7 +121,9 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
             camera=name,
             verdict=verdict.status,
             cannot_tell=verdict.cannot_tell,
-            probability_off=None if verdict.doubt is None else verdict.doubt.probability,
+            probability_off=None
+            if verdict.error_probability is None
+            else verdict.error_probability.probability,
             reasons=tuple(reason.text for reason in result.summary_of(name).reasons),
             actions=result.summary_of(name).actions,
             T_camera_lidar=tuple(result.T_camera_lidar[name].ravel().tolist()),

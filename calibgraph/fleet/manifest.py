@@ -145,7 +145,7 @@ def load_manifest(uri: str) -> Manifest:
              for name in _OWN]  # fmt: skip
     folder, files = uri.rpartition("/")[0], dict[str, Any]()
     jobs = tuple(
-        _job(_Place(uri, row), folder, files, *cells)
+        _job(_Place(uri, row), folder, files, **dict(zip(_OWN, cells, strict=True)))
         for row, cells in enumerate(zip(*given, strict=True))
     )
     _require_different(uri, jobs)
@@ -198,7 +198,7 @@ class _Place:
 
 
 def _job(
-    place: _Place, folder: str, files: dict[str, Any], vehicle: Any, recording: Any, rig: Any,
+    place: _Place, folder: str, files: dict[str, Any], *, vehicle: Any, recording: Any, rig: Any,
     settings: Any,
 ) -> Job:  # fmt: skip
     """A row's job; ``files`` keeps the settings' files that were read."""

@@ -116,7 +116,7 @@ def objective_graph(
     blocks: Mapping[str, ProjectionBlock],
     T_hat: Mapping[str, Array],
     config: Config,
-    terms: Terms,
+    *, terms: Terms,
 ) -> gtsam.NonlinearFactorGraph:
     """The whole objective (paper, Eq. 5), and the measured relative poses of the rig.
 

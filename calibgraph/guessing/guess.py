@@ -79,7 +79,7 @@ class RigGuess:
 
     @property
     def lines(self) -> list[str]:
-        """A line per camera: where it is by the guess, from what, how good; then what to do."""
+        """A line per camera with its pose, source and accuracy; then advice."""
         where = describe_rig(self.rig)
         return [
             *(f"{sentence}; {guess.text}; 1 sigma: {guess.rotation_sigma_deg:.2g} deg, "
@@ -176,7 +176,7 @@ class _TiedCamera:
 def _tied_cameras(
     parts: RigParts, said: Mapping[str, Array], names: Collection[str]
 ) -> dict[str, _TiedCamera]:
-    """Those of some cameras that are tied to one with words, to the first if to several."""
+    """The cameras that a relative pose ties to one with words, to the first if to several."""
     tied: dict[str, _TiedCamera] = {}
     for to, T in said.items():
         for name, T_camera_lidar in parts.tied_to(to, T).items():
@@ -224,7 +224,7 @@ def _of_words(mounting: Mounting) -> CameraGuess:
 
 
 def _of_pair(one: _TiedCamera, other: CameraGuess) -> CameraGuess:
-    """The other's sigmas; its turn moves the camera by as much as they are apart."""
+    """The other's sigmas, with its rotation error times the distance added to the translation."""
     shift_m = one.apart_m * math.radians(other.rotation_sigma_deg)
     translation_m = math.hypot(other.translation_sigma_m, shift_m)
     return CameraGuess("pair", other.rotation_sigma_deg, translation_m, f"by its pose to {one.to}")

@@ -1,4 +1,4 @@
-"""The search for cameras of which nothing is known: over all headings, by images and clouds."""
+"""The search for cameras without any guess: over all headings, by images and clouds."""
 
 from __future__ import annotations
 
@@ -59,18 +59,10 @@ def search_headings(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> dict[str, FoundCamera]:
-    """Find cameras of which nothing is known but the lens, and that images are upright.
+    """Find cameras without a guess: only the lens is known, and that images are upright.
 
     One after another, over headings all round, each within 20 degrees and 1.5 m per axis of a level
     camera at the LiDAR. Those that are found place others that see the same.
-
-    Args:
-        dataset: images and clouds.
-        rig: lenses; its extrinsics of these cameras do not count.
-        cameras: their names.
-        forward: the axis of the LiDAR frame that points ahead.
-        seed: of the search.
-        progress: called as headings are done.
 
     Raises:
         FileError: if an image or a cloud cannot be read.
@@ -82,7 +74,7 @@ def search_headings(
     with core_pool() as cores:
         chosen = spread_out(dataset.frames, SEARCH_FRAMES)
         frames = load_camera_frames(FrameCache(), chosen, only, cores)
-        search = PoseSearch(only, frames, RANGE, seed, lambda: False)
+        search = PoseSearch(only, frames, RANGE, seed=seed, out_of_time=lambda: False)
         for index, name in enumerate(names):
             body = {name: lenses[name]}
             starts = [Mounting(float(deg)).T_camera_lidar(forward) for deg in HEADINGS_DEG]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.errors import RigError
-from calibgraph.model.geometry import T_OPTICAL_LINK, invert
+from calibgraph.model.geometry import T_OPTICAL_LINK, invert, transform
 
 Array = NDArray[np.float64]
 Forward = Literal["+x", "-x", "+y", "-y"]
@@ -43,11 +43,11 @@ GRAMMAR = (
 _FORWARD_DEG: Mapping[Forward, float] = {"+x": 0.0, "+y": 90.0, "-x": 180.0, "-y": -90.0}
 
 WORD_SIGMAS = {"heading": 10.0, "tilt": 3.0, "roll": 3.0, "ahead": 0.8, "left": 0.4, "up": 0.9}
-"""Degrees and metres of what the words leave open: root mean squares over 21 cameras of 8 recorded
+"""Degrees and metres that the words leave open: root mean squares over 21 cameras of 8 recorded
 vehicles about the nearest of the eight headings, level and at the LiDAR (8.2, 2.0, 0.9 deg; 0.72,
 0.33, 0.85 m), rounded up."""
 SAID_DEG, SAID_M, SAID_SHARE = 5.0, 0.05, 0.1
-"""Of numbers that are given: chosen for estimates by eye; a length by so much and such a share."""
+"""Sigmas of given numbers: chosen for estimates by eye; of a length, a constant and a share."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +79,10 @@ class Mounting:
         return max(self.sigmas[name] for name in ("ahead", "left", "up"))
 
     def T_camera_lidar(self, forward: Forward = "+x") -> Array:
-        """(4, 4) of the camera's optical frame.
-
-        Args:
-            forward: the axis of the LiDAR frame that points ahead; z is up.
-        """
-        T_vehicle_link, T_lidar_vehicle = np.eye(4), np.eye(4)
+        """(4, 4) of the camera's optical frame."""
         angles = (self.heading_deg, self.tilt_deg, self.roll_deg)
-        T_vehicle_link[:3, :3] = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
-        T_vehicle_link[:3, 3] = self.place_m
-        turned = Rotation.from_euler("Z", _FORWARD_DEG[forward], degrees=True)
-        T_lidar_vehicle[:3, :3] = turned.as_matrix()
+        T_vehicle_link = transform(Rotation.from_euler("ZYX", angles, degrees=True), self.place_m)
+        T_lidar_vehicle = transform(Rotation.from_euler("Z", _FORWARD_DEG[forward], degrees=True))
         T: Array = T_OPTICAL_LINK @ invert(T_lidar_vehicle @ T_vehicle_link)
         return T
 
@@ -108,10 +101,6 @@ def check_forward(text: str) -> Forward:
 
 def parse_mounting(text: str, camera: str) -> Mounting:
     """Read how a camera is mounted.
-
-    Args:
-        text: a heading, then turns of the camera from it and its place, see ``GRAMMAR``.
-        camera: its name, for errors.
 
     Raises:
         RigError: if a word is not understood, said twice, or the heading is missing.

@@ -106,11 +106,7 @@ def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "
 
 
 def _require_plain_folder(folder: Path) -> None:
-    """Refuse what brings lenses of its own.
-
-    Raises:
-        FileError: if the folder does, or is none.
-    """
+    """Refuse a dataset that has its own lenses."""
     if is_bag(folder):
         raise FileError(folder, "is a ROS bag with lenses of its own; calibgraph bag writes them")
     if not folder.is_dir():

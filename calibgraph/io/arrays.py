@@ -85,7 +85,9 @@ def dataset_from_arrays(
     first = _cloud(clouds[0], 0)
     return Dataset(
         rig=rig,
-        frames=tuple(_frame(root, number, rig, clouds, images) for number in range(frames)),
+        frames=tuple(
+            _frame(root, number, rig, clouds=clouds, images=images) for number in range(frames)
+        ),
         folders=(root,),
         notes=tuple(describe_cloud("clouds[0]", first)),
     )
@@ -106,6 +108,7 @@ def _frame(
     root: Path,
     number: int,
     rig: Rig,
+    *,
     clouds: Sequence[ArrayLike],
     images: Mapping[str, Sequence[ArrayLike]],
 ) -> ArrayFrame:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, StrictBool
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, holds_truth_value, read_yaml, sha256
@@ -26,7 +26,7 @@ from calibgraph.model.result_files import (
     is_calibration_file,
 )
 from calibgraph.model.rig import Finite, Rig
-from calibgraph.model.verdict import Check, Doubt, Status, Verdict
+from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
 
 Array = NDArray[np.float64]
 Table = TypeVar("Table")
@@ -53,7 +53,9 @@ def load_calibration(path: Path | str) -> Calibration:
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
         config=checked_model(Config, parts.config, path),
-        camera_verdicts={k: Verdict(v.checks, v.doubt) for k, v in parts.camera_verdicts.items()},
+        camera_verdicts={
+            k: Verdict(v.checks, v.error_probability) for k, v in parts.camera_verdicts.items()
+        },
         bootstrap=parts.bootstrap_covariance,
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
@@ -145,7 +147,10 @@ class _FrameEntry(BaseModel):
 class _Checks(BaseModel):
     status: Status
     checks: tuple[Check, ...]
-    doubt: Doubt | None = None
+    error_probability: ErrorProbability | None = Field(
+        None,
+        validation_alias=AliasChoices("error_probability", "doubt"),  # its former key
+    )
 
 
 class _Parts(BaseModel):

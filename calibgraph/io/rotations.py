@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import ROUNDING
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
     length = math.hypot(*xyzw)
     if not abs(length - 1.0) <= ROUNDING:
         raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
-    return _pose(xyz_m, Rotation.from_quat(xyzw).as_matrix())
+    return transform(Rotation.from_quat(xyzw).as_matrix(), xyz_m)
 
 
 def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
@@ -52,10 +53,4 @@ def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
             f"roll, pitch, yaw are {roll:g}, {pitch:g}, {yaw:g} rad, beyond 2 pi: are they in "
             "degrees? give radians, 90 deg is 1.5708"
         )
-    return _pose(xyz_m, gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix())
-
-
-def _pose(xyz_m: Sequence[float], R: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, xyz_m
-    return T
+    return transform(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix(), xyz_m)

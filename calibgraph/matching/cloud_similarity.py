@@ -1,8 +1,8 @@
 """Whether two clouds show the same place, and the motion between them, from the clouds alone.
 
-What stands upright is seen from above. The magnitude of that image's spectrum does not change with
-where the vehicle stands, so a correlation along its polar angle gives the heading (Fourier-Mellin),
-then one of the images the offset. ICP refines it, and upright points of both clouds must coincide.
+Upright structure is drawn as an image from above. The magnitude of its spectrum is invariant to the
+vehicle's position, so a correlation along its polar angle gives the heading (Fourier-Mellin), then
+one of the images the offset. ICP refines it, and upright points of both clouds must coincide.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 
 Array = NDArray[np.float64]
 
@@ -64,8 +64,8 @@ class UprightCloud:
     polar: NDArray[np.complex64]
 
     @staticmethod
-    def of(cloud: NDArray[np.floating]) -> UprightCloud:
-        """Of a cloud, (n, 3) or more columns [m], z up."""
+    def from_cloud(cloud: NDArray[np.floating]) -> UprightCloud:
+        """Extract upright structure from a cloud with (n, 3) or more columns [m], z up."""
         chosen = np.random.default_rng(0).random(len(cloud)) * len(cloud) < _MOST_POINTS
         points = _upright_points(np.asarray(cloud[chosen, :3], dtype=np.float64))
         image = _from_above(points)
@@ -96,10 +96,6 @@ class UprightCloud:
 def align_with_any(now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[int, Array] | None:
     """Which of some clouds shows the place of another one best, and the motion between them.
 
-    Args:
-        now: the one.
-        known: the others.
-
     Returns:
         The row of the most similar of them, and (4, 4) T_now_known of the LiDAR; None if they show
         other places. Of clouds within 10 m nearly all are found, beyond 20 m half of them.
@@ -119,7 +115,7 @@ def align_with_any(now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[in
 
 
 def _upright_points(points: Array) -> Array:
-    """Those above the ground in cells with points at several heights, one per voxel."""
+    """Points above the ground in cells with points at several heights, one per voxel."""
     ranges = np.hypot(points[:, 0], points[:, 1])
     near = (ranges > _LEAST_RANGE_M) & (ranges < _REACH_M) & (np.abs(points[:, 2]) < _HEIGHT_M)
     points = points[near]
@@ -150,13 +146,7 @@ def _from_above(points: Array) -> Array:
 
 
 def _correlate(known: UprightCloud, now: UprightCloud, turn: int) -> tuple[float, Array]:
-    """The best correlation of two images from above, and (4, 4) T_known_now there.
-
-    Args:
-        known: the one cloud.
-        now: the other.
-        turn: by how many of the _ANGLES one is turned, or by half a turn more.
-    """
+    """The best correlation of two images from above, and (4, 4) T_known_now there."""
     best, T_best = -1.0, np.eye(4)
     for angle in (turn * np.pi / _ANGLES, turn * np.pi / _ANGLES + np.pi):
         T = np.eye(4)
@@ -189,10 +179,8 @@ def _rigid_fit(source: Array, target: Array) -> Array:
     """(4, 4) that moves (n, 3) points onto others, least squares (Kabsch, 1976)."""
     means = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((source - means[0]).T @ (target - means[1]))
-    T = np.eye(4)
-    T[:3, :3] = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    T[:3, 3] = means[1] - T[:3, :3] @ means[0]
-    return T
+    R = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    return transform(R, means[1] - R @ means[0])
 
 
 def _overlap(known: UprightCloud, now: UprightCloud, T_known_now: Array) -> float:
@@ -211,6 +199,6 @@ def _share(target: UprightCloud, source: UprightCloud, T_target_source: Array) -
 
 
 def _some(points: NDArray[np.floating], most: int) -> Array:
-    """At most so many of (n, 3) points, evenly chosen."""
+    """An evenly spread selection of (n, 3) points."""
     rows = np.linspace(0, len(points) - 1, min(most, len(points)))
     return points[rows.astype(np.intp)].astype(np.float64)

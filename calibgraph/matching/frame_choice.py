@@ -1,4 +1,4 @@
-"""Which frames of a long recording are matched: of places apart, neither blurred nor dark."""
+"""Choose the frames of a long recording that are matched: distant places, sharp and bright."""
 
 from __future__ import annotations
 
@@ -18,18 +18,13 @@ from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
 
 CANDIDATES = 3
-"""Images are read of so many frames for each that is chosen: there is a clear one in three, unless
+"""Frames whose images are read, per chosen frame: there is a clear one in three, unless
 a lens is covered, and more would take longer than the matching."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameChoice:
-    """Some frames of a dataset.
-
-    Attributes:
-        dataset: with these alone.
-        text: how they were chosen, in one line; empty if they are all.
-    """
+    """Some frames of a dataset."""
 
     dataset: Dataset
     text: str = ""
@@ -51,15 +46,10 @@ class _Candidate:
 
 
 def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
-    """At most so many frames, spread over the recording; all of them if there are no more.
+    """Choose frames spread over the recording; all of them if there are no more.
 
     While the vehicle stands, one is taken. Of neighbours, that with the clearest images is: the
     largest product over the cameras of their images' mean gradient.
-
-    Args:
-        dataset: in the order of time.
-        rig: its cameras' names and sizes.
-        most: number of frames.
     """
     if len(dataset.frames) <= most:
         return FrameChoice(dataset)
@@ -90,7 +80,7 @@ def _examine(frame: Frame, rig: Rig) -> _Candidate:
         except (CalibrationError, OSError, KeyError):
             continue
         clarity[index] = _clarity(gray)
-        view = view or (index, View.of(gray))
+        view = view or (index, View.from_image(gray))
     return _Candidate(frame, clarity, view)
 
 

@@ -17,11 +17,7 @@ from calibgraph.progress import Progress
 
 
 class TableMatcher:
-    """A matcher that returns correspondences found before: a table, from a file or in memory.
-
-    Args:
-        table: of any frames; those that the dataset lacks are left out.
-    """
+    """A matcher that returns correspondences found before: a table, from a file or in memory."""
 
     rounds = 1
     stage1: Stage1Source = "pnp"
@@ -39,10 +35,6 @@ class TableMatcher:
 
 def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> FullMatcher:
     """Find a matcher, and complete it with the defaults of the protocol.
-
-    Args:
-        matcher: ``structure``; a table of correspondences, or its file; a matcher.
-        seed: for a matcher by name that draws random numbers.
 
     Raises:
         ValueError: if it is a name, but not of a matcher; or if the matcher has no round.

@@ -2,7 +2,7 @@
 
 The motion from one frame to the next follows from features of a camera's images that both see,
 with depths from the cloud: robust PnP, in metres, without odometry; or from the two clouds. Who
-comes back to a place, in whatever direction, is recognised by the cloud of the place's first frame.
+returns to a place, in any direction, is recognised by the cloud of the place's first frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from calibgraph.parallel import core_pool
 Array = NDArray[np.float64]
 
 PLACE_M = 20.0
-"""Frames within so many metres of a place's first frame are of that place: a camera that looks
+"""Radius [m] of a place about its first frame: a camera that looks
 ahead matches objects at 10 to 50 m."""
 
 Motion = NDArray[np.float64] | None
@@ -44,12 +44,6 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
     of a new one. If neither images nor clouds show the motion, unlike clouds are evidence of
     another place; a cloud in which little stands upright is none, and its frame stays at the place
     before.
-
-    Args:
-        dataset: images and clouds.
-        camera: whose images are compared.
-        lens: the camera, at its extrinsic.
-        seed: of the robust fits.
 
     Raises:
         FileError: if an image or a cloud cannot be read.
@@ -77,12 +71,7 @@ class PlaceWalk:
         self._most, self._in_sequence = most_places, in_sequence
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
-        """The number of the first frame of this frame's place.
-
-        Args:
-            frame: the next one.
-            step: from the frame before, as its images show it.
-        """
+        """The number of the first frame of this frame's place."""
         before, self._before = self._before, frame
         if before is None or before.cloud_path.parent != frame.cloud_path.parent:
             self._find_place(frame)
@@ -99,7 +88,7 @@ class PlaceWalk:
         return self._first
 
     def remember(self, frame: Frame) -> None:
-        """Know the place of which this is the first frame."""
+        """Register a place by its first frame."""
         self._visit(frame.index, _upright_cloud(frame))
 
     def _find_place(self, frame: Frame, *, left: int | None = None, may_stay: bool = False) -> None:
@@ -135,9 +124,9 @@ def _are_comparable(before: Frame, now: Frame) -> bool:
 
 
 def _upright_cloud(frame: Frame) -> UprightCloud | None:
-    """What stands in a frame's cloud; None if it cannot be read, which the matcher reports."""
+    """The upright structure of a frame's cloud; None if unreadable, which the matcher reports."""
     try:
-        return frame.derive("upright", lambda: UprightCloud.of(frame.load_cloud()))
+        return frame.derive("upright", lambda: UprightCloud.from_cloud(frame.load_cloud()))
     except (CalibrationError, OSError):
         return None
 
@@ -162,7 +151,7 @@ class PlaceFinder:
         self._before: _SeenFrame | None = None
 
     def remember(self, frame: Frame) -> None:
-        """Know the place of which this is the first frame, without being there."""
+        """Register a place by its first frame, without moving to it."""
         self._walk.remember(frame)
 
     def first_of_place(self, frame: Frame) -> int:
@@ -222,7 +211,7 @@ def _motion(
     lens: Camera,
     seed: int,
 ) -> Motion:
-    """From features of the earlier frame with depth to where the later one sees them."""
+    """Matches of the earlier frame's features that have depth to the later frame's pixels."""
     (frame, before), (_, after) = both
     if before is None or after is None:
         return None

@@ -1,15 +1,15 @@
 """The matcher protocol: three members that every matcher has, and five more that it may have.
 
-`Matcher` is what a matcher of your own needs. The program works with `FullMatcher`, which has every
-member; `to_full_matcher` adds the defaults of those that are missing. In calibration they are used
-in this order:
+`Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
+members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
+order:
 
-1. `most_frames`: so many frames of the dataset are used.
+1. `most_frames`: the largest number of frames that is used.
 2. `locate`: from where the rounds begin, and with which round.
 3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
 4. `tracking_rounds`: run again from a start displaced from the result.
 5. `release`: no more rounds follow.
-6. `fails_on_images`: whether the checks on images may FAIL the result.
+6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
 from __future__ import annotations
@@ -28,13 +28,7 @@ from calibgraph.progress import Progress
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a matcher's rounds begin.
-
-    Attributes:
-        rig: with the extrinsics to begin from.
-        first_round: index of the first round.
-        findings: of the search; they are added to those of every round.
-    """
+    """Where a matcher's rounds begin."""
 
     rig: Rig
     first_round: int = 0
@@ -42,7 +36,7 @@ class Start:
 
 
 class Matcher(Protocol):
-    """Finds correspondences: the least that a matcher of your own needs.
+    """Finds correspondences: the required members of a matcher.
 
     The members of :class:`FullMatcher` are optional. A class attribute, an attribute or a property
     will do for each member but ``match``.
@@ -99,7 +93,7 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     @property
-    def fails_on_images(self) -> bool:
+    def image_checks_can_fail(self) -> bool:
         """Whether the checks on images may FAIL a result; if not (default), they WARN at most.
 
         The image evidence is measured by the matcher ``structure``, from which another matcher may
@@ -110,22 +104,15 @@ class FullMatcher(Matcher, Protocol):
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
-        """Find where the rounds begin; by default, at the initial guess.
-
-        Args:
-            dataset: images and clouds.
-            rig: lenses, and the initial guess.
-            out_of_time: whether the time limit has passed; then return what there is.
-            progress: called as the work goes on.
-        """
+        """Find where the rounds begin; by default, at the initial guess."""
         ...
 
     def release(self) -> None:
-        """Drop what is kept from round to round; by default, nothing is."""
+        """Release memory that is kept between rounds; does nothing by default."""
         ...
 
 
-class CompletedMatcher:
+class MatcherWithDefaults:
     """A matcher with defaults in place of the members that it lacks: the only place of defaults."""
 
     def __init__(self, matcher: Matcher) -> None:
@@ -134,7 +121,9 @@ class CompletedMatcher:
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
-        self.fails_on_images = bool(getattr(matcher, "fails_on_images", False))
+        self.image_checks_can_fail = bool(
+            getattr(matcher, "image_checks_can_fail", getattr(matcher, "fails_on_images", False))
+        )  # fails_on_images: its former name
         self._locate = getattr(matcher, "locate", None)
         self._release = getattr(matcher, "release", None)
 
@@ -155,7 +144,7 @@ class CompletedMatcher:
         return replace(table, metadata={STAGE1: self.stage1, **table.metadata})
 
     def release(self) -> None:
-        """Drop what the matcher keeps from round to round."""
+        """Release the memory that the matcher keeps between rounds."""
         if self._release is not None:
             self._release()
 
@@ -166,7 +155,7 @@ def to_full_matcher(matcher: Matcher) -> FullMatcher:
     Raises:
         ValueError: if it has less than one round.
     """
-    full = CompletedMatcher(matcher)
+    full = MatcherWithDefaults(matcher)
     if full.rounds < 1:
         raise ValueError(f"the matcher has {full.rounds} rounds, expected at least 1")
     return full

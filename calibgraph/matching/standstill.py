@@ -1,4 +1,4 @@
-"""Frames of one place: while the vehicle stands, all frames show the same, and err the same."""
+"""Stationary frames: while the vehicle stands, all frames show the same and share one error."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from calibgraph.model.rig import Rig
 
 Gray = NDArray[np.uint8]
 
-STANDING_PX = 0.5
-"""Median image motion of the recorded image, below which a camera stands: matches are not nearer
-than that, so they err alike."""
+STATIONARY_PX = 0.5
+"""Median image motion of the recorded image, below which a camera stands: matches are less
+precise, so they share one error."""
 
 _SCALE = 2  # times smaller than recorded, for speed; flow is good to some hundredths of a pixel
 _FEATURES, _MIN_FEATURES = 200, 20
@@ -43,8 +43,8 @@ class View:
     corners: NDArray[np.float32]
 
     @staticmethod
-    def of(gray: Gray) -> View:
-        """Of a (height, width) image as recorded."""
+    def from_image(gray: Gray) -> View:
+        """Prepare a (height, width) image as recorded."""
         size = (gray.shape[1] // _SCALE, gray.shape[0] // _SCALE)
         image = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         thumb = cv2.resize(image, _THUMB, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
@@ -72,31 +72,27 @@ class View:
         if good.mean() < _TRACKED:
             return False
         motion = np.linalg.norm((there - self.corners)[good, 0], axis=1)
-        return bool(_SCALE * np.median(motion) < STANDING_PX)
+        return bool(_SCALE * np.median(motion) < STATIONARY_PX)
 
 
-def same_places(dataset: Dataset, rig: Rig) -> list[list[int]]:
-    """The numbers of the frames at one place, of every place that has several.
+def find_stationary_frames(dataset: Dataset, rig: Rig) -> list[list[int]]:
+    """The frame numbers of every stop that has several frames.
 
-    A frame is where an earlier one is if no camera has moved, by the motion of its image; moving
-    traffic may fill less than half of it.
-
-    Args:
-        dataset: images.
-        rig: its cameras' names and sizes.
+    Two frames are of one stop if the median image motion is below ``STATIONARY_PX`` in every
+    camera; moving traffic may fill less than half of an image.
 
     Raises:
         FileError: if an image cannot be read.
     """
-    places: list[tuple[_Views, list[int]]] = []
+    stops: list[tuple[_Views, list[int]]] = []
     for frame in dataset.frames:
         views = _Views(frame, rig)
-        members = next((found for first, found in places if first.same_place(views)), None)
+        members = next((found for first, found in stops if first.is_stationary(views)), None)
         if members is None:
-            places.append((views, [frame.index]))
+            stops.append((views, [frame.index]))
         else:
             members.append(frame.index)
-    return [members for _, members in places if len(members) > 1]
+    return [members for _, members in stops if len(members) > 1]
 
 
 class _Views:
@@ -106,16 +102,16 @@ class _Views:
         self._frame, self._rig = frame, rig
         self._views: dict[str, View] = {}
 
-    def of(self, name: str) -> View:
+    def view(self, name: str) -> View:
         if name not in self._views:
             gray = self._frame.load_gray(name, self._rig.cameras[name])
-            self._views[name] = View.of(gray)
+            self._views[name] = View.from_image(gray)
         return self._views[name]
 
-    def same_place(self, later: _Views) -> bool:
+    def is_stationary(self, later: _Views) -> bool:
         """Whether no camera has moved, and at least one can tell."""
         names = [name for name in self._rig.cameras if self._sees(name) and later._sees(name)]
-        return _none_moved(self.of(name).stands(later.of(name)) for name in names)
+        return _none_moved(self.view(name).stands(later.view(name)) for name in names)
 
     def _sees(self, name: str) -> bool:
         return name in self._frame.image_paths

@@ -178,7 +178,7 @@ class Calibration:
 
     @property
     def not_included(self) -> str:
-        """What the error bars leave out, in words: relative poses show the scale of the clouds."""
+        """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         if self.rig.relative_poses:
             return "errors of the intrinsics are not included"
         return "errors of the intrinsics, and of the clouds' scale, are not included"
@@ -305,10 +305,9 @@ def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
 
 
 def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
-    doubt = None if verdict.doubt is None else vars(verdict.doubt)
     return {
         "status": verdict.status,
         "cannot_tell": verdict.cannot_tell,
-        "doubt": doubt,
+        "error_probability": verdict.error_probability and vars(verdict.error_probability),
         "reasons": list(verdict.reasons),
     }

@@ -171,7 +171,7 @@ assert set(_SHAPES) == {f.name for f in fields(CameraMatches)} - {"cameras", "me
 
 
 def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches:
-    """Put tables of the same cameras under each other; the metadata is that of the first.
+    """Concatenate tables of the same cameras; the first gives the metadata.
 
     Raises:
         ValueError: if there are none, or their cameras differ.

@@ -1,6 +1,6 @@
-"""What may be behind each kind of check, and what to do: one table, for every place that shows it.
+"""The likely cause of each kind of check and the action to take: one table for all outputs.
 
-A check without an action of its own takes that of its cause. Causes stand in the order in which
+A check without its own action takes the action of its cause. Causes stand in the order in which
 they explain each other: a wrong guess makes matches wrong, and not the other way round.
 """
 
@@ -12,13 +12,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Cause:
-    """What several checks may notice.
-
-    Attributes:
-        title: in words.
-        action: what to do about it, a sentence.
-        kinds: of the checks that notice it, each with an action of its own or an empty one.
-    """
+    """A cause that several checks may notice."""
 
     title: str
     action: str
@@ -96,7 +90,7 @@ CAUSES: dict[str, Cause] = {
         {"residual_spread": "", "inlier_share": "", "competing_solution": "", "held_out": "",
          "failed_frames": "", "restart_rotation": _SPREAD, "restart_translation": _SPREAD,
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
-         "start_dependence": _LEARNED, "recall": _LEARNED},
+         "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),
     "frames": Cause(
         "frames or places that contradict each other", _FRAMES,
@@ -143,6 +137,6 @@ def cause_of(kind: str) -> str:
 
 
 def action_of(kind: str) -> str:
-    """What to do if a check of this kind is not PASS; empty where it depends on the data."""
+    """The action if a check of this kind is not PASS; empty where it depends on the data."""
     cause = CAUSES[cause_of(kind)]
     return cause.kinds.get(kind) or cause.action

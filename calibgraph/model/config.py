@@ -181,10 +181,6 @@ def load_config(path: Path | str) -> Config:
 def config_from(content: Mapping[str, Any], path: Path | str) -> Config:
     """The settings in a mapping; its ``preset`` gives the values that it leaves out.
 
-    Args:
-        content: by name.
-        path: where it is from.
-
     Raises:
         FileError: if it has an unknown key or a wrong value.
     """

@@ -268,7 +268,7 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Put tables under each other; the metadata is that of the first.
+    """Concatenate tables; the first gives the metadata.
 
     Raises:
         ValueError: if there are none.

@@ -24,12 +24,12 @@ class MatcherComponents:
     """Standard deviations per axis of one matcher's errors.
 
     Attributes:
-        systematic_rotation_rad, systematic_translation_m: of what all its frames share.
+        systematic_rotation_rad, systematic_translation_m: error that all its frames share.
         camera_share: of its variance, what each camera has by itself; the cloud has the rest.
         elevation_rad: of an offset of all beams' elevations.
         elevation_stretch: of the share by which elevations are too far from the horizon.
         scan_motion_m: of the motion during a turn for which clouds are not corrected.
-        place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
+        place_rotation_rad, place_translation_m: further error that all cameras share at one place.
         place_variance: of what a camera's frames of a place share besides, over the variance of one
             frame's matches if they were independent.
     """
@@ -55,12 +55,12 @@ class ErrorComponents:
             images, which all frames share.
         pair_correlation: of the errors of two features of a pair in one frame.
         frame_correlation: of the errors of two matches of one frame, where frames are few.
-        usual_frames: as how many frames it counts.
+        prior_frames: weight of that prior in frames.
         pseudo_frames: frames that are added with the scatter along each principal direction.
-        shared_dof, place_dof: degrees of freedom that the usual sizes count for.
-        least_places: from so many on the size of places may be found smaller than usual.
+        shared_dof, place_dof: degrees of freedom of the priors.
+        least_places: number of places from which their variance may fall below its prior.
         robust_sigmas: distance at which the loss of a place bends.
-        robust_places: from so many on there is one.
+        robust_places: number of places from which there is one.
         contradiction_sigmas: from so far on a measured relative pose takes no part.
     """
 
@@ -69,7 +69,7 @@ class ErrorComponents:
     pair_translation_m: float
     pair_correlation: float
     frame_correlation: float
-    usual_frames: float
+    prior_frames: float
     pseudo_frames: float
     shared_dof: float
     place_dof: float
@@ -81,7 +81,7 @@ class ErrorComponents:
 
 @cache
 def error_components() -> ErrorComponents:
-    """What the file of this version holds.
+    """The content of the file of this version.
 
     Raises:
         ValueError: if the file has another format.
@@ -110,7 +110,7 @@ def error_components() -> ErrorComponents:
         pair_translation_m=pairs["translation_m"],
         pair_correlation=pairs["correlation"],
         frame_correlation=frames["correlation"],
-        usual_frames=frames["usual_frames"],
+        prior_frames=frames["prior_frames"],
         pseudo_frames=frames["pseudo_frames"],
         shared_dof=sizes["shared_dof"],
         place_dof=sizes["place_dof"],

@@ -1,4 +1,4 @@
-"""What an error bar consists of: the share of each source in its variance, and what shrinks it."""
+"""The sources of an error bar: their shares of its variance, and the action that shrinks it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAIRS = "images of camera pairs"
 PRIORS = "priors and relative poses"
 
 NEEDED = 0.3
-"""Error bar over tolerance at which 99.5 % of the errors are within: what a PASS needs."""
+"""Error bar over tolerance at which 99.5 % of the errors are within, as a PASS needs."""
 
 TIMES = (2, 3, 5, 10, 20, 1000)
 """As many frames, at as many times more places: for these the error bar is predicted."""
@@ -37,8 +37,8 @@ class ErrorSources:
         rotation_deg: standard deviation about the axis where it is largest.
         translation_cm: the same along an axis.
         rotation: share of each source in the variance; they add up to 1.
-        translation: likewise.
-        forecast: the error bar [deg, cm] of so many times more frames and places.
+        translation: the same shares for the translation.
+        forecast: the error bar [deg, cm] with that factor more frames and places.
     """
 
     rotation_deg: float
@@ -59,7 +59,7 @@ class ErrorSources:
         return f"{in_unit(bar.sigma, bar.unit)} ({', '.join(parts)})"
 
     def action(self, tolerance: tuple[float, float]) -> str:
-        """What would shrink the error bar enough for a PASS, in one sentence; empty if it is.
+        """The action that shrinks the error bar enough for a PASS, in one sentence; empty if it is.
 
         Args:
             tolerance: rotation [deg] and distance [cm].
@@ -83,7 +83,7 @@ class ErrorSources:
         )
 
     def _larger(self, tolerance: tuple[float, float]) -> _Bar:
-        """That of rotation or translation, by which is larger beside its tolerance."""
+        """The value of rotation or translation, whichever is larger relative to its tolerance."""
         rotation = _Bar(self.rotation_deg, "deg", self.rotation, tolerance[0])
         translation = _Bar(self.translation_cm, "cm", self.translation, tolerance[1])
         return max(rotation, translation, key=lambda bar: bar.sigma / bar.tolerance)

@@ -10,15 +10,9 @@ from typing import Any
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.error_components import UNKNOWN, error_components
 
-_PER_CAMERA = {
-    "z_score": "contrast",  # the key on disk is older than the name
-    "start_dependence": "start_dependence",
-    "recall": "recall",
-    "failed_share": "failed_share",
-    "found": "found",
-    "missed": "missed",
-}
-_Z_SCORES = ("contrast", "found", "missed")
+_PER_CAMERA = ("z_score", "start_dependence", "memorization", "failed_share", "found", "missed")
+_Z_SCORES = ("z_score", "found", "missed")
+_FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
     "range_rotation_deg": 180.0,
@@ -43,7 +37,7 @@ class MatcherFindings:
     Attributes:
         z_score: agreement of image and cloud, in standard deviations of chance agreement.
         start_dependence: share of a displaced start that remains in the matches (0 to 1).
-        recall: share of the way back that is found without the image (0 to 1).
+        memorization: share of the displacement that is undone with a blank image (0 to 1).
         failed_share: share of the frames without matches (0 to 1).
         found: z-score at the pose where the search found the camera.
         missed: best z-score of the search where it did not find the camera: the camera fails.
@@ -52,19 +46,20 @@ class MatcherFindings:
             if unknown.
         systematic_rotation_rad, systematic_translation_m: standard deviation per camera axis of the
             common error, which all its frames share; None if it is not stated.
-        camera_share: of its variance, what each camera has by itself; the cloud has the rest.
+        camera_share: share of its variance that is independent per camera; the cloud has the rest.
         elevation_rad: standard deviation of an offset of all beams' elevations; this and the next
-            two, which bend the cloud, are part of the error that all frames share.
-        elevation_stretch: of the share by which elevations are too far from the horizon.
-        scan_motion_m: of the motion during a turn for which clouds are not corrected.
-        place_rotation_rad, place_translation_m: of what all cameras share at one place besides.
-        place_variance: of the error that frames of one place share, over that of one frame's
-            matches if they were independent.
+            two are the scan distortion, a part of the error that all frames share.
+        elevation_stretch: standard deviation of the relative scale of elevations.
+        scan_motion_m: standard deviation of the uncompensated motion during a scan.
+        place_rotation_rad, place_translation_m: standard deviation of a further error that all
+            cameras share at one place.
+        place_variance: variance of the error that frames of one place share, relative to one
+            frame's matches if they were independent.
     """
 
     z_score: Mapping[str, float] = field(default_factory=dict)
     start_dependence: Mapping[str, float] = field(default_factory=dict)
-    recall: Mapping[str, float] = field(default_factory=dict)
+    memorization: Mapping[str, float] = field(default_factory=dict)
     failed_share: Mapping[str, float] = field(default_factory=dict)
     found: Mapping[str, float] = field(default_factory=dict)
     missed: Mapping[str, float] = field(default_factory=dict)
@@ -85,21 +80,21 @@ class MatcherFindings:
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:
         """Read the keys of a table's metadata that are findings; others are left alone.
 
-        Without a common error, one that is usual of its ``matcher`` is taken, if it is a known one.
+        Without a stated common error, the prior of its ``matcher`` is taken, if that is known.
 
         Raises:
             CorrespondenceError: if a value is not a number in its range.
         """
-        values: dict[str, Any] = {
-            name: _by_camera(metadata, key) for name, key in _PER_CAMERA.items()
-        }
+        former = {_FORMER_KEYS[key]: metadata[key] for key in _FORMER_KEYS if key in metadata}
+        metadata = {**former, **metadata}
+        values: dict[str, Any] = {key: _by_camera(metadata, key) for key in _PER_CAMERA}
         for key, largest in _NUMBERS.items():
             if key in metadata:
                 values[key] = _number(key, metadata[key], largest)
         if STAGE1 in metadata:
             values[STAGE1] = _source(metadata[STAGE1])
         if not _COMMON & values.keys():
-            values = _usual_of(metadata.get("matcher")) | values
+            values = _prior_of(metadata.get("matcher")) | values
         return MatcherFindings(**values)
 
     def to_metadata(self) -> dict[str, Any]:
@@ -108,7 +103,7 @@ class MatcherFindings:
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name in _PER_CAMERA:
-                content |= {_PER_CAMERA[item.name]: dict(value)} if value else {}
+                content |= {item.name: dict(value)} if value else {}
             elif value is not None and value != item.default:
                 content[item.name] = value
         return content
@@ -125,7 +120,7 @@ class MatcherFindings:
 
     @property
     def rigid_sigmas(self) -> tuple[float, float]:
-        """Of these what is left besides the bends, which displace a camera by about as much."""
+        """Rigid part of the systematic error: the scan distortion is subtracted in quadrature."""
         bends = self.elevation_rad, self.scan_motion_m / (4 * math.pi)
         rotation, translation = (
             math.sqrt(max(whole**2 - bend**2, 0.0))
@@ -135,12 +130,12 @@ class MatcherFindings:
 
     @property
     def bend_sigmas(self) -> tuple[float, float, float]:
-        """Of what bends the cloud: offset of elevations [rad], their stretch, motion [m]."""
+        """Scan distortion: elevation offset [rad], elevation scale, uncompensated motion [m]."""
         return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
 
 
-def _usual_of(matcher: object) -> dict[str, float]:
-    """The sizes of a known matcher's errors; none of another one, whose tables have to state it."""
+def _prior_of(matcher: object) -> dict[str, float]:
+    """The error sizes of a known matcher; empty for others, whose tables have to state them."""
     known = error_components().matchers
     named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
     return vars(known[str(matcher)]) if named else {}

@@ -11,11 +11,20 @@ import math
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from calibgraph.model.pose_kernel import exponential_times, logarithms
 
 Array = NDArray[np.float64]
+
+
+def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """(4, 4) of a rotation, or its (3, 3) matrix, and a (3,) translation."""
+    T = np.eye(4)
+    T[:3, :3] = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
+    T[:3, 3] = translation
+    return T
 
 
 def invert(T_a_b: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What others call the lens models, in any spelling."""
+"""Other names of the lens models, in any spelling."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def evaluate(
         estimate: to evaluate.
         reference: its covariances, where it has any, give the deviations.
         covariance: per camera of the estimate, (6, 6) of xi in T_camera_lidar = exp(xi) estimate;
-            that of the estimate's own rig if None.
+            the estimate's own rig if None.
 
     Raises:
         RigError: if a camera of the estimate is not in the reference.

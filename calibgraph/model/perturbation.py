@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ def perturb_extrinsics(
     seed: int = 0,
     uniform: bool = False,
 ) -> dict[str, Array]:
-    """As :func:`perturb`, of (4, 4) T_camera_lidar by camera."""
+    """Like :func:`perturb`, for (4, 4) T_camera_lidar by camera."""
     if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
         raise ValueError(
             f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "
@@ -63,17 +64,12 @@ def perturb_extrinsics(
 def _draw_exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
     """(4, 4) T_delta of exactly this angle and length, about and along random directions."""
     axis, direction = rng.standard_normal((2, 3))
-    T = np.eye(4)
-    angle = np.radians(rotation_deg)
-    T[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-    T[:3, 3] = translation_m * direction / np.linalg.norm(direction)
-    return T
+    turn = Rotation.from_rotvec(np.radians(rotation_deg) * axis / np.linalg.norm(axis))
+    return transform(turn, translation_m * direction / np.linalg.norm(direction))
 
 
 def _draw_uniform(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
     """(4, 4) T_delta with six components uniform within these values."""
     angles, shift = rng.uniform(-1.0, 1.0, (2, 3))
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", rotation_deg * angles, degrees=True).as_matrix()
-    T[:3, 3] = translation_m * shift
-    return T
+    turn = Rotation.from_euler("xyz", rotation_deg * angles, degrees=True)
+    return transform(turn, translation_m * shift)

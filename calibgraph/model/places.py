@@ -49,7 +49,7 @@ class Places:
         return Places(_groups(metadata, key), named)
 
     def to_metadata(self) -> dict[str, Any]:
-        """As keys of the metadata; what is not known has no key."""
+        """As keys of the metadata; unknown values have no key."""
         known = {STATIONARY: self.stationary or None, PLACES: self.places}
         return {key: [list(g) for g in groups] for key, groups in known.items() if groups}
 
@@ -62,7 +62,7 @@ class Places:
         )
 
     def merge_stationary(self, frame: Numbers) -> Numbers:
-        """(n,) frame numbers, those of one stop replaced by the first of them."""
+        """(n,) frame numbers, with all frames of one stop replaced by its first."""
         for stop in self.stationary:
             frame = np.where(np.isin(frame, stop), np.int64(stop[0]), frame)
         return frame
@@ -77,7 +77,7 @@ class Places:
         return [part for part in np.split(frame[order], edges) if len(part)]
 
     def frames_per_place(self, frame: Numbers) -> float:
-        """How many of (f,) frames share the error of a place, in the mean over frames."""
+        """Number of (f,) frames that share the error of a place, averaged over frames."""
         counts = [len(place) for place in self.split(frame)]
         return float(np.square(counts).sum() / max(1, len(frame)))
 

@@ -19,24 +19,24 @@ _FOCAL_SHARE = 0.1, 20.0
 """Pixels per radian over the image's longer side: below, even a pinhole sees over 157 deg and the
 image circle of a fisheye covers less than a tenth of the image; above, the image shows 3 deg."""
 _ASPECT = 2.2
-"""Ratio of focal lengths: above that of anamorphic lenses and of half frames of video, 2."""
+"""Ratio of focal lengths: above anamorphic lenses and half frames of video, which have 2."""
 _CENTRE_SHARE, _CENTRE_SHARE_OF_BOTH = 0.35, 0.12
 """Offset of the principal point over the image's size, along either axis and along both. A crop at
 one edge, as of the sky, and a rectified pair offset it along one; few lenses are off by 0.05."""
 _COVERED_SHARE, _COVERED_DEG = 0.95, 75.0
-"""Share of the image that the lens projects to; less is usual of fisheye lenses that see farther
+"""Share of the image that the lens projects to; less is normal for fisheye lenses that see farther
 than this from the axis, whose images are circles."""
 _DISTORTED = 0.4, 3.0
-"""Field angle at the image's border over that without distortion; 0.8 to 2 for usual lenses."""
+"""Field angle at the image's border over that without distortion; 0.8 to 2 for normal lenses."""
 _DECENTRED = 0.1
-"""Shift of the image's border by p1 and p2, over its distance from the axis; below 0.02 for usual
+"""Shift of the image's border by p1 and p2, over its distance from the axis; below 0.02 for normal
 lenses. The coefficients k3 and k4 of a fisheye lens, read as p1 and p2, shift it by more."""
 _DIRECTIONS, _BISECTIONS = 96, 40  # in which a lens is examined, and how finely
 _PINHOLE_LIMIT = 19.0  # of the tangent of a field angle, 87 deg
 
 
 def find_implausible(rig: Rig) -> list[str]:
-    """The values of a rig that cannot be right or seldom are, a line each; empty for usual rigs.
+    """The values of a rig that are impossible or rare, a line each; empty for normal rigs.
 
     Every line names the camera, the numbers, and the likely mistake as a question.
     """
@@ -61,7 +61,7 @@ def _extrinsic(T_camera_lidar: Array) -> Iterator[str]:
 
 
 def _intrinsics(camera: Camera) -> Iterator[str]:
-    """About focal lengths and the principal point; only if they are usual, about the distortion."""
+    """Sentences about focal lengths and principal point; if these are normal, on distortion."""
     k, size = camera.intrinsics_px, (camera.width_px, camera.height_px)
     image = f"a {size[0]}x{size[1]} px image"
     low, high = _FOCAL_SHARE

@@ -82,11 +82,7 @@ Transform = Annotated[
 
 
 def _pose_covariance(value: Any) -> Array:
-    """Check a (6, 6) covariance of a pose: symmetric, positive definite.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """Check a (6, 6) covariance of a pose: symmetric, positive definite."""
     try:
         covariance = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -112,11 +108,7 @@ PoseCovariance = Annotated[
 
 
 def _checked_name(name: str) -> str:
-    """A camera's name is part of file names and messages.
-
-    Raises:
-        ValueError: if it cannot be.
-    """
+    """A camera's name is part of file names and messages."""
     if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,100}", name) or name in (".", ".."):
         raise ValueError(
             f"camera name {name!r}: expected 1 to 100 characters without slashes, and not a dot"
@@ -125,11 +117,7 @@ def _checked_name(name: str) -> str:
 
 
 def _checked_model(name: Any) -> Any:
-    """The name of a lens model, as it is.
-
-    Raises:
-        ValueError: if it is the name that ROS or Kalibr give to one of ours.
-    """
+    """The name of a lens model, as it is."""
     ours = find_lens_model(name) if isinstance(name, str) and name else None
     if ours not in (None, name):
         raise ValueError(f"{name!r} is called {ours!r} here; its distortion is {ORDERS[ours]}")

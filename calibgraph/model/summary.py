@@ -1,4 +1,4 @@
-"""A verdict for people: at most three reasons by their causes, and what to do; the rest folded.
+"""A verdict for people: at most three reasons by their causes, and actions; the rest folded.
 
 Terminal, report, service, fleet and files show the same :class:`Summary`.
 """
@@ -50,7 +50,7 @@ class Summary:
     Attributes:
         status: PASS, WARN or FAIL.
         cannot_tell: whether the first reason is that the data cannot tell.
-        doubt: how probable it is that which cameras are off, in one sentence; empty for a PASS.
+        error_probability: per camera, that it is off, in one sentence; empty for a PASS.
         reasons: at most three, each of another cause, the worst first.
         actions: what to do, at most three sentences, each once.
         error_bar: the largest error bar beside the tolerance, and the shares of its sources; empty
@@ -60,7 +60,7 @@ class Summary:
 
     status: Status
     cannot_tell: bool
-    doubt: str
+    error_probability: str
     reasons: tuple[Reason, ...]
     actions: tuple[str, ...]
     error_bar: str
@@ -82,15 +82,11 @@ def summarize(
     weaknesses: Mapping[str, Sequence[str]] | None = None,
     sources: Mapping[str, ErrorSources] | None = None,
 ) -> Summary:
-    """The verdict of a rig, or of one camera, in few words.
-
-    Args:
-        verdicts: per camera.
-        weaknesses: sentences per camera.
-        sources: of the error bar, per camera.
-    """
+    """The verdict of a rig, or of one camera, in few words."""
     of_rig, known = rig_verdict(verdicts), sources or {}
-    tolerance = TOLERANCE if of_rig.doubt is None else of_rig.doubt.tolerance
+    tolerance = (
+        TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance
+    )
     findings = [*_unsure(verdicts), *_findings(verdicts)] or _nearest(verdicts)
     by_cause: dict[str, list[Reason]] = {}
     for finding in sorted(findings, key=_rank):
@@ -107,7 +103,7 @@ def summarize(
     return Summary(
         of_rig.status,
         of_rig.cannot_tell,
-        _doubt(verdicts),
+        _error_probabilities(verdicts),
         tuple(shown),
         tuple(actions)[:MOST],
         _error_bar(known, tolerance),
@@ -118,7 +114,7 @@ def summarize(
 def _with_action_for(
     reason: Reason, sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]
 ) -> Reason:
-    """With what would shrink the largest error bar of its cameras, if that is the reason."""
+    """The reason with the action that shrinks the largest error bar, if the bar is the reason."""
     known = [sources[name] for name in reason.cameras if name in sources]
     if CAUSES[reason.cause].action or not known:
         return reason
@@ -140,7 +136,7 @@ def _rank(reason: Reason) -> tuple[int, int]:
 
 
 def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
-    """Those of how much the data determine before others, and the first named as such."""
+    """Reasons about too little data before others, the first marked "cannot tell"."""
     first, *others = sorted(reasons, key=lambda reason: reason.cause not in _OF_DATA)
     text = f"{_CANNOT_TELL}{first.text.removeprefix(_CANNOT_TELL)}"
     return [replace(first, text=text), *others]
@@ -156,9 +152,11 @@ def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
 
 
 def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """That the error bar is too wide for the tolerance, of the cameras where nothing is odd."""
+    """The reason that the error bar is too wide for the tolerance, with its cameras."""
     found = {
-        n: v.doubt for n, v in verdicts.items() if v.doubt is not None and v.doubt.of_error_bar
+        n: v.error_probability
+        for n, v in verdicts.items()
+        if v.error_probability is not None and v.error_probability.of_error_bar
     }
     if not found:
         return []
@@ -167,13 +165,17 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     return [Reason("WARN", tuple(found), text, "error bar")]
 
 
-def _doubt(verdicts: Mapping[str, Verdict]) -> str:
-    """How probable it is that cameras are off, the worst first, in one sentence."""
-    found = {n: v.doubt for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
+    """The probabilities that cameras are off, the worst first, in one sentence."""
+    found = {
+        n: v.error_probability
+        for n, v in verdicts.items()
+        if v.error_probability and v.error_probability.status != "PASS"
+    }
     ordered = sorted(found.items(), key=lambda item: (item[1].status, -item[1].probability))
     if not ordered:
         return ""
-    percents = ", ".join(f"{name} {doubt.percent}" for name, doubt in ordered)
+    percents = ", ".join(f"{name} {found.percent}" for name, found in ordered)
     return f"{ordered[0][1].sentence}: {percents}"
 
 
@@ -190,8 +192,12 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
 
 
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """Of cameras that may be off though all their checks are PASS, the check nearest its limit."""
-    doubtful = {n: v for n, v in verdicts.items() if v.doubt and v.doubt.status != "PASS"}
+    """The check nearest its limit, of cameras that may be off though all their checks PASS."""
+    doubtful = {
+        n: v
+        for n, v in verdicts.items()
+        if v.error_probability and v.error_probability.status != "PASS"
+    }
     checks = [(name, check) for name, verdict in doubtful.items() for check in verdict.checks]
     if not checks:
         return []

@@ -71,7 +71,7 @@ def check_schema(schema: pa.Schema) -> None:
 
 
 def _check_type(field: pa.Field) -> None:
-    """Check that a column has a plain type, whose size in memory is that of the data.
+    """Check that a column has a plain type, whose size in memory is the size of the data.
 
     A few bytes of run-end encoded values, for example, could expand to any number of rows.
     """

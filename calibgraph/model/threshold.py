@@ -21,7 +21,7 @@ class Threshold:
 
     Attributes:
         key: by which checks look the row up.
-        name: what is measured; the name of the check.
+        name: of the measured number and its check.
         direction: "at most" or "at least": on which side of the limits PASS lies.
         warn: the last value that is PASS.
         fail: the last value that is not FAIL.
@@ -29,7 +29,7 @@ class Threshold:
         question: what the check answers, in words.
         reason: why these limits: what they mean, or the data that they were read from.
         advice: the meaning if it is not PASS; for what to do, see ``model.causes``.
-        of_tolerance: whether the limits are for the usual tolerance, and follow another one.
+        of_tolerance: whether the limits are for the default tolerance, and scale with another one.
     """
 
     key: str
@@ -46,7 +46,7 @@ class Threshold:
     def at(self, tolerance: tuple[float, float]) -> Threshold:
         """The row for a tolerance [deg, cm].
 
-        A tolerance below the usual one moves the limit of PASS alone: an error of that size is too
+        A tolerance below the default moves the limit of PASS alone: an error of that size is too
         large for the user, but no sign of a wrong result.
         """
         if not self.of_tolerance:
@@ -62,66 +62,19 @@ class Threshold:
         return grade(not value >= self.warn, not value >= self.fail)
 
     def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
-        """The check of a value.
-
-        Args:
-            value: in the row's unit.
-            name: in place of the row's, where it depends on the data.
-            advice: likewise.
-        """
-        build = at_most if self.direction == "at most" else at_least
-        limits = (self.warn, self.fail, self.unit)
-        return build(name or self.name, value, *limits, advice or self.advice, self.key)
+        """The check of a value."""
+        status, name, meaning = self.grade(value), name or self.name, advice or self.advice
+        limit = self.fail if status == "FAIL" else self.warn
+        text = f"{name} {beside(value, limit, self.unit)}"
+        if status != "PASS":
+            side = "above" if self.direction == "at most" else "below"
+            text += f" is {side} {in_unit(limit, self.unit)}" + (f": {meaning}" if meaning else "")
+        return self.describe(float(value), status, text, name=name)
 
     def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
         """A check whose sentence, and perhaps status, depend on more than the value."""
         limits = (self.warn, self.fail, self.unit)
         return Check(name or self.name, status, text, value, *limits, kind=self.key)
-
-
-def at_most(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
-) -> Check:
-    """A check that a number is at most its limits; NaN fails.
-
-    Args:
-        name: what was measured.
-        value: what was found.
-        warn: the largest value that is PASS.
-        fail: the largest value that is not FAIL.
-        unit: of the values; "share" is printed in percent.
-        advice: what to do if it is above.
-        kind: of the check.
-    """
-    status = grade(not value <= warn, not value <= fail)
-    return _measured(name, status, "above", value, warn, fail, unit, advice, kind)
-
-
-def at_least(  # noqa: PLR0913, PLR0917 - a line of a table
-    name: str, value: float, warn: float, fail: float, unit: str, advice: str = "", kind: str = ""
-) -> Check:
-    """A check that a number is at least its limits; NaN fails. Arguments as of `at_most`."""
-    status = grade(not value >= warn, not value >= fail)
-    return _measured(name, status, "below", value, warn, fail, unit, advice, kind)
-
-
-def _measured(  # noqa: PLR0913, PLR0917 - private, two calls
-    name: str,
-    status: Status,
-    side: str,
-    value: float,
-    warn: float,
-    fail: float,
-    unit: str,
-    advice: str,
-    kind: str,
-) -> Check:
-    limit = fail if status == "FAIL" else warn
-    text = f"{name} {beside(value, limit, unit)}"
-    if status != "PASS":
-        text += f" is {side} {in_unit(limit, unit)}"
-        text += f": {advice}" if advice else ""
-    return Check(name, status, text, float(value), warn, fail, unit, kind)
 
 
 def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
@@ -149,11 +102,6 @@ def beside(value: float, limit: float, unit: str) -> str:
     """A number with its unit, in three digits that tell it from a limit beyond which it lies.
 
     Where these would be the same, the number is rounded away from the limit.
-
-    Args:
-        value: of the number.
-        limit: that it is printed beside.
-        unit: of both.
     """
     text = in_unit(value, unit)
     if value == limit or text != in_unit(limit, unit):

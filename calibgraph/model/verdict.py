@@ -32,7 +32,7 @@ ABOUT_THE_DATA = frozenset(
         "terms",
     }
 )
-"""Kinds of checks of how much the data determine: beyond a limit, nothing seems wrong yet."""
+"""Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
 _SURE = 0.99
 
 
@@ -41,14 +41,14 @@ class Check:
     """One check of one camera's result.
 
     Attributes:
-        name: what was measured or searched for.
+        name: of the measured number, or of the search.
         status: PASS, WARN or FAIL.
         text: one sentence: what was found and, if that is not PASS, what to do.
         value: the number that was found, if it is one.
         warn: the limit of PASS, which itself passes, if there is one.
         fail: the limit of WARN, which itself does not fail, if there is one.
         unit: of value, warn and fail.
-        kind: what it is of, the same for all cameras and numbers; the name if it is empty.
+        kind: the same for all cameras and numbers; the name if it is empty.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Check:
 
 
 def _between(value: float, warn: float, fail: float) -> float:
-    """Where a value is: below 1 before the limit of PASS, 2 at that of WARN, 3 far beyond it.
+    """Severity of a value: below 1 before the PASS limit, 2 at the WARN limit, 3 far beyond it.
 
     Which side is good is seen from the limits; of equal ones, or of one without a FAIL limit, the
     share of the first limit counts.
@@ -108,8 +108,8 @@ def _share(part: float, whole: float) -> float:
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """The probability that a result is off by more than what the user tolerates, two ways.
+class ErrorProbability:
+    """The probability that a result is off by more than the tolerance, from two sources.
 
     Attributes:
         by_checks: that it is grossly wrong.
@@ -125,7 +125,7 @@ class Doubt:
 
     @property
     def probability(self) -> float:
-        """Of either."""
+        """The probability of either."""
         return 1.0 - (1.0 - self.by_checks) * (1.0 - self.by_error_bar)
 
     @property
@@ -154,7 +154,7 @@ class Doubt:
 
     @property
     def sentence(self) -> str:
-        """What it is the probability of, without the number."""
+        """The event that the probability is about, without the number."""
         return f"off by more than {self.tolerated} with a probability"
 
     @property
@@ -164,7 +164,7 @@ class Doubt:
 
     @property
     def advice(self) -> str:
-        """That the data cannot tell more; empty if something seems wrong."""
+        """The note that the data cannot tell more; empty if something seems wrong."""
         if not self.of_error_bar:
             return ""
         return ": cannot tell, by the error bar"
@@ -176,13 +176,13 @@ class Verdict:
 
     Attributes:
         checks: all checks, in order.
-        doubt: the probability that it is off; without it, as while driving, the checks alone
-            decide.
-        cameras: of a rig's verdict, those of its cameras.
+        error_probability: that the result is off by more than the tolerance; None while driving,
+            where the checks alone decide.
+        cameras: the verdicts of the cameras, if this is a rig's.
     """
 
     checks: tuple[Check, ...] = ()
-    doubt: Doubt | None = None
+    error_probability: ErrorProbability | None = None
     cameras: tuple[Verdict, ...] = ()
 
     @property
@@ -194,25 +194,30 @@ class Verdict:
         worst: Status = max(
             (check.status for check in self.checks), key=_ORDER.index, default="PASS"
         )
-        if self.doubt is None:
+        if self.error_probability is None:
             return worst
-        if self.doubt.status == "PASS" and worst != "PASS":
+        if self.error_probability.status == "PASS" and worst != "PASS":
             return "WARN"
-        return self.doubt.status
+        return self.error_probability.status
+
+    @property
+    def doubt(self) -> ErrorProbability | None:
+        """Former name of ``error_probability``, for one release."""
+        return self.error_probability
 
     @property
     def cannot_tell(self) -> bool:
         """Whether it is WARN because the data determine too little, not because something is odd.
 
-        So if the error bar leaves more doubt than the checks do, or if the only checks beyond a
-        limit are of how much the data determine. Of a rig, if this is so of every camera that is
-        not PASS.
+        True if the error bar is more likely than the checks to hide an error, or if the only checks
+        beyond a limit measure how much the data determine. For a rig: if it is true for every
+        camera that is not PASS.
         """
         if self.status != "WARN":
             return False
         if self.cameras:
             return all(each.cannot_tell for each in self.cameras if each.status != "PASS")
-        if self.doubt is not None and self.doubt.of_error_bar:
+        if self.error_probability is not None and self.error_probability.of_error_bar:
             return True
         beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
         return bool(beyond) and beyond <= ABOUT_THE_DATA
@@ -223,21 +228,21 @@ class Verdict:
         failing = [check for check in self.checks if check.status != "PASS"]
         failing.sort(key=lambda check: -check.severity)
         texts = [check.text for check in failing]
-        if self.doubt is None or self.doubt.status == "PASS":
+        if self.error_probability is None or self.error_probability.status == "PASS":
             return tuple(texts)
-        doubt = self.doubt
-        return (f"{doubt.sentence} of {doubt.percent}{doubt.advice}", *texts)
+        found = self.error_probability
+        return (f"{found.sentence} of {found.percent}{found.advice}", *texts)
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: that of its worst camera, with the checks of all, by their names."""
+    """The verdict of a rig: its worst camera's, with the checks of all, by their names."""
     checks = tuple(
         replace(check, text=f"{name}: {check.text}")
         for name, verdict in cameras.items()
         for check in verdict.checks
     )
-    doubts = [verdict.doubt for verdict in cameras.values() if verdict.doubt is not None]
-    worst = max(doubts, key=lambda doubt: (doubt.status == "FAIL", doubt.probability), default=None)
+    known = [each.error_probability for each in cameras.values() if each.error_probability]
+    worst = max(known, key=lambda found: (found.status == "FAIL", found.probability), default=None)
     return Verdict(checks, worst, tuple(cameras.values()))
 
 

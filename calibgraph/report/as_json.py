@@ -54,7 +54,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
 
 
 def _probability(verdict: Verdict) -> float | None:
-    return None if verdict.doubt is None else verdict.doubt.probability
+    return None if verdict.error_probability is None else verdict.error_probability.probability
 
 
 def _sources(result: Calibration, name: str) -> dict[str, Any] | None:

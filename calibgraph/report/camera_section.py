@@ -96,6 +96,7 @@ def camera_section(
     name: str,
     index: int,
     overlays: Overlays | None,
+    *,
     errors: BeforeAfter | None,
 ) -> CameraSection:
     """Collect what the page shows of a camera.

@@ -57,7 +57,7 @@ def report_html(result: Calibration) -> str:
     errors = errors_before_after(result)
     overlays, overlays_left_out = draw_overlays(result, errors)
     cameras = [
-        camera_section(result, name, index, overlays.get(name), errors.get(name))
+        camera_section(result, name, index, overlays.get(name), errors=errors.get(name))
         for index, name in enumerate(result.rig.cameras)
     ]
     summary = result.summary

@@ -87,7 +87,7 @@ def draw_overlays(
         cloud = load_entry_cloud(shown)[:, :3].astype(np.float64)
         for name in result.rig.cameras:
             if name in shown["images"]:
-                drawn[name] = _overlays(result, name, shown, cloud, errors.get(name))
+                drawn[name] = _overlays(result, name, shown, cloud, errors=errors.get(name))
     except (CalibrationError, OSError) as error:
         return drawn, str(error)
     return drawn, None
@@ -98,6 +98,7 @@ def _overlays(
     name: str,
     shown: Mapping[str, Any],
     cloud: Array,
+    *,
     errors: BeforeAfter | None,
 ) -> Overlays:
     cameras = result.initial_rig.cameras[name], result.rig.cameras[name]

@@ -85,7 +85,7 @@ def _section(
         median_px=f"{np.median(known):.2f}" if len(known) else "",
         check=_check_of(result, names),
         frame=str(entry["name"] if entry else shown),
-        picture=_picture(result, names, entry, matches, budget),
+        picture=_picture(result, names, entry, matches, budget=budget),
     )
 
 
@@ -101,6 +101,7 @@ def _picture(
     names: tuple[str, str],
     entry: Mapping[str, Any] | None,
     matches: tuple[Array, Array],
+    *,
     budget: int,
 ) -> str:
     """A data URI; empty if an image cannot be read, which the overlays report."""

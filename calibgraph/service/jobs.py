@@ -110,7 +110,7 @@ class JobTable:
         self._engine = engine
         self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
-    def add(self, id: str, tenant: str, job: Job, digest: str, key: str | None) -> JobRecord:
+    def add(self, id: str, tenant: str, job: Job, digest: str, *, key: str | None) -> JobRecord:
         """Add a job; it is durable when this returns.
 
         Args:

@@ -70,7 +70,7 @@ def _submit_route(kind: JobKind) -> Callable[..., Awaitable[Response]]:
     async def route(
         request: Request, state: State, caller: Submitter, idempotency_key: IdempotencyKey = None
     ) -> Response:
-        record, _ = await submit(state, request, caller, kind, idempotency_key)
+        record, _ = await submit(state, request, caller, kind, key=idempotency_key)
         answer = job_answer(record, state.runner.step(record.id))
         headers = {"Location": f"/v1/jobs/{record.id}"}
         return JSONResponse(answer.model_dump(mode="json"), 202, headers)

@@ -109,6 +109,7 @@ def export(
     format: str,
     state: State,
     caller: Reader,
+    *,
     even_if_failed: Annotated[bool, Query()] = False,
 ) -> Response:
     """The calibration in the format of another program."""

@@ -59,6 +59,7 @@ class Runner:
         folder: DataFolder,
         settings: Settings,
         roots: tuple[Root, ...],
+        *,
         metrics: Metrics,
         ring: Callable[[str], None],
     ) -> None:

@@ -116,7 +116,7 @@ def open_service(settings: Settings, metrics: Metrics) -> Service:
         folder=folder,
         engine=engine,
         jobs=table,
-        runner=Runner(table, folder, settings, roots, metrics, bell.ring),
+        runner=Runner(table, folder, settings, roots, metrics=metrics, ring=bell.ring),
         tracker_table=TrackerTable(engine),
         trackers=Trackers(folder, settings),
         roots=roots,

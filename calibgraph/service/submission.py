@@ -48,7 +48,7 @@ _RETRY_AFTER_S = 5
 
 
 async def submit(
-    service: Service, request: Request, caller: Caller, kind: JobKind, key: str | None
+    service: Service, request: Request, caller: Caller, kind: JobKind, *, key: str | None
 ) -> tuple[JobRecord, bool]:
     """Take in a job; it is durable when this returns.
 
@@ -72,8 +72,10 @@ async def submit(
     arriving = service.folder.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
-        job, digest = await _read(service, request, caller, kind, arriving / INPUT)
-        return await run_in_threadpool(_keep, service, arriving, caller.tenant, job, digest, key)
+        job, digest = await _read(service, request, caller, kind, folder=arriving / INPUT)
+        return await run_in_threadpool(
+            _keep, service, arriving, caller.tenant, job, digest=digest, key=key
+        )
     except OtherRequestError:
         raise Problem(422, "this Idempotency-Key was given with another request") from None
     finally:
@@ -102,7 +104,7 @@ def _require_place_in_queue(service: Service, tenant: str) -> None:
 
 
 async def _read(
-    service: Service, request: Request, caller: Caller, kind: JobKind, folder: Path
+    service: Service, request: Request, caller: Caller, kind: JobKind, *, folder: Path
 ) -> tuple[Job, str]:
     """The job that a request asks for, its uploads in a folder; and the digest of all."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -171,7 +173,7 @@ def _free_name(name: str, taken: set[str]) -> str:
 
 
 def _keep(
-    service: Service, arriving: Path, tenant: str, job: Job, digest: str, key: str | None
+    service: Service, arriving: Path, tenant: str, job: Job, *, digest: str, key: str | None
 ) -> tuple[JobRecord, bool]:
     """Put the input in its place, then the job into the table."""
     (arriving / LOG).touch()
@@ -183,7 +185,7 @@ def _keep(
     folder = service.folder.of_job(arriving.name)
     service.folder.keep(arriving, folder)
     try:
-        record = service.jobs.add(folder.name, tenant, job, digest, key)
+        record = service.jobs.add(folder.name, tenant, job, digest, key=key)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

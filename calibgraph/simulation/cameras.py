@@ -97,6 +97,7 @@ def render(
     rays: CameraRays,
     T_world_camera: Array,
     rng: np.random.Generator,
+    *,
     imaging: Imaging | None = None,
 ) -> Image:
     """Render an image.

@@ -31,8 +31,8 @@ class Lidar:
         intensity_noise: standard deviation.
         ring_spread: standard deviation of the beams' gains, about 1.
         dropout: share of shots that are lost at random.
-        weakest: albedo of which 1 - 1/e of the shots return at 100 m and normal incidence.
-        errors: none, or those of a real sensor.
+        weakest: albedo at which 1 - 1/e of the shots return from 100 m at normal incidence.
+        errors: of the sensor; none for an ideal one.
     """
 
     elevations_deg: tuple[float, ...]
@@ -82,7 +82,7 @@ def ring_gains(lidar: Lidar, rng: np.random.Generator) -> Array:
 
 
 def scan(
-    world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, rng: np.random.Generator
+    world: World, lidar: Lidar, gains: Array, T_world_lidar: Array, *, rng: np.random.Generator
 ) -> Points:
     """Scan the world in one instant, as a moving sensor after motion compensation.
 

@@ -72,6 +72,7 @@ def ribbon(
     line_m: Array,
     along_m: Array,
     edges_m: Sequence[tuple[float, float]],
+    *,
     albedo: Albedo,
     paint: Paint,
 ) -> Mesh:

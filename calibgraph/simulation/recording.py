@@ -99,7 +99,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
             the seed draws them.
         lens_errors: size of the errors of the lenses in the rig files, 1 for those that a good
             calibration with a target leaves; the truth is then what goes best with these lenses.
-        vary_layout: draw the street's width, curves, gardens, heights and what stands in it by the
+        vary_layout: draw the street's width, curves, gardens, heights and objects by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
         progress: called with the stage, its steps done, and their number.
 
@@ -124,8 +124,8 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
-        _write_scans(made / "lidar", lidar, drive, seed, progress)
-        _write_images(made / "cameras", rig, drive, seed, progress)
+        _write_scans(made / "lidar", lidar, drive, seed, progress=progress)
+        _write_images(made / "cameras", rig, drive, seed, progress=progress)
         stated.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
         for name in _WRITTEN:
@@ -180,16 +180,18 @@ def _draw_stops(
     return tuple(stops)
 
 
-def _write_scans(folder: Path, lidar: Lidar, drive: Drive, seed: int, progress: Progress) -> None:
+def _write_scans(
+    folder: Path, lidar: Lidar, drive: Drive, seed: int, *, progress: Progress
+) -> None:
     gains = ring_gains(lidar, np.random.default_rng([seed, _GAINS]))
     for frame, T_world_lidar in enumerate(drive.T_world_lidar):
         progress("scanning", frame, len(drive.T_world_lidar))
         rng = np.random.default_rng([seed, _SCAN, frame])
-        cloud = scan(drive.world, lidar, gains, T_world_lidar, rng)
+        cloud = scan(drive.world, lidar, gains, T_world_lidar, rng=rng)
         _write_cloud(folder / f"{frame:06d}.npy", cloud)
 
 
-def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, progress: Progress) -> None:
+def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, *, progress: Progress) -> None:
     """All images, camera by camera: the rays of a camera take much memory."""
     frames = len(drive.T_world_lidar)
     for index, (name, camera) in enumerate(rig.cameras.items()):

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera, Intrinsics, Rig
 
 Array = NDArray[np.float64]
 
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Rotation of a camera that looks along the LiDAR's x axis, z of which is up."""
+"""Rotation of a camera that looks along the LiDAR's x axis; the LiDAR's z axis is up."""
 
 
 def rig_of(name: str) -> Rig:
@@ -168,8 +169,6 @@ def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, 
         xyz_m: (3,) position; x is forward, y left, z up.
         yaw_pitch_roll_deg: rotations about z, then y (down is positive), then x.
     """
-    T = np.eye(4)
     turned = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix()
-    T[:3, :3] = _OPTICAL @ turned.T
-    T[:3, 3] = -T[:3, :3] @ np.asarray(xyz_m)
-    return T
+    R = _OPTICAL @ turned.T
+    return transform(R, -R @ np.asarray(xyz_m))

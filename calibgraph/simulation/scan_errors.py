@@ -1,4 +1,4 @@
-"""What real scans have and an ideal one has not: wrong beam angles, wide beams, motion, bias."""
+"""The errors of real scans: wrong beam angles, wide beams, motion, bias."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class ScanErrors:
     """Errors of a spinning LiDAR, constant over a recording.
 
     Attributes:
-        elevations_deg: by how much each beam points higher than is reported; empty for nothing.
+        elevations_deg: true minus reported elevation of each beam; empty for none.
         beam_mrad: full width of a beam; what lies foremost in it returns, if two parts in seven
             meet it.
         motion_m: drive ahead during a turn, for which the points are not corrected.
-        dark_m: ranges of black surfaces are longer by so much.
+        dark_m: range bias of black surfaces.
     """
 
     elevations_deg: tuple[float, ...] = ()
@@ -41,11 +41,6 @@ def draw_scan_errors(beams: int, size: float, rng: np.random.Generator) -> ScanE
     At size 1: elevations wrong by 0.05 deg all alike, by 0.05 deg at the outermost beams and
     linearly between, and by 0.04 deg each (standard deviations); beams 1 to 3.5 mrad wide; 0.1 m of
     motion left per turn (standard deviation); up to 3 cm of bias on black.
-
-    Args:
-        beams: of the LiDAR.
-        size: multiplies all of them.
-        rng: draws them.
     """
     tilt = np.linspace(-1.0, 1.0, beams)
     alike, along = rng.normal(0.0, 0.05, 2)
@@ -65,7 +60,7 @@ def cast_beams(
 
     Args:
         world: surfaces.
-        errors: of the sensor; those of its elevations are in the shots.
+        errors: of the sensor; its elevation errors are in the shots.
         T_world_lidar: (4, 4) when the sensor looks ahead.
         shots: (n, 3) unit vectors in the LiDAR's frame.
 
@@ -98,7 +93,7 @@ def _parts_of_beam(shots: Array, beam_mrad: float) -> list[Array]:
 
 
 def _foremost(hits: list[Hits]) -> Hits:
-    """What returns: the foremost surface that at least two parts of the beam meet."""
+    """The returned range: the foremost surface that at least two parts of the beam meet."""
     distances = np.stack([part.distance_m for part in hits])
     order = np.argsort(distances, axis=0)
     ranked = np.take_along_axis(distances, order, axis=0)
@@ -119,5 +114,5 @@ def _foremost(hits: list[Hits]) -> Hits:
 
 
 def bias_of_range(errors: ScanErrors, brightness: Array) -> Array:
-    """(n,) [m] by how much ranges are too long; brightness as of ``return_chance``."""
+    """(n,) [m] range bias; brightness as in ``return_chance``."""
     return np.asarray(errors.dark_m * np.exp(-brightness / _BLACK))

@@ -21,12 +21,7 @@ MATCHES = 1000  # per camera and frame: the paper's grid keeps at most as many
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A rig in a street, and a matcher.
-
-    Attributes:
-        rig: its extrinsics are the truth.
-        errors: of the matcher, per camera.
-    """
+    """A rig in a street, and a matcher."""
 
     rig: Rig
     errors: Mapping[str, MatcherErrors]
@@ -42,14 +37,6 @@ def simulate_table(
     out: Path, name: str, *, frames: int, rotation_deg: float, translation_m: float, seed: int
 ) -> list[Path]:
     """Write the correspondences of a scenario with its truth and a guess.
-
-    Args:
-        out: folder to write: ``correspondences.parquet``, ``reference.yaml`` and ``rig.yaml``.
-        name: of the scenario.
-        frames: number of frames.
-        rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
-        translation_m: its translation error.
-        seed: of all draws.
 
     Returns:
         The files.

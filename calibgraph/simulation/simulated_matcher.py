@@ -86,7 +86,7 @@ class SimulatedMatcher:
 
     @property
     def _common_error(self) -> dict[str, float]:
-        """That frames share none, where it is so; else it is not stated, as of other matchers."""
+        """The statement that frames share no error, if true; otherwise nothing is stated."""
         if self.errors.bias_px or self.bias_twist.any():
             return {}
         return {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}

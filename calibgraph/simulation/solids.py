@@ -61,7 +61,7 @@ class Solid:
         albedo: its colour.
         paint: over the albedo.
         yaw_deg: rotation about z.
-        taper: extents of its top along x and y, as shares of those of the underside.
+        taper: extents of its top along x and y, relative to the underside.
         bumps: standard deviation of the radius of its surface, as a share, for leaves.
         uv_from_m: (u, v) of the surface's corner on the paint.
     """
@@ -160,14 +160,7 @@ HEDGE = (
 def place(
     parts: Iterable[Solid], xy_m: tuple[float, float], *, yaw_deg: float, body: Albedo
 ) -> list[Solid]:
-    """Place an object in the world.
-
-    Args:
-        parts: in a common frame.
-        xy_m: position of its origin.
-        yaw_deg: rotation about z.
-        body: albedo of the unpainted parts.
-    """
+    """Place an object in the world."""
     T_world_parts = to_transform((*xy_m, 0), yaw_deg * UNIT_Z)
     return [
         replace(

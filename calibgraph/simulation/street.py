@@ -67,7 +67,7 @@ _KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What streets may differ in; by default, all are laid out alike.
+    """The layout of a street; by default all streets have the same.
 
     Attributes:
         width: factor of all distances across: of lanes, kerbs, pavements, houses' fronts.
@@ -75,7 +75,7 @@ class Layout:
         spacing: factor of the distances between furniture along it.
         margin_m: its length behind the first stop and beyond the last.
         marks_from_m: where along it the markings of the road begin.
-        setback_m: of the houses on the left and on the right, beyond the usual one.
+        setback_m: of the houses on the left and on the right, beyond the default.
         storeys: fewest and most.
         parked: share of the bays that are taken.
         oncoming: chance of an oncoming car every 12 m.
@@ -122,7 +122,7 @@ class Centreline:
         along_m: (k,) distances s along it, rising.
         xy_m: (k, 2) in the world.
         heading_rad: (k,) directions, unwrapped.
-        layout: distances to the left of the line are of a street of the usual width.
+        layout: distances to the left of the line are of a street of the default width.
     """
 
     along_m: Array
@@ -189,7 +189,7 @@ def _band(
     paint: Paint,
 ) -> Mesh:
     marks_m = line.along_m + line.layout.marks_from_m
-    return ribbon(line.with_left, marks_m, edges_m, albedo, paint)
+    return ribbon(line.with_left, marks_m, edges_m, albedo=albedo, paint=paint)
 
 
 def _place(

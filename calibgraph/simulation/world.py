@@ -224,7 +224,7 @@ def _fill_sky(colour, directions):  # type: ignore[no-untyped-def]
 def _fill_surfaces(  # type: ignore[no-untyped-def]
     colour, directions, width, triangle, within, lit, surfaces, paints, grain, sun
 ):
-    """Lit surfaces; ``width`` is that of each ray at its hit."""
+    """Lit surfaces; ``width`` is the width of each ray at its hit."""
     for i in range(len(triangle)):
         if triangle[i] < 0:
             continue

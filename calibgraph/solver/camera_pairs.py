@@ -162,7 +162,7 @@ def pair_terms(
         rows = table.of_pair(a, b)
         rows = rows.select(np.argsort(rows.frame, kind="stable"))
         sides = [
-            _term_of_side(rig, names, side, rows, kind, config)
+            _term_of_side(rig, names, side, rows, kind=kind, config=config)
             for side, names in enumerate(((a, b), (b, a)))
         ]
         terms += sides
@@ -214,7 +214,7 @@ def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
 
 
 def _term_of_side(
-    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, kind: Kind, config: Config
+    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, *, kind: Kind, config: Config
 ) -> PairTerm:
     """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)

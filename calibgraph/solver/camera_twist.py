@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
@@ -23,10 +24,7 @@ def apply_twist(camera: Camera, twist: Array) -> Camera:
 
 def twisted(T_camera_lidar: Array, twist: Array) -> Array:
     """(4, 4) exp(twist) T_camera_lidar, to first order in the translation, however far it is."""
-    step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
-    step[:3, 3] = twist[3:]
-    return np.asarray(step @ T_camera_lidar)
+    return np.asarray(transform(Rotation.from_rotvec(twist[:3]), twist[3:]) @ T_camera_lidar)
 
 
 def project_with_jacobian(camera: Camera, points_lidar_m: Array) -> tuple[Array, Array]:

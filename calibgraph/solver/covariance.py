@@ -40,6 +40,7 @@ def cluster_robust_covariance(
     T_camera_lidar: Transforms,
     scales: Scales,
     curvature: Curvature,
+    *,
     held: Sequence[str] = (),
 ) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few + M) H^-1``.
@@ -150,8 +151,8 @@ def with_pseudo_frames(
         mean = along * count / np.maximum(count - 1.0, 1.0)
     else:
         prior = _along(vectors, usual * of_frame) / PSEUDO_FRAMES
-        usual_frames = error_components().usual_frames
-        mean = (usual_frames * prior + count * along) / (usual_frames + count - 1.0)
+        prior_frames = error_components().prior_frames
+        mean = (prior_frames * prior + count * along) / (prior_frames + count - 1.0)
     allowed: Array = scatter + (vectors * (PSEUDO_FRAMES * mean)) @ vectors.T
     return allowed
 

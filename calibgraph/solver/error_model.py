@@ -237,7 +237,7 @@ def error_model(
         blocks[name] = by_place.with_variance(within.least)
         if sigmas.any():
             pose = to_T_lidar_camera(T_camera_lidar[name])
-            evidence = distortion_evidence(block, scales[name], pose, WEAK, places)
+            evidence = distortion_evidence(block, scales[name], pose, WEAK, places=places)
             jacobian[number] = evidence.jacobian * sigmas
             weight = 1.0 / within.mean_variance(findings.place_variance)
             information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information

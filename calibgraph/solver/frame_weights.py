@@ -82,6 +82,7 @@ def weigh_all_frames(
     blocks: Mapping[str, CameraBlock],
     stage1: Stage1,
     start: Mapping[str, Array],
+    *,
     config: Config,
     terms: Terms,
 ) -> WeighedFrames:

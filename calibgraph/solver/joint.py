@@ -67,10 +67,10 @@ def solve_joint(
     with watch("stage1"):
         pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
         blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
-        start = best_start(rig, blocks, pairwise, config, terms, tied)     # x_0
+        start = best_start(rig, blocks, pairwise, config, terms=terms, tied=tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights
-        frames = weigh_all_frames(kept.table, blocks, pairwise, start, config, terms)
+        frames = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
 
     objective = Objective(rig, frames.blocks, T_hat(pairwise), config, terms)  # Eq. 5
 
@@ -84,7 +84,10 @@ def solve_joint(
         errors, optimum = refine_with_error_model(
             inliers, optimum, scales, kept.table.metadata, held)
 
-    counts = count_correspondences(kept, objective, inliers, pairwise, frames.outlier_frames)
+    outlier_frames = frames.outlier_frames
+    counts = count_correspondences(
+        kept, objective, inliers, pairwise, outlier_frames=outlier_frames
+    )
     seconds = watch.seconds
     found = Solution(
         rig, kept.table, objective, inliers, scales, optimum, counts, seconds,
@@ -167,6 +170,7 @@ def count_correspondences(
     objective: Objective,
     inliers: Objective,
     pairwise: Stage1,
+    *,
     outlier_frames: Mapping[str, int],
 ) -> dict[str, dict[str, int]]:
     """Per camera: correspondences left after each filter and the gate, and its frames.

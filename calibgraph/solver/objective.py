@@ -84,7 +84,7 @@ class Objective:
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
         """All terms but the reprojection term: priors and measured relative poses."""
-        return objective_graph(self.rig, {}, self.T_hat, self.config, self.terms)
+        return objective_graph(self.rig, {}, self.T_hat, self.config, terms=self.terms)
 
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
@@ -131,9 +132,7 @@ def ransac_pnp(
         return None
     if not found or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         return None
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(rotation)[0]
-    T[:3, 3] = translation.ravel()
+    T = transform(cv2.Rodrigues(rotation)[0], translation.ravel())
     T[:3] = turn.T @ T[:3]
     return T
 

@@ -74,6 +74,7 @@ def distortion_evidence(
     scale: ResidualScale,
     T_lidar_camera: gtsam.Pose3,
     weak: Array,
+    *,
     places: Sequence[Numbers],
 ) -> DistortionEvidence:
     """The quadratics of a camera's matches, in the tangent of ``T_lidar_camera``.

@@ -87,7 +87,7 @@ def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]
     return np.asarray(np.kron(cameras, of_pair / 2))
 
 
-def error_over_usual(
+def shared_variance_ratio(
     T_camera_lidar: Mapping[str, Array], covariance: Array, fits: Sequence[PairFit]
 ) -> float:
     """Variance of the shared error over its usual one, by what cameras see in common; at least 1.

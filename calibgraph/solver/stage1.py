@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import twists_between
+from calibgraph.model.geometry import transform, twists_between
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
@@ -218,29 +218,22 @@ def aggregate(T_camera_lidar: Array, how: str) -> Array:
     """
     if how == "median":
         return median_pose(T_camera_lidar)
-    T = np.eye(4)
     rotations, translations = _parts(T_camera_lidar)
     if how == "mean":
-        rotation, T[:3, 3] = rotations.mean(), translations.mean(axis=0)
-    elif how == "mode":
+        return transform(rotations.mean(), translations.mean(axis=0))
+    if how == "mode":
         median = geodesic_median(rotations)
         tangents = (rotations * median.inv()).as_rotvec()
         mode = np.array([half_sample_mode(column) for column in tangents.T])
-        rotation = Rotation.from_rotvec(mode) * median
-        T[:3, 3] = [half_sample_mode(column) for column in translations.T]
-    else:
-        raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
-    T[:3, :3] = rotation.as_matrix()
-    return T
+        translation = [half_sample_mode(column) for column in translations.T]
+        return transform(Rotation.from_rotvec(mode) * median, translation)
+    raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
 
 
 def median_pose(T_camera_lidar: Array) -> Array:
     """(4, 4) of (f, 4, 4): component-wise for the translation, geodesic L1 for the rotation."""
-    T = np.eye(4)
     rotations, translations = _parts(T_camera_lidar)
-    T[:3, :3] = geodesic_median(rotations).as_matrix()
-    T[:3, 3] = np.median(translations, axis=0)
-    return T
+    return transform(geodesic_median(rotations), np.median(translations, axis=0))
 
 
 def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:

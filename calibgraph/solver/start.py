@@ -24,6 +24,7 @@ def best_start(
     blocks: Mapping[str, CameraBlock],
     stage1: Stage1,
     config: Config,
+    *,
     terms: Terms,
     tied: Sequence[tuple[str, str]] = (),
 ) -> Transforms:

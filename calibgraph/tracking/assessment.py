@@ -12,10 +12,10 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, joint_estimate
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
+from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
@@ -41,7 +41,7 @@ class Assessment:
 
 
 def assess(
-    state: State, sums: Posterior, halves: Halves, closed: ClosedPlaces, priors: Priors
+    state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces, *, priors: Priors
 ) -> Assessment:
     """Assess the present estimates.
 
@@ -162,8 +162,8 @@ def _counts(one: CameraState) -> dict[str, int]:
 def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
-    halves = Halves.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, ClosedPlaces.of(state), Priors.of(state))
+    halves = SplitHalf.of_closed_epochs(state).add(state.epochs[-1].frames)
+    assessment = assess(state, sums, halves, ClosedPlaces.of(state), priors=Priors.of(state))
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

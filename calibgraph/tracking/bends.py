@@ -92,7 +92,7 @@ class BendSums:
         inliers = raw.select(raw.at(to_T_camera_lidar(T_lidar_camera)).inliers(scale))
         if len(inliers.frame) < MIN_MATCHES:
             return found
-        evidence = distortion_evidence(inliers, scale, T_lidar_camera, WEAK, places)
+        evidence = distortion_evidence(inliers, scale, T_lidar_camera, WEAK, places=places)
         found.hessian[camera] = evidence.hessian
         found.pull[camera] = evidence.hessian @ evidence.jacobian
         found.information[camera] = evidence.information.sum(axis=0)

@@ -238,14 +238,14 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
             cameras.append(camera)
             steps.append(two - one)
             now[camera] = two
-    covariance = _covariance(state, before, after, cameras, detected.since)
+    covariance = _covariance(state, before, after, cameras, since=detected.since)
     limits = np.array([alarm_limit(state.total_frames[c]) for c in cameras])
     references = tuple(state.references[c] for c in cameras)
     return Steps(tuple(cameras), np.ravel(steps), covariance, limits, references), now
 
 
 def _covariance(
-    state: State, before: Posterior, after: Posterior, cameras: list[int], since: int
+    state: State, before: Posterior, after: Posterior, cameras: list[int], *, since: int
 ) -> Array:
     """(6 m, 6 m) covariance of the difference between the estimates before and after."""
     rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])

@@ -98,7 +98,11 @@ def absorb_frames(
         frames = []
         for frame in epoch.frames:
             raw = by_number.get(frame.number)
-            absorbed = None if raw is None else _absorb(state, frame, camera, raw, T_lidar_camera)
+            absorbed = (
+                None
+                if raw is None
+                else _absorb(state, frame, camera, raw, T_lidar_camera=T_lidar_camera)
+            )
             frames.append(absorbed or frame)
             if raw is not None and absorbed is not None:
                 used = np.count_nonzero(absorbed.inliers[camera])
@@ -117,7 +121,7 @@ def absorb_frames(
 
 
 def _absorb(
-    state: State, frame: LiveFrame, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
+    state: State, frame: LiveFrame, camera: int, raw: CameraBlock, *, T_lidar_camera: gtsam.Pose3
 ) -> LiveFrame | None:
     """The frame with a camera's matches, None if too few are within the gate."""
     scale = state.cameras[camera].scale

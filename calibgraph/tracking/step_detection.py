@@ -121,7 +121,7 @@ def detect_small_step(state: State) -> DetectedStep | None:
         since, after = state.epochs[place].frames[0].number, afterwards[place]
         by_places = shift_since(state, since)
         for camera, camera_state in enumerate(state.cameras):
-            excess = _shift_excess(state, camera, before, after, by_places)
+            excess = _shift_excess(state, camera, before, after, by_places=by_places)
             if camera_state.started and excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
@@ -158,7 +158,7 @@ def _sums_from_each_epoch(state: State) -> list[_Sums]:
 
 
 def _shift_excess(
-    state: State, camera: int, before: Posterior, after: _Sums, by_places: Array
+    state: State, camera: int, before: Posterior, after: _Sums, *, by_places: Array
 ) -> float:
     """Excess of the contradiction between a camera's frames before and after, over the limit.
 

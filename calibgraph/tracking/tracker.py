@@ -34,12 +34,12 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
+from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.start import try_to_start
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
@@ -174,7 +174,7 @@ class IncrementalCalibrator:
         events += seen + self._restart_after_step()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
-        return make_update(self._state, self.rig, self._assess(), tuple(events), used)
+        return make_update(self._state, self.rig, self._assess(), tuple(events), used=used)
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
@@ -182,7 +182,7 @@ class IncrementalCalibrator:
         if self._assessed is None or self._assessed[0] is not state:
             sums, halves = with_open_epoch(self._closed, state), self._closed_halves
             halves = halves.add(state.epochs[-1].frames)
-            found = assess(state, sums, halves, self._closed_places, self._priors)
+            found = assess(state, sums, halves, self._closed_places, priors=self._priors)
             self._assessed = state, found
         return self._assessed[1]
 
@@ -241,7 +241,7 @@ class IncrementalCalibrator:
         self._priors = Priors.of(self._state)
         self._closed_places = ClosedPlaces.of(self._state)
         self._closed = closed_posterior(self._state)
-        self._closed_halves = Halves.of_closed_epochs(self._state)
+        self._closed_halves = SplitHalf.of_closed_epochs(self._state)
 
     def _blocks_by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
         """The preprocessed matches of each camera that has enough."""

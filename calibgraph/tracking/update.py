@@ -52,6 +52,7 @@ def make_update(
     rig: Rig,
     assessment: Assessment,
     events: tuple[Event, ...],
+    *,
     used: Mapping[int, CameraBlock],
 ) -> Update:
     """The update after the last frame of a state.

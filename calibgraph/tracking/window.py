@@ -166,4 +166,4 @@ def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
         name: to_T_camera_lidar(reference)
         for name, reference in zip(state.names, state.references, strict=True)
     }
-    return objective_graph(rig, {}, T_hat, state.config, "full")
+    return objective_graph(rig, {}, T_hat, state.config, terms="full")

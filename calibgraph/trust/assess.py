@@ -51,7 +51,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     point_distance_checks,      # are the points in metres?
     estimate_checks,            # residuals, sigmas, relative poses, halves, counts, convergence
     pair_agreement_checks,      # do two cameras' images agree with the correspondences?
-    matcher_checks,             # what the matcher reported: search, learned shares, z-score
+    matcher_checks,             # findings of the matcher: search, learned shares, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?
     place_checks,               # does a place contradict the others?

@@ -28,9 +28,6 @@ def bootstrap_covariance(solution: Solution) -> dict[str, Array]:
     it is gated and solved like the solution, from there. A draw that leaves a camera with too few
     matches is repeated.
 
-    Args:
-        solution: of the joint solve; ``config.bootstrap`` is the number of draws.
-
     Returns:
         Empty without draws, or where the terms do not use the correspondences.
 
@@ -53,11 +50,7 @@ def bootstrap_covariance(solution: Solution) -> dict[str, Array]:
 def _solve_draw(
     solution: Solution, rng: np.random.Generator, frames: NDArray[np.int64]
 ) -> Transforms:
-    """The T_camera_lidar of one draw of frames.
-
-    Raises:
-        CorrespondenceError: if no draw has enough matches of every camera.
-    """
+    """The T_camera_lidar of one draw of frames."""
     for _ in range(_MAX_TRIES):
         drawn = rng.choice(frames, len(frames))
         blocks = {name: _draw(b, drawn) for name, b in solution.objective.blocks.items()}

@@ -1,4 +1,4 @@
-"""The usual convention errors of a guess (direction, axes, units): each undone and compared."""
+"""The common convention errors of a guess (direction, axes, units): each undone and compared."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calibgraph.matching.structure.pose_refinement import (
     approach,
     refine,
 )
-from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert
+from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert, transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.thresholds import limit
@@ -39,7 +39,7 @@ _LEAST_POINTS = 300  # of a cloud in the image, so that windows of it can agree
 
 
 def undo_convention_errors(guess: Array) -> dict[str, Array]:
-    """By convention error, in words: the (4, 4) T_camera_lidar of a (4, 4) guess that has it."""
+    """Per convention error, in words: the (4, 4) T_camera_lidar of a (4, 4) guess that has it."""
     inverse = invert(guess)
     position, transposed = guess.copy(), guess.copy()
     position[:3, 3] = -guess[:3, :3] @ guess[:3, 3]
@@ -69,9 +69,7 @@ def undo_convention_errors(guess: Array) -> dict[str, Array]:
 
 def _turned(degrees: float) -> Array:
     """(4, 4) a turn about z."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return turn
+    return transform(Rotation.from_euler("z", degrees, degrees=True))
 
 
 def _in_millimetres(guess: Array) -> Array:
@@ -90,7 +88,7 @@ def _rotated(guess: Array, *xyzw: float) -> Array:
 def convention_error_between(guess: Array, result: Array) -> str | None:
     """The convention error of a guess that, undone, leads near the result; in words.
 
-    Of errors that lead about as near, the first of the list, which is the most usual.
+    Of errors that lead about as near, the first of the list, the most common one.
     """
     distances = {
         error: degrees / limit("convention_rotation") + metres / limit("convention_translation")
@@ -123,12 +121,7 @@ def likely_intended_guess(dataset: Dataset, guess: Rig) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Tries corrected guesses of some cameras of a rig.
-
-    Attributes:
-        frames: the cameras' images and clouds.
-        guess: of all cameras.
-    """
+    """Tries corrected guesses of some cameras of a rig."""
 
     frames: Mapping[str, CameraFrames]
     guess: Rig
@@ -204,7 +197,7 @@ def _is_near(one: Array, two: Array) -> bool:
 
 
 def _in_reach(guess: Array, T_camera_lidar: Array) -> bool:
-    """Whether the usual search from a guess reaches a pose."""
+    """Whether the matcher's search from a guess reaches a pose."""
     degrees, metres = _difference(guess, T_camera_lidar)
     return degrees < math.sqrt(3) * SEARCH_DEG and metres < math.sqrt(3) * SEARCH_M
 

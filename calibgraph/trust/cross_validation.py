@@ -27,14 +27,14 @@ RESTARTS, RESTART_DEG, RESTART_M = 3, 2.0, 0.2
 """How many displaced starts, and how far they are from the solution."""
 
 _RESTART_SAMPLE = 5000  # matches of a camera that first lead back from a displaced start
-_MET_DEG, _MET_CM = 0.01, 0.3  # a tenth of what the check allows: starts that have come together
+_MET_DEG, _MET_CM = 0.01, 0.3  # a tenth of the check's limit: starts that have come together
 _ROUGH = 1e-6  # relative change of the cost at which their first pass stops: the gate needs no more
-_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes what it finds
+_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
 
 
 def held_out_checks(evidence: Evidence) -> Checks:
-    """The error of frames that a solution was not fitted to, over that of those it was."""
+    """Ratio of the error of held-out frames to the error of fitted frames."""
     row = threshold("held_out")
     return {
         name: [row.check(_held_out_ratio(block, evidence.halves[name], evidence.even_frames))]
@@ -46,13 +46,7 @@ def held_out_checks(evidence: Evidence) -> Checks:
 def _held_out_ratio(
     block: CameraBlock, halves: tuple[Array, Array], even_frames: NDArray[np.int64]
 ) -> float:
-    """The median error of held-out frames over that of fitted ones.
-
-    Args:
-        block: a camera's matches, not only those within the gate.
-        halves: (4, 4) T_camera_lidar from the even frames, and from the odd ones.
-        even_frames: their numbers.
-    """
+    """Ratio of the median error of held-out frames to the median error of fitted frames."""
     even = block.in_frames(even_frames)
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])
@@ -89,7 +83,7 @@ def restart_checks(evidence: Evidence) -> Checks:
 
 @cache
 def _displacements(cameras: int) -> list[list[Array]]:
-    """Per restart, the (4, 4) T_delta of so many cameras."""
+    """Per restart, the (4, 4) T_delta of each camera."""
     unmoved = {str(camera): np.eye(4) for camera in range(cameras)}
     return [
         [
@@ -159,12 +153,7 @@ def competing_solution_checks(evidence: Evidence) -> Checks:
 
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:
-    """The matches that agree on another extrinsic alone, over those that agree on this one alone.
-
-    Args:
-        solution: of the joint solve, from correspondences.
-        camera: one that has correspondences.
-    """
+    """Ratio of the matches that agree on another extrinsic alone to those on this one alone."""
     row = threshold("competing_solution")
     block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
@@ -187,7 +176,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
 
 
 def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
-    """A camera's matches, also those of the frames that are left out: they may agree elsewhere."""
+    """All matches of a camera, outlier frames included: they may agree on another pose."""
     if not solution.counts[camera]["outlier_frames"]:
         return solution.objective.blocks[camera]
     rows = solution.correspondences.of_camera(camera)
@@ -195,13 +184,7 @@ def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
 
 
 def _ransac_iterations(fewest: float, matches: int) -> int:
-    """Samples of 4 matches that find a competing solution if it is large enough for a warning.
-
-    Args:
-        fewest: matches of such a solution, if it shares none with the reported one; it may share
-            half of them.
-        matches: that were left out, among which they are.
-    """
+    """Samples of 4 matches that find a competing solution if it is large enough for a warning."""
     share = min(fewest / 2 / matches, 0.99)
     needed = math.log(_MISSED) / math.log1p(-(share**4)) if share > 0 else math.inf
     return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))

@@ -1,4 +1,4 @@
-"""What is known of one camera's estimate, from a batch solve or while driving: input to checks."""
+"""One camera's estimate, from a batch solve or while driving, as checks need it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """One camera's estimate, with what its checks need.
+    """One camera's estimate and the values that its checks need.
 
     Attributes:
         camera: lens, and the initial guess.

@@ -1,4 +1,4 @@
-"""What several checks share, each computed once, when the first check needs it."""
+"""The values that checks share, each computed once, when the first check needs it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from calibgraph.solver.error_shares import (
 )
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.shared_error import error_between, error_over_usual, shared_scatter
+from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
@@ -62,12 +62,7 @@ class DataOnly:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A solution and what its checks compute from it.
-
-    Attributes:
-        solution: of the joint solve.
-        guess: the rig as it was first guessed.
-    """
+    """A solution, the first guess, and the values that checks compute from them."""
 
     solution: Solution
     guess: Rig
@@ -79,7 +74,7 @@ class Evidence:
 
     @property
     def of_correspondences(self) -> Evidence:
-        """The same of the solution without what cameras see in common."""
+        """The evidence of the solution without camera-to-camera matches."""
         return self if self.solution.before_pairs is None else self._without_pairs
 
     @cached_property
@@ -88,7 +83,7 @@ class Evidence:
 
     @property
     def findings(self) -> MatcherFindings:
-        """What the matcher reported."""
+        """The findings of the matcher."""
         return self.solution.correspondences.findings
 
     @cached_property
@@ -108,7 +103,7 @@ class Evidence:
 
     @cached_property
     def curvature(self) -> Curvature:
-        """Of all terms at the solution."""
+        """The curvature of all terms at the solution."""
         solution = self.solution
         return curvature_at(
             solution.inliers, solution.T_camera_lidar, self.robust_hessians, solution.held
@@ -123,7 +118,7 @@ class Evidence:
             solution.T_camera_lidar,
             solution.scales,
             self.curvature,
-            solution.held,
+            held=solution.held,
         )
 
     @cached_property
@@ -146,7 +141,7 @@ class Evidence:
             return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.error_over_usual * self._shared(solution.inliers, self.curvature)
+        shared = self.shared_variance_ratio * self._shared(solution.inliers, self.curvature)
         return (
             self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
         )
@@ -175,7 +170,7 @@ class Evidence:
         inliers, T_camera_lidar = self.solution.inliers, self.solution.T_camera_lidar
         no_places = replace(self.findings, place_variance=0.0)
         every, common = (
-            self.error_over_usual * np.diag(self._shared(inliers, self.curvature, findings))
+            self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
             for findings in (self.findings, no_places)
         )
         between = np.diag(error_between(T_camera_lidar, inliers.pairs))
@@ -185,8 +180,8 @@ class Evidence:
     def errors(self) -> ErrorFit | None:
         """The error model of the solution; None with the paper's presets.
 
-        What all matches share is at least as large as the images of pairs show, also where the loss
-        has given these up.
+        The shared error is at least as large as pairs of images show, even if the loss rejects
+        them.
         """
         solution = self.solution
         found = solution.errors or fit_errors(
@@ -196,19 +191,21 @@ class Evidence:
             solution.correspondences.metadata,
             solution.held,
         )
-        return None if found is None else found.with_shared_ratio(self.error_over_usual)
+        return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
 
     @cached_property
-    def error_over_usual(self) -> float:
-        """Variance of the shared error over its usual one, by what cameras see in common."""
+    def shared_variance_ratio(self) -> float:
+        """Variance of the shared error relative to its prior, from co-visible features."""
         own = self.of_correspondences
         if own is self or own.joint_covariance is None:
             return 1.0
-        return error_over_usual(own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits)
+        return shared_variance_ratio(
+            own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits
+        )
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
-        """Where the images place pairs of cameras, the first of each held near the solution."""
+        """The relative poses of pairs by images, the first camera held near the solution."""
         matches = self.solution.camera_matches
         if matches is None:
             return []
@@ -217,7 +214,7 @@ class Evidence:
 
     @cached_property
     def pair_covariance(self) -> Array:
-        """(6 N, 6 N) of the solution; where it is not determined, of what is usual."""
+        """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
         if self.joint_covariance is not None:
             return self.joint_covariance
         held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
@@ -226,7 +223,7 @@ class Evidence:
     def _shared(
         self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
     ) -> Array:
-        """(6 N, 6 N) covariance of a solution by the error that all frames share, if as usual."""
+        """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
         places = self.solution.correspondences.places
         repeats = {
             name: places.frames_per_place(block.frame_numbers)
@@ -332,7 +329,7 @@ class Evidence:
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
-        """Of the relative poses between cameras that both have correspondences."""
+        """The factors of relative poses between cameras that both have correspondences."""
         if self.data_only is None:
             return ()
         T_camera_lidar, covariance = self.data_only.T_camera_lidar, self.data_only.covariance
@@ -361,7 +358,7 @@ class Evidence:
         return pose_difference(joint, own)
 
     def estimate(self, camera: str) -> Estimate:
-        """What the checks of one camera's estimate need."""
+        """The input of the checks of one camera's estimate."""
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
         sigmas = self.data_sigmas
         return Estimate(
@@ -384,13 +381,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """All rounds of matching and solving, and the files they read.
-
-    Attributes:
-        run: the outcome of the rounds.
-        hashes: SHA-256 of the files, by path.
-        progress: called as the images are checked.
-    """
+    """All rounds of matching and solving, and the SHA-256 of the files they read."""
 
     run: MatchingRun
     hashes: Mapping[str, str]
@@ -398,7 +389,7 @@ class RunEvidence:
 
     @cached_property
     def solution(self) -> Evidence:
-        """Of the solution of the last round."""
+        """The evidence of the last round's solution."""
         return Evidence(self.run.solution, self.run.guess)
 
 

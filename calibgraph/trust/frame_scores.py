@@ -23,18 +23,15 @@ from calibgraph.model.rig import Camera
 Images = Sequence[NDArray[np.uint8]]
 """Gray images of one camera, (height, width) each, one per frame."""
 
-MAX_WINDOWS, SHARING_FRAMES = 10_000, 10  # per camera, over so many frames; of more, as many each
+MAX_WINDOWS, SHARING_FRAMES = (
+    10_000,
+    10,
+)  # per camera over that many frames; with more frames, as many each
 WIDE, FINER = LEVELS[1], LEVELS[2]
 
 
 class FrameScorer:
-    """Scores frames in parallel; clouds are decoded once.
-
-    Args:
-        dataset: images and clouds.
-        frames: those to score.
-        pool: of threads.
-    """
+    """Scores frames in parallel; clouds are decoded once."""
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames

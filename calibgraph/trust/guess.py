@@ -72,10 +72,6 @@ def compare_with_other_guesses(
 ) -> list[Check]:
     """The distance of two cameras to each other's guess over that to their own, at the least.
 
-    Args:
-        camera: its name; all others are tried.
-        distances: of the guess of one camera and the result of another, by both names.
-
     Returns:
         One check; none for a single camera.
     """

@@ -38,7 +38,7 @@ def image_checks(evidence: RunEvidence) -> Checks:
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    if run.matcher.fails_on_images:
+    if run.matcher.image_checks_can_fail:
         return checks
     return {
         name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
@@ -58,13 +58,6 @@ def check_images(
 
     Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
     a rotation), and a time offset under a constant motion (equivalent to a translation).
-
-    Args:
-        dataset: images and clouds; neighbouring frames of a folder are neighbours in time.
-        rig: the result.
-        table: the correspondences of its last round.
-        seed: of the searches.
-        progress: called as the work goes on.
 
     Returns:
         Checks of every camera.
@@ -91,13 +84,7 @@ def check_images(
 def _clouds_checks(
     own: Sequence[Check], of_placed: Mapping[str, Sequence[Check]]
 ) -> tuple[Check, ...]:
-    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras.
-
-    Args:
-        own: the checks of a camera's time.
-        of_placed: those of cameras that agree with their clouds at their place: elsewhere, which
-            clouds agree best is chance.
-    """
+    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras."""
     if any(check.status != "PASS" for check in own):
         return ()  # they show it
     return tuple(
@@ -109,12 +96,7 @@ def _clouds_checks(
 
 
 def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Check, ...]:
-    """The checks of one camera's extrinsic and lens by the image evidence.
-
-    Args:
-        found: the evidence.
-        names: of the frames, by number.
-    """
+    """The checks of one camera's extrinsic and lens by the image evidence."""
     if math.isnan(found.displaced_z_score):
         text = (
             f"the images could not be checked: only {found.groups} places with structure in both "

@@ -1,4 +1,4 @@
-"""Image evidence: what a second pass over images and clouds shows about a result.
+"""Image evidence: a second pass over images and clouds tests a result.
 
 Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`:
 
@@ -73,23 +73,13 @@ def measure_image_evidence(
     extrinsics_only: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, ImageEvidence]:
-    """Measure the image evidence on all cameras of a result.
-
-    Args:
-        dataset: images and clouds.
-        rig: lenses, and the extrinsics in question.
-        places: which frames share one.
-        seed: of the search for the lens.
-        extrinsics_only: whether to leave out the lens and the clouds of neighbouring frames, which
-            take most of the time.
-        progress: called as the work goes on.
-    """
+    """Measure the image evidence on all cameras of a result."""
     report = progress or no_progress
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}
     with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_camera, scorer, seed, places)
+        measure = partial(_measure_camera, scorer, seed=seed, places=places)
         if extrinsics_only:
             measure = partial(_measure_extrinsic, scorer)
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
@@ -108,7 +98,7 @@ def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageE
 
 
 def _measure_camera(
-    scorer: FrameScorer, seed: int, places: Places, name: str, camera: Camera
+    scorer: FrameScorer, name: str, camera: Camera, *, seed: int, places: Places
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
@@ -126,7 +116,7 @@ def _measure_camera(
 
 
 def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
-    """Compare the score at the result with those of displaced poses, over the same windows."""
+    """Compare the score at the result with displaced poses, over the same windows."""
     frames, per_frame = score_displaced(scores)
     best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
     return {

@@ -1,4 +1,4 @@
-"""What is seen of a dataset and its guess in a moment, before anything is matched."""
+"""Quick checks of a dataset and its guess, before anything is matched."""
 
 from __future__ import annotations
 
@@ -51,11 +51,12 @@ def _doubts_about_cloud(frame: Frame, cloud: Cloud) -> Iterator[str]:
     if distance.status != "PASS":
         yield distance.text
         return
-    apart = displacement_of_parts(cloud)
-    if apart is not None:
+    displacement = displacement_of_parts(cloud)
+    if displacement is not None:
+        turned, moved = displacement
         yield (
-            f"the cloud of frame {frame.name} holds the same surfaces twice, {apart[0]:.2g} deg "
-            f"and {apart[1]:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
+            f"the cloud of frame {frame.name} holds the same surfaces twice, {turned:.2g} deg "
+            f"and {moved:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
             "motion was corrected?"
         )
     if frame.is_corrected and scan_duration_s(frame.cloud_path) == 0:
@@ -86,7 +87,7 @@ def explain_guess(data: Dataset, rig: Rig, cloud: Cloud) -> str | None:
 
 
 def count_points_in_view(rig: Rig, cloud: Cloud) -> dict[str, int]:
-    """By camera, how many points of a cloud lie in the image by the guess."""
+    """Per camera, the number of cloud points in the image at the guess."""
     return {name: _count_seen(camera, cloud) for name, camera in rig.cameras.items()}
 
 
@@ -97,7 +98,7 @@ def _count_seen(camera: Camera, cloud: Cloud) -> int:
 
 
 def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
-    """A line per camera of whose view the cloud is out, by :func:`count_points_in_view`."""
+    """A line per camera without cloud points in view, by :func:`count_points_in_view`."""
     return [
         f"{name}: by the guess, no point of the cloud lies in the image"
         for name, count in in_view.items()
@@ -108,16 +109,10 @@ def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
 def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str, ...]:
     """Warnings about a dataset and its guess, before cameras are searched for; they are logged.
 
-    Args:
-        data: images and clouds.
-        rig: the guess.
-        at_guess: whether a matcher starts there; others may do without clouds, and are warned of
-            the rig alone.
-
     Raises:
         FileError: if a cloud cannot be read.
         DatasetError: if no camera has points of a cloud in view. One that has none may still be
-            placed by what it sees in common with others.
+            placed by co-visible features.
     """
     warnings = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
     for text in warnings:

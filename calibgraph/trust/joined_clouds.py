@@ -1,4 +1,4 @@
-"""Clouds that hold the same surfaces twice, some way apart: joined with a wrong extrinsic."""
+"""Clouds that hold the same surfaces twice, displaced: joined with a wrong extrinsic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from calibgraph.model.geometry import angle_deg
+from calibgraph.model.geometry import angle_deg, transform
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _EXPLAINED = 3.0  # root mean square of the motion along the normals, over what 
 
 
 def displacement_of_parts(points_m: NDArray[np.floating]) -> tuple[float, float] | None:
-    """How far apart two parts of a cloud show the same surfaces: degrees and metres.
+    """Displacement of two parts of a cloud that show the same surfaces: degrees and metres.
 
     Args:
         points_m: (n, >= 3) x y z, in the order of the file.
@@ -74,7 +74,7 @@ def _register(target: Array, source: Array) -> Array | None:
 
 
 def _spread_m(offsets_m: Array) -> float:
-    """Their robust standard deviation, at least that of a good LiDAR."""
+    """The robust standard deviation of distances, at least the noise of a good LiDAR."""
     return max(_LEAST_M, 1.5 * float(np.median(np.abs(offsets_m))))
 
 
@@ -101,7 +101,4 @@ def _step(points: Array, normals: Array, offsets_m: Array) -> Array:
     information = (jacobian * weights[:, None]).T @ jacobian
     information += 1e-5 * np.trace(information) * np.eye(6)  # a plane alone does not hold it
     step = -np.linalg.solve(information, (jacobian * weights[:, None]).T @ offsets_m)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-    T[:3, 3] = step[3:]
-    return T
+    return transform(Rotation.from_rotvec(step[:3]), step[3:])

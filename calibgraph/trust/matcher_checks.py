@@ -1,4 +1,4 @@
-"""Checks of what the matcher reported beside its correspondences."""
+"""Checks of the matcher's findings."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
 
 
 def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
-    """What a learned matcher does with its start, without its image, and with its frames."""
+    """Checks of a learned matcher: dependence on its start, memorization, failed frames."""
     shares = (
         (threshold("start_dependence"), findings.start_dependence.get(camera),
          "of a displaced start remains in the matches"),
-        (threshold("recall"), findings.recall.get(camera),
+        (threshold("memorization"), findings.memorization.get(camera),
          "of a displaced start is undone even without the image"),
         (threshold("failed_frames"), findings.failed_share.get(camera, 0.0),
          "of the frames failed to be matched"),

@@ -1,4 +1,4 @@
-"""What the data do not determine well, in words: weakest direction, empty parts, prior share."""
+"""Weakly observable parts of a solution, in words: weakest direction, empty parts, prior share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
 
 def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[str, ...]:
-    """Sentences about what one camera's data do not determine well, the most important first.
+    """Sentences about weakly observable parameters of one camera, the most important first.
 
     Args:
         solution: of the joint solve.
@@ -63,7 +63,7 @@ def _covariance_if_independent(block: CameraBlock, solution: Solution, camera: s
 def weakest_direction(covariance: Array) -> str:
     """The eigenvector of the largest standard deviation, in words.
 
-    Rotations and translations are compared by what is tolerable of each.
+    Rotations and translations are compared relative to their tolerances.
 
     Args:
         covariance: (6, 6) of (rotation [rad], translation [m]) in the camera's axes.

@@ -1,4 +1,4 @@
-"""Whether two cameras' relative pose from their images agrees with that of the calibration."""
+"""Whether two cameras' relative pose from their images agrees with the calibration."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from calibgraph.trust.thresholds import threshold
 Array = NDArray[np.float64]
 
 BLAME_SIGMAS = 1.0
-"""By so much more the one camera of a pair must disagree with its other neighbours than the other
+"""Factor by which one camera of a pair must disagree more with its other neighbours than the other
 one with its own, to be taken for the one that is wrong."""
 
 
 @dataclass(frozen=True)
 class PairAgreement:
-    """The relative pose of two cameras from images against that of a calibration.
+    """The relative pose of two cameras from images against the calibration.
 
     Attributes:
         a: the one camera.
@@ -70,13 +70,7 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
 
 
 def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
-    """The check of one camera of a pair, which other pairs may show to be the other's fault.
-
-    Args:
-        found: the pair.
-        camera: one of its two.
-        all_found: all pairs of the rig.
-    """
+    """The check of one camera of a pair, which other pairs may show to be the other's fault."""
     row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
     status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
     text = (
@@ -92,7 +86,7 @@ def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairA
 
 
 def _elsewhere(camera: str, pair: PairAgreement, found: Sequence[PairAgreement]) -> float:
-    """By how many sigmas a camera disagrees with others than that of a pair; 0 without others."""
+    """Sigmas by which a camera disagrees with the cameras outside a pair; 0 without others."""
     others = [one for one in found if one is not pair and camera in (one.a, one.b)]
     return max((one.sigmas for one in others), default=0.0)
 

@@ -1,4 +1,4 @@
-"""Whether all places agree: each against the others, by what its frames determine."""
+"""Whether all places agree: each against the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The probability that a result is off by more than the user's tolerance: what a verdict is cut of.
+"""The probability that a result is off by more than the tolerance, from which verdicts are cut.
 
 Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check
 is, which can only grow as a check gets worse. By a wrong lens: checks whose value is a probability.
@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
-from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 Array = NDArray[np.float64]
 
 TABLES, STRUCTURE = "tables", "structure"
-"""The models: of correspondences alone, whatever made them; of runs of the matcher."""
+"""The models: of correspondences from any source; of runs of the matcher."""
 
 _DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probability's logarithm
 
@@ -44,7 +44,7 @@ def judge(
     """
     of_checks = probability_of_checks(checks, model)
     of_error_bar = probability_beyond(covariance, tolerance)
-    return Verdict(tuple(checks), Doubt(of_checks, of_error_bar, *tolerance))
+    return Verdict(tuple(checks), ErrorProbability(of_checks, of_error_bar, *tolerance))
 
 
 def model_of(metadata: Mapping[str, Any]) -> str:
@@ -68,7 +68,7 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     """The worst of (kind, severity) pairs per kind of check.
 
-    Without those of the lens, and without that of what is stated, which is no sign of an error.
+    Checks of the lens are left out, as is the check of the stated error, no sign of an error.
     """
     worst: dict[str, float] = {}
     for kind, severity in checks:
@@ -80,13 +80,7 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
 def contributions(
     severities: Mapping[str, float], weights: Mapping[str, Sequence[float]], other: Sequence[float]
 ) -> dict[str, float]:
-    """Per kind of check, what it adds to the log odds; never negative.
-
-    Args:
-        severities: per kind.
-        weights: per kind, of each step of `steps`.
-        other: of kinds without.
-    """
+    """Per kind of check, its contribution to the log odds; never negative."""
     return {
         kind: sum(map(mul, steps(severity), weights.get(kind, other)))
         for kind, severity in severities.items()

@@ -37,12 +37,7 @@ def repeated_cloud_checks(evidence: RunEvidence) -> Checks:
 
 
 def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
-    """The first two frames with the same cloud, if any.
-
-    Args:
-        dataset: its frames.
-        hashes: of the files, by path.
-    """
+    """The first two frames with the same cloud, if any."""
     names: dict[str, str] = {}
     for frame in dataset.frames:
         digest = hashes[str(frame.cloud_path)]

@@ -86,7 +86,7 @@ def check_sigmas(what: str, sigmas: Array | None, tolerance: tuple[float, float]
 
 
 def common_error_checks(estimate: Estimate) -> list[Check]:
-    """That the error bar lacks the error that all frames share, if nobody has stated it."""
+    """The check that the error that all frames share is stated and part of the error bar."""
     if not estimate.scatter_only or estimate.sigmas is None:
         return []
     text = (

@@ -85,13 +85,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
               "Are there enough frames?",
-              "With fewer, the error bar is mostly what is usual of matches.",
+              "With fewer, the error bar is mostly a prior.",
               "the error bar is mostly a default, not measured"),
     # the matcher
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
               "How much of a displaced start does a learned matcher leave?", _CHOSEN,
               "the network does not measure here"),
-    Threshold("recall", "recall", "at most", 0.3, 0.6, "share",
+    Threshold("memorization", "memorization", "at most", 0.3, 0.6, "share",
               "How much of a displaced start does a learned matcher undo without the image?",
               _CHOSEN, "the network reproduces the rig it was trained on, and pulls towards it"),
     Threshold("failed_frames", "failed frames", "at most", 0.3, 0.7, "share",
@@ -107,7 +107,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at most", 0.25, 0.5, "share",
               "Do the matches that were left out agree on another extrinsic?", _COUNTED),
     Threshold("outlier_frames", "share of outlier frames", "at most", 0.35, 0.9, "share",
-              "How many frames lie apart from where frames are densest?", _COUNTED,
+              "How many frames lie far from where frames are densest?", _COUNTED,
               "a minority of the frames decides; check what differs between them"),
     Threshold("place_distance", "distance of a place from the others", "at most", 5.0, math.inf,
               "sigma", "Does each place agree with the others, of three and more?",
@@ -201,21 +201,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # while driving
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?",
-              "Above half, most of what is measured now contradicts the estimate."),
+              "Above half, most new measurements contradict the estimate."),
 )
 # fmt: on
 
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides whether a check counts, or what it is compared with.
-
-    Attributes:
-        key: by which checks look it up.
-        value: the limit.
-        unit: of the value.
-        meaning: what it decides, in words.
-    """
+    """A number that decides whether a check counts, or that it is compared with."""
 
     key: str
     value: float
@@ -271,7 +264,7 @@ def thresholds_markdown() -> str:
         "|---|---|---|---|---|---|",
         *(_line(row) for row in THRESHOLDS),
         "",
-        "\\* At the usual tolerance of "
+        "\\* At the default tolerance of "
         f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. The limit of "
         "FAIL grows with the tolerance, and does not fall below this value.",
         "",

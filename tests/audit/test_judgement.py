@@ -3,18 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.audit.judgement import (
-    POWER,
-    Quantiles,
-    Tolerance,
-    detectable,
-    judge_axes,
-    tail_of_axis,
-)
+from calibgraph.audit.judgement import judge_axes
+from calibgraph.audit.significance import POWER, Quantiles, Tolerance, detectable, tail_of_axis
 
 TOLERANCE = Tolerance(0.5, 10.0)
 SIGMA = np.repeat([np.radians(0.09), 0.02], 3)
-KNOWN = Quantiles.of(np.inf, tail_of_axis(3))
+KNOWN = Quantiles.from_freedom(np.inf, tail_of_axis(3))
 QUANTILE = KNOWN.significant[0]
 
 
@@ -74,7 +68,7 @@ def test_at_most_one_of_a_thousand_has_one_if_sigma_is_of_few_frames(share: floa
     rng, rigs, freedom = np.random.default_rng(0), 50_000, 10
     estimated = share * rng.chisquare(freedom, (rigs, 6)) / freedom
     variance = estimated + 1 - share
-    known, own = (Quantiles.of(nu, tail_of_axis(1)) for nu in (np.inf, freedom))
+    known, own = (Quantiles.from_freedom(nu, tail_of_axis(1)) for nu in (np.inf, freedom))
     limit = own.beside_known(estimated / variance, known).significant * np.sqrt(variance)
     draws = np.abs(rng.standard_normal(variance.shape))
     assert np.count_nonzero((draws > limit).any(axis=1)) < 50 + 4 * np.sqrt(50)  # Poisson

@@ -11,8 +11,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Audit, CameraAudit, LidarAudit
-from calibgraph.audit.page_camera import measured_camera
-from calibgraph.audit.page_chart import charts_of
+from calibgraph.audit.page_camera import charts_of, measured_camera
 from calibgraph.audit.result import audit_of, audit_summary
 from calibgraph.model.geometry import twist_between
 from tests.audit.test_check import TRUTH

@@ -101,7 +101,7 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
         row = fleet.rows[name, camera]
         assert row["verdict"] == result.camera_verdicts[camera].status
         assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
-        doubt = result.camera_verdicts[camera].doubt
+        doubt = result.camera_verdicts[camera].error_probability
         assert doubt is not None
         assert row["probability_off"] == pytest.approx(doubt.probability, rel=1e-3)
         # The sums of one thread and of several differ in their rounding.

@@ -88,14 +88,14 @@ def test_twice_the_error_of_the_graph_is_eq_5(triple: Rig, terms: str, pairs: st
     if terms != "reprojection":
         expected += priors(T_hat, T) + relative_priors(T_hat, T, chosen)
     config = CONFIG.changed(relative_prior_pairs=pairs)
-    graph = objective_graph(triple, blocks_of(triple, table), T_hat, config, terms)
+    graph = objective_graph(triple, blocks_of(triple, table), T_hat, config, terms=terms)
     # 180 terms, and logm's own error of some 1e-13.
     assert 2 * graph.error(to_values(names, T)) == pytest.approx(expected, rel=1e-10)
 
 
 def test_the_keys_are_the_cameras_in_the_rigs_order(pair: Rig) -> None:
     table = simulate_correspondences(pair, frames=2, matches=30)
-    graph = objective_graph(pair, blocks_of(pair, table), pair.T_camera_lidar, CONFIG, "full")
+    graph = objective_graph(pair, blocks_of(pair, table), pair.T_camera_lidar, CONFIG, terms="full")
     names = list(pair.cameras)
     found = {key for index in range(graph.size()) for key in graph.at(index).keys()}  # noqa: SIM118
     assert found == {pose_key(names, name) for name in names}
@@ -107,7 +107,7 @@ def test_the_keys_are_the_cameras_in_the_rigs_order(pair: Rig) -> None:
 def test_the_graph_prints_every_factor(pair: Rig) -> None:
     table = simulate_correspondences(pair, frames=2, matches=30)
     rig = pair.model_copy(update={"relative_poses": (stereo_relative_pose(pair),)})
-    graph = objective_graph(rig, blocks_of(rig, table), rig.T_camera_lidar, CONFIG, "full")
+    graph = objective_graph(rig, blocks_of(rig, table), rig.T_camera_lidar, CONFIG, terms="full")
     lines = [line for line in str(graph).splitlines() if line.startswith("Factor ")]
     assert [line.partition(": ")[2].strip() for line in lines] == [
         "CustomFactor on x0",  # the reprojection term of each camera
@@ -121,11 +121,11 @@ def test_the_graph_prints_every_factor(pair: Rig) -> None:
 
 def test_weights_of_zero_give_no_factor(pair: Rig) -> None:
     config = CONFIG.changed(prior_weight=0.0, relative_prior_weight=0.0)
-    assert objective_graph(pair, {}, pair.T_camera_lidar, config, "full").size() == 0
+    assert objective_graph(pair, {}, pair.T_camera_lidar, config, terms="full").size() == 0
 
 
 def test_the_optimum_of_the_priors_is_stage_1(pair: Rig) -> None:
-    graph = objective_graph(pair, {}, pair.T_camera_lidar, CONFIG, "priors")
+    graph = objective_graph(pair, {}, pair.T_camera_lidar, CONFIG, terms="priors")
     start = perturb(pair, rotation_deg=3, translation_m=0.3).T_camera_lidar
     optimum = optimize(graph, list(pair.cameras), start)
     assert optimum.converged

@@ -18,7 +18,7 @@ _GAINS = ring_gains(_LIDAR, np.random.default_rng(0))
 
 def scan_at(drive: Drive, T_world_lidar: Array, seed: int) -> NDArray[np.float32]:
     """(n, 4) the cloud of a 64-beam LiDAR with few columns."""
-    return scan(drive.world, _LIDAR, _GAINS, T_world_lidar, np.random.default_rng(seed))
+    return scan(drive.world, _LIDAR, _GAINS, T_world_lidar, rng=np.random.default_rng(seed))
 
 
 def displaced(T_world_lidar: Array, *, left_m: float, turned_deg: float) -> Array:

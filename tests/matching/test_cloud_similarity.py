@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def cloud_at(drive: Drive, T_world_lidar: Array, seed: int = 0) -> UprightCloud:
-    return UprightCloud.of(scan_at(drive, T_world_lidar, seed))
+    return UprightCloud.from_cloud(scan_at(drive, T_world_lidar, seed))
 
 
 @pytest.mark.parametrize(("stop", "turned_deg"), [(0, 77.0), (1, 0.0), (1, 180.0)])
@@ -40,7 +40,7 @@ def test_the_motion_between_two_scans_of_a_place_is_found(
 def test_other_places_are_not_aligned(drive: Drive) -> None:
     """40 m on in the same street, and in another one."""
     now = cloud_at(drive, drive.T_world_lidar[5])
-    other = UprightCloud.of(np.load(SAMPLE / "lidar" / "000000.npy"))
+    other = UprightCloud.from_cloud(np.load(SAMPLE / "lidar" / "000000.npy"))
     assert align_with_any(now, [cloud_at(drive, drive.T_world_lidar[0]), other]) is None
 
 
@@ -56,5 +56,7 @@ def test_where_nothing_is_upright_nothing_is_known() -> None:
     flat = np.column_stack([rng.uniform(-40, 40, (5000, 2)), rng.normal(-1.8, 0.01, 5000)])
     empty = np.empty((0, 4), np.float32)
     for cloud in (flat, empty):
-        assert align_with_any(UprightCloud.of(cloud), [UprightCloud.of(cloud)]) is None
-    assert align_with_any(UprightCloud.of(flat), []) is None
+        assert (
+            align_with_any(UprightCloud.from_cloud(cloud), [UprightCloud.from_cloud(cloud)]) is None
+        )
+    assert align_with_any(UprightCloud.from_cloud(flat), []) is None

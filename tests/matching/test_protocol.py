@@ -36,7 +36,7 @@ class Complete:
     rounds: int = 3
     stage1: str = "rig"
     most_frames: int | None = 2
-    fails_on_images: bool = True
+    image_checks_can_fail: bool = True
     tracking_rounds: tuple[int, ...] = (1,)
     calls: list[tuple[str, int, float]] = field(default_factory=list)
 
@@ -82,7 +82,7 @@ def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
     assert (full.rounds, full.stage1) == (1, "pnp")
     assert full.most_frames is None
     assert full.tracking_rounds == ()
-    assert not full.fails_on_images
+    assert not full.image_checks_can_fail
     data = calibgraph.load_dataset(SAMPLE, truth)
     start = full.locate(data, truth, out_of_time=lambda: False, progress=no_progress)
     assert start.rig is truth and start.first_round == 0
@@ -113,7 +113,7 @@ def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
     assert near[2] > 0.05 > last[2]  # from a displaced start
     assert end[0] == "release"
     assert run.rematch is not None and run.rematch.again is not None
-    assert run.matcher.fails_on_images
+    assert run.matcher.image_checks_can_fail
 
 
 def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
@@ -139,7 +139,7 @@ def test_a_matcher_without_rounds_is_an_error() -> None:
 FINDINGS = MatcherFindings(
     z_score={"left": 17.5},
     start_dependence={"left": 0.1},
-    recall={"left": 0.9},
+    memorization={"left": 0.9},
     failed_share={"left": 0.25},
     found={"left": 18.0},
     missed={"right": 3.0},
@@ -149,9 +149,9 @@ FINDINGS = MatcherFindings(
     systematic_translation_m=0.02,
 )
 METADATA = {
-    "contrast": {"left": 17.5},
+    "z_score": {"left": 17.5},
     "start_dependence": {"left": 0.1},
-    "recall": {"left": 0.9},
+    "memorization": {"left": 0.9},
     "failed_share": {"left": 0.25},
     "found": {"left": 18.0},
     "missed": {"right": 3.0},
@@ -160,6 +160,23 @@ METADATA = {
     "systematic_rotation_rad": 0.001,
     "systematic_translation_m": 0.02,
 }
+
+
+def test_former_keys_of_findings_are_read() -> None:
+    former = METADATA | {"contrast": METADATA["z_score"], "recall": METADATA["memorization"]}
+    del former["z_score"], former["memorization"]
+    assert MatcherFindings.from_metadata(former) == FINDINGS
+
+
+def test_a_current_key_overrides_its_former_one() -> None:
+    both = {"contrast": {"left": 1.0}, "z_score": {"left": 2.0}}
+    assert MatcherFindings.from_metadata(both).z_score == {"left": 2.0}
+
+
+def test_the_former_name_of_a_member_is_read() -> None:
+    matcher = Minimal()
+    matcher.fails_on_images = True  # type: ignore[attr-defined]
+    assert to_full_matcher(matcher).image_checks_can_fail  # type: ignore[arg-type]
 
 
 def test_findings_keep_their_keys_on_disk() -> None:
@@ -181,7 +198,7 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("metadata", "words"),
     [
-        ({"contrast": 17.5}, "'contrast' must map camera names to numbers, found 17.5"),
+        ({"z_score": 17.5}, "'z_score' must map camera names to numbers, found 17.5"),
         ({"missed": {"left": "far"}}, "'missed' must map camera names to numbers"),
         ({"range_rotation_deg": 270}, "'range_rotation_deg' must be a number from 0 to 180"),
     ],

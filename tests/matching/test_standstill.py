@@ -10,7 +10,7 @@ import numpy as np
 
 import calibgraph
 from calibgraph import Dataset
-from calibgraph.matching.standstill import View, same_places
+from calibgraph.matching.standstill import View, find_stationary_frames
 from tests.conftest import SAMPLE
 
 
@@ -32,7 +32,7 @@ def parked(folder: Path, data: Dataset) -> Dataset:
 
 def test_frames_of_a_drive_are_of_different_places() -> None:
     data = calibgraph.load_dataset(SAMPLE)
-    assert same_places(data, data.rig) == []
+    assert find_stationary_frames(data, data.rig) == []
 
 
 def test_frames_of_a_parked_vehicle_are_of_one_place_also_after_a_drive(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_frames_of_a_parked_vehicle_are_of_one_place_also_after_a_drive(tmp_path
     parking = parked(tmp_path, data)
     between = replace(data.frames[3], index=5)
     both = replace(data, frames=(parking.frames[0], between, *parking.frames[1:]))
-    assert same_places(both, data.rig) == [[0, 1, 2]]
+    assert find_stationary_frames(both, data.rig) == [[0, 1, 2]]
 
 
 def test_one_camera_that_moves_is_enough(tmp_path: Path) -> None:
@@ -49,11 +49,11 @@ def test_one_camera_that_moves_is_enough(tmp_path: Path) -> None:
     first = next(iter(data.rig.cameras))
     frozen = data.frames[0].image_paths[first]
     frames = [replace(f, image_paths={**f.image_paths, first: frozen}) for f in data.frames]
-    assert same_places(replace(data, frames=tuple(frames)), data.rig) == []
+    assert find_stationary_frames(replace(data, frames=tuple(frames)), data.rig) == []
 
 
 def test_an_image_without_features_cannot_tell() -> None:
-    blank = View.of(np.full((240, 320), 80, dtype=np.uint8))
+    blank = View.from_image(np.full((240, 320), 80, dtype=np.uint8))
     assert blank.stands(blank) is None
 
 
@@ -64,7 +64,7 @@ def test_a_motion_of_half_a_pixel_is_a_motion() -> None:
 
     def shifted(pixels: float) -> View:
         moved = cv2.warpAffine(image, np.array([[1, 0, pixels], [0, 1, 0]]), (640, 480))
-        return View.of(moved.astype(np.uint8))
+        return View.from_image(moved.astype(np.uint8))
 
     assert shifted(0.0).stands(shifted(0.3)) is True
     assert shifted(0.0).stands(shifted(0.8)) is False

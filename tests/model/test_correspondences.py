@@ -54,7 +54,7 @@ def table(**changes: Any) -> Correspondences:
         ({"metadata": {"systematic_translation_m": "1"}}, "found '1'"),
         ({"metadata": {"found": {"left": 10**400}}}, "'found' must be finite, found inf"),
         ({"metadata": {"missed": {"left": math.nan}}}, "'missed' must be finite, found nan"),
-        ({"metadata": {"contrast": {"left": -math.inf}}}, "'contrast' must be finite, found -inf"),
+        ({"metadata": {"z_score": {"left": -math.inf}}}, "'z_score' must be finite, found -inf"),
         ({"points_lidar_m": [[1, 2]] * 4}, r"shape \(4, 2\), expected \(4, 3\)"),
         ({"confidence": [1.0]}, "shape"),
     ],

@@ -10,7 +10,7 @@ import calibgraph
 from calibgraph.model.causes import CAUSES, cause_of
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.summary import MOST, summarize
-from calibgraph.model.verdict import COMMON_ERROR, Check, Doubt, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 
@@ -23,9 +23,14 @@ def of_kinds(*kinds: str) -> Verdict:
 
 
 def test_a_pass_has_no_reasons_and_nothing_to_do() -> None:
-    summary = summarize({"left": Verdict((threshold("frames").check(9),), Doubt(0.001))})
+    summary = summarize({"left": Verdict((threshold("frames").check(9),), ErrorProbability(0.001))})
     assert summary.status == "PASS"
-    assert (summary.doubt, summary.reasons, summary.actions, summary.others) == ("", (), (), ())
+    assert (summary.error_probability, summary.reasons, summary.actions, summary.others) == (
+        "",
+        (),
+        (),
+        (),
+    )
 
 
 def test_a_check_that_fails_and_warns_is_one_reason_the_worst_camera_first() -> None:
@@ -71,16 +76,19 @@ def test_of_many_causes_the_worst_three_are_shown_and_the_others_folded() -> Non
 
 
 def test_an_action_is_stated_once() -> None:
-    summary = summarize({"left": of_kinds("start_dependence"), "right": of_kinds("recall")})
+    summary = summarize({"left": of_kinds("start_dependence"), "right": of_kinds("memorization")})
     assert len(summary.actions) == 1
 
 
 def test_cannot_tell_is_a_reason_and_no_status() -> None:
-    summary = summarize({"left": Verdict((), Doubt(0.001, 0.3))})
+    summary = summarize({"left": Verdict((), ErrorProbability(0.001, 0.3))})
     assert (summary.status, summary.cannot_tell) == ("WARN", True)
     (reason,) = summary.reasons
     assert reason.text.startswith("cannot tell: ") and "0.5 deg or 10 cm" in reason.text
-    assert summary.doubt == "off by more than 0.5 deg or 10 cm with a probability: left 30%"
+    assert (
+        summary.error_probability
+        == "off by more than 0.5 deg or 10 cm with a probability: left 30%"
+    )
 
 
 def test_every_kind_of_check_has_a_cause() -> None:
@@ -112,7 +120,9 @@ WIDE = ErrorSources(
 
 
 def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
-    unsure = {"left": Verdict((threshold("sigma_rotation").check(0.3),), Doubt(0.001, 0.1))}
+    unsure = {
+        "left": Verdict((threshold("sigma_rotation").check(0.3),), ErrorProbability(0.001, 0.1))
+    }
     summary = summarize(unsure, sources={"left": WIDE})
     assert summary.error_bar == f"accuracy of left, 1 sigma: 0.3 deg (90% {COMMON}, 10% {MATCHES})"
     (action,) = summary.actions
@@ -123,7 +133,7 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
 
 def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
     checks = (threshold("residual_spread").check(9.0), threshold("sigma_rotation").check(9.0))
-    summary = summarize({"left": Verdict(checks, Doubt(0.9))}, sources={"left": WIDE})
+    summary = summarize({"left": Verdict(checks, ErrorProbability(0.9))}, sources={"left": WIDE})
     assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
     assert summary.actions == (CAUSES["matches"].action,)
     assert summary.error_bar == ""
@@ -131,7 +141,7 @@ def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
 
 def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> None:
     checks = (threshold("residual_spread").check(0.24), threshold("time_offset").check(0.01))
-    summary = summarize({"left": Verdict(checks, Doubt(0.02))})
+    summary = summarize({"left": Verdict(checks, ErrorProbability(0.02))})
     (reason,) = summary.reasons
     assert (reason.status, reason.cause) == ("WARN", "matches")
     assert reason.text == (

@@ -1,37 +1,53 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from calibgraph import Check, Verdict
-from calibgraph.model.threshold import at_least, at_most, beside, in_unit
-from calibgraph.model.verdict import ABOUT_THE_DATA, COMMON_ERROR, Doubt, rig_verdict
+from calibgraph.model.threshold import Direction, Threshold, beside, in_unit
+from calibgraph.model.verdict import ABOUT_THE_DATA, COMMON_ERROR, ErrorProbability, rig_verdict
 from calibgraph.trust.thresholds import threshold
+
+
+def check_of(
+    name: str, value: float, direction: Direction, *limits: float, unit: str = ""
+) -> Check:
+    return Threshold(name, name, direction, *limits, unit, "", "").check(value)
 
 
 def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
     verdict = Verdict(
-        (at_most("a", 2, 1, 3, "m"), at_most("b", 0, 1, 3, "m"), at_least("c", 0, 2, 1, ""))
+        (
+            check_of("a", 2, "at most", 1, 3, unit="m"),
+            check_of("b", 0, "at most", 1, 3, unit="m"),
+            check_of("c", 0, "at least", 2, 1),
+        )
     )
     assert verdict.status == "FAIL"
     assert [reason[0] for reason in verdict.reasons] == ["c", "a"]
     assert rig_verdict({"front": verdict}).reasons[0] == "front: c 0 is below 1"
 
 
-@pytest.mark.parametrize("check", [at_most, at_least])
-def test_nan_fails(check: Callable[..., Check]) -> None:
-    assert check("a", float("nan"), 1, 2, "m").status == "FAIL"
+@pytest.mark.parametrize("direction", ["at most", "at least"])
+def test_nan_fails(direction: Direction) -> None:
+    assert check_of("a", float("nan"), direction, 1, 2, unit="m").status == "FAIL"
 
 
 def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
-    assert at_least("kept", 0.59999, 0.6, 0.3, "share").text == "kept 59.9% is below 60%"
-    assert at_most("x", 0.150057698, 0.15, 0.5, "deg").text == "x 0.151 deg is above 0.15 deg"
-    assert at_most("x", 0.2, 0.15, 0.5, "deg").text == "x 0.2 deg is above 0.15 deg"
+    assert (
+        check_of("kept", 0.59999, "at least", 0.6, 0.3, unit="share").text
+        == "kept 59.9% is below 60%"
+    )
+    assert (
+        check_of("x", 0.150057698, "at most", 0.15, 0.5, unit="deg").text
+        == "x 0.151 deg is above 0.15 deg"
+    )
+    assert (
+        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text == "x 0.2 deg is above 0.15 deg"
+    )
     assert beside(0.14999, 0.15, "deg") == "0.149 deg"
     assert beside(-0.2001, -0.2, "share") == "-20.1%"
-    assert at_most("x", 1.0, 1.0, 2.0, "m").status == "PASS"
+    assert check_of("x", 1.0, "at most", 1.0, 2.0, unit="m").status == "PASS"
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -52,10 +68,12 @@ ODD = threshold("z_score").check(12.0)
 
 def test_a_wide_error_bar_and_few_frames_cannot_tell() -> None:
     for verdict in (
-        Verdict((), Doubt(0.001, 0.05)),
-        Verdict((ODD,), Doubt(0.001, 0.05)),  # the error bar leaves more doubt than the checks
-        Verdict((FEW_FRAMES,), Doubt(0.01)),
-        Verdict((FEW_FRAMES,), Doubt(0.001)),
+        Verdict((), ErrorProbability(0.001, 0.05)),
+        Verdict(
+            (ODD,), ErrorProbability(0.001, 0.05)
+        ),  # the error bar leaves more doubt than the checks
+        Verdict((FEW_FRAMES,), ErrorProbability(0.01)),
+        Verdict((FEW_FRAMES,), ErrorProbability(0.001)),
         Verdict((FEW_FRAMES,)),
     ):
         assert (verdict.status, verdict.cannot_tell) == ("WARN", True)
@@ -63,20 +81,20 @@ def test_a_wide_error_bar_and_few_frames_cannot_tell() -> None:
 
 def test_what_looks_odd_right_or_wrong_is_no_lack_of_data() -> None:
     for verdict, status in (
-        (Verdict((ODD,), Doubt(0.05)), "WARN"),
-        (Verdict((FEW_FRAMES, ODD), Doubt(0.05, 0.01)), "WARN"),
+        (Verdict((ODD,), ErrorProbability(0.05)), "WARN"),
+        (Verdict((FEW_FRAMES, ODD), ErrorProbability(0.05, 0.01)), "WARN"),
         (Verdict((FEW_FRAMES, ODD)), "WARN"),
-        (Verdict((), Doubt(0.05)), "WARN"),
-        (Verdict((), Doubt(0.001)), "PASS"),
-        (Verdict((), Doubt(0.5, 0.6)), "FAIL"),
+        (Verdict((), ErrorProbability(0.05)), "WARN"),
+        (Verdict((), ErrorProbability(0.001)), "PASS"),
+        (Verdict((), ErrorProbability(0.5, 0.6)), "FAIL"),
     ):
         assert (verdict.status, verdict.cannot_tell) == (status, False)
         assert not any("cannot tell" in reason for reason in verdict.reasons)
 
 
 def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
-    unsure, odd = Verdict((), Doubt(0.001, 0.3)), Verdict((ODD,), Doubt(0.01))
-    good, wrong = Verdict((), Doubt(0.001)), Verdict((), Doubt(0.9))
+    unsure, odd = Verdict((), ErrorProbability(0.001, 0.3)), Verdict((ODD,), ErrorProbability(0.01))
+    good, wrong = Verdict((), ErrorProbability(0.001)), Verdict((), ErrorProbability(0.9))
     assert rig_verdict({"a": unsure, "b": good}).cannot_tell
     for other in (odd, wrong):
         assert not rig_verdict({"a": unsure, "b": other}).cannot_tell

@@ -32,7 +32,9 @@ def test_camera_and_lidar_see_the_same_surfaces(drive: Drive, lens: str) -> None
     camera = small_camera(lens)
     T_world_camera = relative_transform(drive.T_world_lidar[1], camera.T_camera_lidar)
     exact = replace(SCAN, range_noise_m=0.0)
-    cloud = scan(drive.world, exact, np.ones(16), drive.T_world_lidar[1], np.random.default_rng(0))
+    cloud = scan(
+        drive.world, exact, np.ones(16), drive.T_world_lidar[1], rng=np.random.default_rng(0)
+    )
     points = cloud[:, :3] @ camera.T_camera_lidar[:3, :3].T + camera.T_camera_lidar[:3, 3]
     pixels, valid = camera.lens.project(points)
     seen = valid & camera.in_image(pixels)
@@ -101,7 +103,9 @@ def test_image_noise_is_as_configured(drive: Drive) -> None:
     camera = small_camera("pinhole")
     rays, T = camera_rays(camera), relative_transform(drive.T_world_lidar[0], camera.T_camera_lidar)
     clean, first, second = (
-        render(drive.world, rays, T, rng, Imaging(noise=noise, exposure_spread=0.0)).astype(float)
+        render(drive.world, rays, T, rng, imaging=Imaging(noise=noise, exposure_spread=0.0)).astype(
+            float
+        )
         for noise, rng in zip((0.0, 0.02, 0.02), np.random.default_rng(1).spawn(3), strict=True)
     )
     inside = (clean > 25) & (clean < 230)  # 5 sigma from black and white

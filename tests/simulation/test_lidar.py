@@ -43,7 +43,7 @@ def shots_of(points: np.ndarray) -> np.ndarray:
 
 def test_range_noise_and_dropouts_are_as_configured(drive: Drive) -> None:
     T, shots = drive.T_world_lidar[0], shot_directions(SCAN)
-    cloud = scan(drive.world, SCAN, np.ones(16), T, np.random.default_rng(1))
+    cloud = scan(drive.world, SCAN, np.ones(16), T, rng=np.random.default_rng(1))
     truth, index = noiseless(drive, 0, shots), shots_of(cloud)
     error = np.linalg.norm(cloud[:, :3], axis=1) - truth[index]
     sigma, n = SCAN.range_noise_m, len(cloud)
@@ -72,7 +72,7 @@ def test_rings_keep_their_gains(drive: Drive) -> None:
     gains = ring_gains(SCAN, np.random.default_rng(2))
     plain = replace(SCAN, range_noise_m=0.0, intensity_noise=0.0)
     T = drive.T_world_lidar[0]
-    alike, ringed = (scan(drive.world, plain, g, T, np.random.default_rng(0))
+    alike, ringed = (scan(drive.world, plain, g, T, rng=np.random.default_rng(0))
                      for g in (np.ones(16), gains))  # fmt: skip
     ring = shots_of(alike) // 360
     unsaturated = (ringed[:, 3] > 0) & (ringed[:, 3] < 1) & (alike[:, 3] < 1)

@@ -30,7 +30,7 @@ def test_stops_are_apart_and_the_lane_is_free(seed: int, vary_layout: bool) -> N
     assert steps.min() > 0.8 * 5.0
     assert steps.max() < 1.25 * 5.0
     for T in drive.T_world_lidar:
-        cloud = scan(drive.world, SCAN, np.ones(16), T, np.random.default_rng(0))
+        cloud = scan(drive.world, SCAN, np.ones(16), T, rng=np.random.default_rng(0))
         x, y, z = cloud[:, :3].T
         assert not np.any((np.abs(x) < 2.5) & (np.abs(y) < 1.0) & (z > -1.4))
 

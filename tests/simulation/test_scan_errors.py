@@ -24,7 +24,7 @@ EXACT = replace(SCAN, range_noise_m=0.0, dropout=0.0)
 
 def scanned(drive: Drive, errors: ScanErrors, frame: int = 0) -> np.ndarray:
     T, rng = drive.T_world_lidar[frame], np.random.default_rng(1)
-    return scan(drive.world, replace(EXACT, errors=errors), np.ones(16), T, rng).astype(float)
+    return scan(drive.world, replace(EXACT, errors=errors), np.ones(16), T, rng=rng).astype(float)
 
 
 def elevations_deg(cloud: np.ndarray) -> np.ndarray:

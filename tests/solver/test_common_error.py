@@ -50,7 +50,7 @@ def test_it_changes_no_probability_and_no_pose(pair: Rig) -> None:
     silent, stated = (solve(pair, table(pair, metadata)) for metadata in ({}, ZERO))
     for name, verdict in stated.camera_verdicts.items():
         assert verdict.status == "PASS"
-        assert silent.camera_verdicts[name].doubt == verdict.doubt
+        assert silent.camera_verdicts[name].error_probability == verdict.error_probability
         np.testing.assert_array_equal(silent.T_camera_lidar[name], stated.T_camera_lidar[name])
 
 

@@ -16,8 +16,8 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs, pair_sigmas
 from calibgraph.solver.shared_error import (
     error_between,
-    error_over_usual,
     shared_scatter,
+    shared_variance_ratio,
 )
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
@@ -87,7 +87,7 @@ def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size:
             name: gtsam.Pose3.Expmap(size * np.sqrt(EACH) * rng.standard_normal(6)).matrix() @ T
             for name, T in mixed_rig.T_camera_lidar.items()
         }
-        found.append(error_over_usual(own, covariance, fits))
+        found.append(shared_variance_ratio(own, covariance, fits))
     # Two of the three cameras are tied: six degrees of freedom, and six of what is usual.
     expected = (6 + 6 * size**2) / 12
     spread = 6 * size**2 * np.sqrt(2 / 6) / 12 / np.sqrt(200)
@@ -102,11 +102,11 @@ def fits_of(rig: Rig) -> list[PairFit]:
 
 def test_it_is_never_taken_for_less_than_usual(pair: Rig) -> None:
     covariance = np.diag(np.tile(EACH, 2))
-    assert error_over_usual(pair.T_camera_lidar, covariance, fits_of(pair)) == 1.0
+    assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits_of(pair)) == 1.0
 
 
 def test_without_tied_cameras_it_is_as_usual(pair: Rig) -> None:
-    assert error_over_usual(pair.T_camera_lidar, np.eye(12), ()) == 1.0
+    assert shared_variance_ratio(pair.T_camera_lidar, np.eye(12), ()) == 1.0
 
 
 def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:

@@ -221,7 +221,7 @@ def test_a_tracker_that_throws_leaves_the_state_as_it_was(
             calibrator.update(table)
         before = calibrator.tracker.to_bytes()
         with monkeypatch.context() as patch:
-            patch.setattr(tracker, "make_update", lambda *_: 1 / 0)
+            patch.setattr(tracker, "make_update", lambda *_, **__: 1 / 0)
             calibrator.update(world.tables[7])
     with DurableCalibrator(tmp_path, rig) as calibrator:
         assert calibrator.tracker.to_bytes() == before

@@ -312,11 +312,11 @@ def test_an_update_that_fails_leaves_nothing_behind(
 
     judge, calls = tracker_module.assess, []
 
-    def broken_once(*arguments: object) -> object:
+    def broken_once(*arguments: object, **options: object) -> object:
         calls.append(arguments)
         if len(calls) == 1:
             raise RuntimeError("broken")
-        return judge(*arguments)  # type: ignore[arg-type]
+        return judge(*arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(tracker_module, "assess", broken_once)
     with pytest.raises(CorrespondenceError, match=r"frame 19: .*broken.*left out"):

@@ -21,13 +21,13 @@ def table(pair: Rig) -> Correspondences:
     ("findings", "status"),
     [
         ({}, "PASS"),
-        ({"start_dependence": 0.1, "recall": 0.1, "failed_share": 0.1}, "PASS"),
+        ({"start_dependence": 0.1, "memorization": 0.1, "failed_share": 0.1}, "PASS"),
         ({"start_dependence": 0.3}, "WARN"),
         ({"start_dependence": 0.9}, "FAIL"),
         ({"start_dependence": float("nan")}, "FAIL"),
-        ({"recall": 0.4}, "WARN"),
-        ({"recall": 1.0}, "FAIL"),
-        ({"recall": -0.5}, "PASS"),
+        ({"memorization": 0.4}, "WARN"),
+        ({"memorization": 1.0}, "FAIL"),
+        ({"memorization": -0.5}, "PASS"),
         ({"failed_share": 0.5}, "WARN"),
         ({"failed_share": 1.0}, "FAIL"),
     ],
@@ -47,8 +47,8 @@ def test_findings_decide_the_verdict_of_their_camera(
 def test_malformed_findings_are_refused(
     pair: Rig, table: Correspondences, nonsense: object
 ) -> None:
-    with pytest.raises(calibgraph.CorrespondenceError, match="recall"):
-        calibgraph.solve(pair, replace(table, metadata={"recall": nonsense}))
+    with pytest.raises(calibgraph.CorrespondenceError, match="memorization"):
+        calibgraph.solve(pair, replace(table, metadata={"memorization": nonsense}))
 
 
 def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:

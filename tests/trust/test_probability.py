@@ -11,7 +11,7 @@ from calibgraph.model.verdict import (
     FAIL_ABOVE,
     PASS_BELOW,
     Check,
-    Doubt,
+    ErrorProbability,
     Verdict,
     rig_verdict,
 )
@@ -74,7 +74,9 @@ def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(mo
     assert judge([], None, (0.5, 10.0), model).status == "PASS"
     new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
     assert judge([new], None, (0.5, 10.0), model).status == "FAIL"
-    assert judge([Check("search", "FAIL", "not found")], None, (0.5, 10.0), model).doubt == Doubt(1)
+    assert judge(
+        [Check("search", "FAIL", "not found")], None, (0.5, 10.0), model
+    ).error_probability == ErrorProbability(1)
 
 
 def test_several_doubts_are_worse_than_one() -> None:
@@ -99,34 +101,36 @@ def test_the_status_is_a_cut_of_the_probability() -> None:
         (0.9 * PASS_BELOW, "PASS"), (PASS_BELOW, "WARN"), (FAIL_ABOVE, "WARN"),
         (1.01 * FAIL_ABOVE, "FAIL"), (math.nan, "FAIL"),
     ):  # fmt: skip
-        assert Verdict((Check("x", "PASS", ""),), Doubt(probability)).status == status
+        assert Verdict((Check("x", "PASS", ""),), ErrorProbability(probability)).status == status
     assert (
         "off by more than 0.5 deg or 10 cm with a probability of 30%"
-        in Verdict((), Doubt(0.3)).reasons
+        in Verdict((), ErrorProbability(0.3)).reasons
     )
 
 
 def test_a_check_beyond_its_limit_is_a_warning_and_no_more_where_the_probability_is_small() -> None:
     for status in ("WARN", "FAIL"):
-        verdict = Verdict((Check("x", status, "a reason"),), Doubt(0.1 * PASS_BELOW))
+        verdict = Verdict((Check("x", status, "a reason"),), ErrorProbability(0.1 * PASS_BELOW))
         assert (verdict.status, verdict.reasons) == ("WARN", ("a reason",))
 
 
 def test_a_wide_error_bar_is_no_fail_but_named() -> None:
-    verdict = Verdict((), Doubt(0.01, 0.6))
+    verdict = Verdict((), ErrorProbability(0.01, 0.6))
     assert verdict.status == "WARN"
     assert "cannot tell, by the error bar" in verdict.reasons[0]
-    assert "cannot tell" not in Verdict((), Doubt(0.6, 0.01)).reasons[0]
+    assert "cannot tell" not in Verdict((), ErrorProbability(0.6, 0.01)).reasons[0]
 
 
 def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:
-    printed = [Doubt(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
+    printed = [ErrorProbability(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
     assert printed == ["0.0%", "0.2%", "4.6%", "50%", "over 99%"]
 
 
 def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:
-    rig = rig_verdict({"a": Verdict((), Doubt(0.001)), "b": Verdict((), Doubt(0.5))})
-    assert rig.doubt == Doubt(0.5)
+    rig = rig_verdict(
+        {"a": Verdict((), ErrorProbability(0.001)), "b": Verdict((), ErrorProbability(0.5))}
+    )
+    assert rig.error_probability == ErrorProbability(0.5)
     assert rig.status == "FAIL"
 
 

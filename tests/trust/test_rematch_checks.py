@@ -42,7 +42,7 @@ class Scored(Simulated):
 
     def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
         table = super().match(dataset, rig, round_index=round_index, progress=progress)
-        return replace(table, metadata={"contrast": self.z_scores.pop(0)})
+        return replace(table, metadata={"z_score": self.z_scores.pop(0)})
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
     for name in ("front_right", "left"):
         assert errors[name].translation_error_cm == pytest.approx(8, abs=1)
     expected = {"front_left": 18.0, "front_right": 20.0, "left": 18.0}
-    assert matched.correspondences.metadata["contrast"] == expected
+    assert matched.correspondences.metadata["z_score"] == expected
     for checks in compare_ends(matched.rematch).values():  # two different ends are a warning
         assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
     began = calibgraph.evaluate(matched.solution.rig, truth).cameras

@@ -77,7 +77,7 @@ def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> Ba
     tolerance_ns = round(options.tolerance_s * _S)
     pairs = {n: nearest(clouds, stamps[topic], tolerance_ns) for n, topic in images.items()}
     complete = np.flatnonzero(np.all([rows >= 0 for rows in pairs.values()], axis=0))
-    summary = _summary(stamps, topics, pairs, complete, options)
+    summary = _summary(stamps, topics, pairs, complete, options=options)
     if not len(complete):
         raise DatasetError(f"{path}: {summary}; {_advice(stamps, topics, pairs)}")
     record_ns = np.array(clouds.record_ns)[complete]
@@ -140,6 +140,7 @@ def _summary(
     topics: RigTopics,
     pairs: Mapping[str, Rows],
     complete: Rows,
+    *,
     options: BagOptions,
 ) -> str:
     """How many frames there are, how far apart their stamps are, and what was left out."""

@@ -24,6 +24,7 @@ from calibgraph.io.bags.transforms import (
     values_of,
 )
 from calibgraph.io.motion import ScanMotion, twist_between
+from calibgraph.model.geometry import transform
 
 Array = NDArray[np.float64]
 MotionOf = Callable[[BagFrame], ScanMotion]
@@ -96,11 +97,9 @@ class _Trajectory:
             )
         share = (stamp_s - both[0]) / (both[1] - both[0])
         pair = self.T_world_lidar[after - 1 : after + 1]
-        T = np.eye(4)
-        T[:3, 3] = (1 - share) * pair[0, :3, 3] + share * pair[1, :3, 3]
         turn = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))
-        T[:3, :3] = turn(np.clip(share, 0, 1)).as_matrix()
-        return T
+        shift = (1 - share) * pair[0, :3, 3] + share * pair[1, :3, 3]
+        return transform(turn(np.clip(share, 0, 1)), shift)
 
 
 @dataclass(frozen=True, eq=False)

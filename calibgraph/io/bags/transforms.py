@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.io.bags.messages import TREES, Bag, Drive
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 
 Array = NDArray[np.float64]
 
@@ -208,10 +208,7 @@ def pose_matrix(shift: Sequence[float], turn: Sequence[float]) -> Array | None:
     length = float(np.linalg.norm(turn))
     if not (np.isfinite([*shift, length]).all() and length > _LEAST_LENGTH):
         return None
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(turn).as_matrix()
-    T[:3, 3] = shift
-    return T
+    return transform(Rotation.from_quat(turn), shift)
 
 
 def stamp_ns_of(stamped: Any) -> int:

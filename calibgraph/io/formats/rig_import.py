@@ -117,7 +117,7 @@ class RigParts:
             "lidar": self.lidar,
             "cameras": {
                 name: {
-                    **_camera(name, lens, T.get(name), size_px, self),
+                    **_camera(name, lens, T.get(name), size_px, parts=self),
                     "frame_id": self.frame_ids.get(name),
                 }
                 for name, lens in self.lenses.items()
@@ -273,6 +273,7 @@ def _camera(
     lens: CameraLens,
     T_camera_lidar: Array | None,
     size_px: tuple[int, int] | None,
+    *,
     parts: RigParts,
 ) -> dict[str, Any]:
     """The content of a rig file for a camera.

@@ -1,4 +1,4 @@
-"""Camera-camera matches: what the cameras of a rig see in common, on the LiDAR's surfaces."""
+"""Camera-to-camera matches: co-visible features on the LiDAR's surfaces."""
 
 from calibgraph.matching.camera_pairs.find import match_cameras, match_some_frames, with_surfaces
 from calibgraph.matching.camera_pairs.overlap import overlapping_pairs

@@ -61,12 +61,7 @@ def features_of(frame: Frame, name: str, camera: Camera) -> Features:
 
 
 def detect_features(gray: Gray, camera: Camera) -> Features:
-    """SIFT features of an image that lie on rays of the lens, one per place.
-
-    Args:
-        gray: (height, width).
-        camera: its lens.
-    """
+    """SIFT features of an image that lie on rays of the lens, one per place."""
     factor = min(1.0, MAX_SIDE_PX / max(gray.shape))
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     # Without the precise upscaling, keypoints are off by a quarter of a pixel.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.matching.camera_pairs.geometry import MAX_ANGLE_RAD, turn_to_axis
+from calibgraph.model.geometry import transform
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,6 @@ def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | Non
         return None
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3], T_b_a[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    T_b_a = transform(cv2.Rodrigues(rotation)[0], translation.ravel())
     T_b_a[:3] = turn.T @ T_b_a[:3]
     return T_b_a

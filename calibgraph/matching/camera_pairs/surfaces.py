@@ -25,7 +25,7 @@ def planes_at(rays: Array, points_camera_m: Array) -> Array:
     """Planes of the LiDAR points next to rays.
 
     None where neighbours are far, lie to one side or on a line, or do not lie on a plane, as at
-    silhouettes, where some are on the object in front and some on what is behind.
+    silhouettes, where some are on the object in front and some behind it.
 
     Args:
         rays: (n, 3) unit vectors in the camera frame.

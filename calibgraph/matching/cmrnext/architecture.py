@@ -19,7 +19,7 @@ _MAX_WIDTH = 256
 
 @dataclass(frozen=True)
 class Architecture:
-    """What distinguishes one CMRNext network from another.
+    """The dimensions that differ between CMRNext networks.
 
     Attributes:
         fourier_levels: of the depth encoding; -1: plain depth.
@@ -55,16 +55,12 @@ class Architecture:
         return self.lidar_channels if self.context == "lidar" else _RGB
 
     def scale(self, channels: int) -> int:
-        """A layer's channels, from those of the published width."""
+        """A layer's channels, scaled from the published width."""
         return channels * self.width // FULL_WIDTH
 
 
 def recognize_architecture(shapes: Shapes, *, reflectance: bool) -> Architecture:
     """The architecture that a state dict's shapes belong to.
-
-    Args:
-        shapes: by parameter name.
-        reflectance: as in the config; the parity of the LiDAR channels must agree.
 
     Raises:
         ValueError: if they belong to no supported architecture.

@@ -46,15 +46,7 @@ _MAX_TEXT, _MAX_INTEGER = 200, 2**53
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A network's weights and the config of their training.
-
-    Attributes:
-        path: of the file.
-        sha256: of the file.
-        architecture: of the network, recognised from the shapes.
-        config: of the training; plain values only.
-        state: the state dict.
-    """
+    """A network's weights and the config of their training."""
 
     path: Path
     sha256: str
@@ -212,11 +204,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _require_sound(config: Mapping[str, Any]) -> None:
-    """Check the keys of the config that anything depends on.
-
-    Raises:
-        ValueError: on the first that is missing or out of its range.
-    """
+    """Check the keys of the config that anything depends on."""
     for key, (least, most, required) in _NUMBERS.items():
         value: Any = config.get(key)
         if value is None and not required:
@@ -232,11 +220,7 @@ def _require_sound(config: Mapping[str, Any]) -> None:
 
 
 def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict, after comparing every name, shape and type with the network's.
-
-    Raises:
-        ValueError: on the first difference, and on numbers that are not finite.
-    """
+    """The state dict, after comparing every name, shape and type with the network's."""
     with torch.device("meta"):
         expected = CmrNext(architecture).state_dict()
     for kind, names in (

@@ -25,11 +25,7 @@ _FAR = 1e6  # cells: positions are clamped before rounding to integers
 
 
 class Correlation(Protocol):
-    """A correlation pyramid of two feature maps.
-
-    Attributes:
-        device: of its tensors.
-    """
+    """A correlation pyramid of two feature maps."""
 
     device: torch.device
 

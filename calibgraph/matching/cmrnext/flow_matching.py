@@ -91,7 +91,7 @@ class FlowMatcher:
         full, coarse = self._flow(jobs, lidar_images, halved)
         cell = CELL * (1 + halved)
         return [
-            to_table(job, lidar, full[i], coarse[i], cell)
+            to_table(job, lidar, full[i], coarse[i], cell=cell)
             for i, (job, lidar) in enumerate(zip(jobs, lidar_images, strict=True))
         ]
 
@@ -137,7 +137,7 @@ def _exact() -> AbstractContextManager[None]:
 
 
 def to_table(
-    job: MatchingJob, lidar: LidarImage, full: Maps, coarse: Maps, cell: int
+    job: MatchingJob, lidar: LidarImage, full: Maps, coarse: Maps, *, cell: int
 ) -> Correspondences:
     """Matches of one image: exact sub-pixel projections plus the flow at their pixels.
 

@@ -27,7 +27,7 @@ class ImageResult:
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
         start_dependence: see :mod:`calibgraph.matching.cmrnext.probe`; None if not measured.
-        recall: likewise.
+        memorization: see the same module; None if not measured.
     """
 
     job: MatchingJob
@@ -35,7 +35,7 @@ class ImageResult:
     T_camera_lidar: Array | None
     failed: bool
     start_dependence: float | None = None
-    recall: float | None = None
+    memorization: float | None = None
 
     def next_job(self) -> MatchingJob:
         """The job of the next network: from the new estimate, unless it failed."""
@@ -60,13 +60,13 @@ def list_failed_frames(results: Mapping[str, Sequence[ImageResult]]) -> dict[str
 def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
     """Failed frames, in the last round the probes, and the shared error of the last network."""
     failed = list_failed_frames(results)
-    usual = asdict(error_components().matchers["cmrnext"])
-    stated = {key: last.config[key] for key in usual if last.config.get(key) is not None}
+    prior = asdict(error_components().matchers["cmrnext"])
+    stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
     return MatcherFindings(
         failed_share={name: len(failed[name]) / len(each) for name, each in results.items()},
         start_dependence=_medians(results, "start_dependence"),
-        recall=_medians(results, "recall"),
-        **{**usual, **stated},
+        memorization=_medians(results, "memorization"),
+        **{**prior, **stated},
     )
 
 

@@ -36,12 +36,7 @@ _OCCLUDER_SHARE, _OCCLUDER_M = 0.9, 0.5  # how much nearer an occluder is
 
 
 class View:
-    """A camera without its distortion: a pinhole of the same resolution, centre and size.
-
-    Args:
-        camera: its pose is not used.
-        crop_even: leave out the last column or row if their number is odd.
-    """
+    """A camera without its distortion: a pinhole of the same resolution, centre and size."""
 
     def __init__(self, camera: Camera, *, crop_even: bool = False) -> None:
         self.camera = camera
@@ -141,7 +136,7 @@ class LidarImage:
         )
 
     def without_occluded(self) -> LidarImage:
-        """Without points that have nearer points in all four quadrants around them."""
+        """The points without those that have nearer points in all four quadrants around them."""
         radius = _OCCLUDER_RADIUS_PX
         depth = self.rasterize(self.depth_m)
         depth[depth == 0] = np.inf

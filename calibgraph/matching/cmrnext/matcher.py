@@ -63,7 +63,7 @@ class CmrNextMatcher:
     stage1: Stage1Source = "pnp"
     most_frames: int | None = None
     tracking_rounds: tuple[int, ...] = ()
-    fails_on_images = False
+    image_checks_can_fail = False
 
     def __init__(
         self,
@@ -197,7 +197,7 @@ class CmrNextMatcher:
             probe.remaining_share(job.camera, base, start, table)
             for table in (with_image, without_image)
         )
-        return replace(result, start_dependence=dependence, recall=1.0 - kept)
+        return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
     def _metadata(self, last: Checkpoint, round_index: int) -> dict[str, Any]:
         return {

@@ -70,11 +70,7 @@ class _Iteration:
 
 
 class CmrNext(nn.Module):
-    """The network, in evaluation or training.
-
-    Args:
-        architecture: of the network.
-    """
+    """The network, in evaluation or training."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()

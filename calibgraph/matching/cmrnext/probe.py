@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
@@ -30,10 +31,8 @@ def displace(
     """(4, 4) a start within the network's range: per axis a rotation and a shift of random sign."""
     rotation_deg, translation_m = range_deg_m or _DEFAULT_RANGE
     signs = rng.choice([-1.0, 1.0], 6)
-    D = np.eye(4)
-    angles = _SHARE_OF_RANGE * rotation_deg * signs[:3]
-    D[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
-    D[:3, 3] = _SHARE_OF_RANGE * translation_m * signs[3:]
+    turn = Rotation.from_rotvec(_SHARE_OF_RANGE * rotation_deg * signs[:3], degrees=True)
+    D = transform(turn, _SHARE_OF_RANGE * translation_m * signs[3:])
     return np.asarray(D @ T_camera_lidar)
 
 

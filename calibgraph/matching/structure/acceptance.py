@@ -3,7 +3,7 @@
 The best z-score of a search where there is nothing to find follows a Gumbel distribution: it is the
 highest of many. Its location differs from scene to scene, with the LiDAR, and most of all with how
 much a place is like another one. It is not measured on the scene itself: searches in clouds turned
-about the vertical, of which it is known, had 3 to 7 where cameras that look at façades had up to 15
+about the vertical had 3 to 7 where cameras that look at façades had up to 15
 in the clouds of other streets.
 """
 
@@ -13,34 +13,25 @@ import math
 from collections.abc import Iterable
 
 FALSE_ACCEPTANCE = 1e-3
-"""Share of cameras with nothing to find of which a pose may be accepted."""
+"""Accepted share of wrong poses, among cameras whose true pose is out of reach."""
 
 PRIOR_LOCATION, PRIOR_SIGMA, SCALE = 5.7, 3.0, 0.92
 """Of the best z-score of a search for one roll: mean and standard deviation over scenes of the
-location, and scale. Locations in turned clouds and in those of other places: KITTI 4 to 5, 26,000
+location, and scale. Locations in turned clouds and in clouds of other places: KITTI 4 to 5, 26,000
 to 47,000 points a scan 5 to 7, 16 beams in a laboratory 11; rendered streets, all alike, 12."""
 
 
 _LOCATION = PRIOR_LOCATION + 0.5 * PRIOR_SIGMA**2 / SCALE
-"""The tail of the Gumbel distribution is exponential, so that what is uncertain of its location
+"""The tail of the Gumbel distribution is exponential, so the uncertainty of its location
 raises it by half the variance over the scale."""
 
 
 def least_z_score(tries: float) -> float:
-    """From which z-score on a pose is accepted.
-
-    Args:
-        tries: how much was searched, in searches for one roll; a single pose is less than one.
-    """
+    """The smallest z-score of an accepted pose."""
     return _LOCATION + SCALE * math.log(tries / FALSE_ACCEPTANCE)
 
 
 def are_accepted(z_scores: Iterable[float], tries: float) -> bool:
-    """Whether poses of several cameras, one of each, are accepted together.
-
-    Args:
-        z_scores: of the poses; each excess over chance counts.
-        tries: of such sets of poses, as of :func:`least_z_score`.
-    """
+    """Whether poses of several cameras, one of each, are accepted together."""
     excess = sum(max(0.0, z_score - _LOCATION) for z_score in z_scores)
     return excess >= SCALE * math.log(tries / FALSE_ACCEPTANCE)

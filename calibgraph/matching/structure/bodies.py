@@ -14,11 +14,11 @@ from calibgraph.model.rig import Camera, RelativePose, Rig
 Array = NDArray[np.float64]
 
 Body = Mapping[str, Camera]
-"""Cameras at their places; the first one leads: its extrinsic is that of the body."""
+"""Cameras with fixed relative poses; the extrinsic of the first is the pose of the body."""
 
 RIGID_RAD, RIGID_M = np.radians(0.5), 0.1
-"""Sigmas of a known relative pose up to which two cameras are one body: what is left of them, the
-rounds correct camera by camera."""
+"""Sigmas of a known relative pose up to which two cameras are one body; the rounds correct the
+remaining error camera by camera."""
 
 
 def rigid_bodies(rig: Rig) -> list[Body]:
@@ -52,7 +52,7 @@ def _other_side(pair: RelativePose, body: Body) -> tuple[str, Array]:
 
 
 def lead(body: Body) -> Camera:
-    """The camera whose extrinsic is that of the body."""
+    """The camera whose extrinsic is the pose of the body."""
     return next(iter(body.values()))
 
 

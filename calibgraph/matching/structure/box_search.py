@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 COARSE_BLUR_CELLS, COARSE_EVERY, FINE_BLUR_CELLS = 2.0, 2, 1.0
 SAMPLES = 1024  # of the box
-SHIFT_DOWN_RAD = np.radians(6.0)  # a rotation down is nearly a shift of the maps within so much
+SHIFT_DOWN_RAD = np.radians(6.0)  # a smaller rotation down is nearly a shift of the maps
 COARSE_STARTS, FINE_STARTS, CANDIDATES = 24, 12, 8  # how many go on from each stage
 DUPLICATE = np.repeat([np.radians(3.0), 0.6], 3)  # nearer poses are duplicates
 COARSE_SIGMAS = np.repeat([np.radians(1.5), 0.3], 3)
@@ -82,7 +82,7 @@ class BodyMaps:
     T_camera_lead: Sequence[Array]
 
     def blur(self, sigma_cells: float, every: int = 1) -> BodyMaps:
-        """With maps blurred, of only every so many rows and columns."""
+        """The body with its maps blurred and subsampled."""
         return replace(self, maps=[maps.blur(sigma_cells, every) for maps in self.maps])
 
     def z_scores(self, T_lead_lidar: Array) -> Array:
@@ -97,22 +97,17 @@ def search_box(
 ) -> list[Array]:
     """Find the best extrinsics in a box.
 
-    Args:
-        maps: of a body.
-        box: where to search the lead.
-        cores: works on several starts in parallel.
-        effort: factor on the number of poses that go on from each stage.
-        seed: of the search.
-
     Returns:
         T_lead_lidar (4, 4), best first, without near duplicates.
     """
     rng = np.random.default_rng(seed)
     coarse = maps.blur(COARSE_BLUR_CELLS, COARSE_EVERY)
     starts = _suppress_duplicates(_sample(coarse, box, rng), effort * COARSE_STARTS)
-    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng, cores)[: effort * FINE_STARTS]
+    rough = _refine(coarse, box, starts, COARSE_SIGMAS, rng=rng, cores=cores)[
+        : effort * FINE_STARTS
+    ]
     fine = maps.blur(FINE_BLUR_CELLS)
-    refined = _refine(fine, box, [start for start, _ in rough], FINE_SIGMAS, rng, cores)
+    refined = _refine(fine, box, [start for start, _ in rough], FINE_SIGMAS, rng=rng, cores=cores)
     best_first = [displacement for displacement, _ in refined]
     return list(box.transforms(np.array(_suppress_duplicates(best_first, effort * CANDIDATES))))
 
@@ -139,7 +134,7 @@ def _sample_camera(
     own = replace(box, guess_T_camera_lidar=T_camera_lead @ box.guess_T_camera_lidar)
     unit = qmc.Sobol(6, seed=rng).random(SAMPLES)
     displacements = (2 * unit - 1) * box.half_widths
-    displacements[:, 1] = 0.0  # the rotation to the right, of which all values are tried
+    displacements[:, 1] = 0.0  # all rotations to the right are tried by the shift
     down = min(SHIFT_DOWN_RAD, box.rotation_rad)
     transforms = own.transforms(displacements)
     z_scores, shifts = coarse.find_best_shifts(transforms, (box.rotation_rad, down))
@@ -171,6 +166,7 @@ def _refine(
     box: Box,
     starts: Sequence[Array],
     sigmas: Array,
+    *,
     rng: np.random.Generator,
     cores: Executor,
 ) -> list[tuple[Array, float]]:

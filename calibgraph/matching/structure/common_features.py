@@ -1,4 +1,4 @@
-"""What the cameras of a rig see in common in the frames of a search, and where that places them."""
+"""Co-visible features of a rig's cameras in the frames of a search, and the poses they imply."""
 
 from __future__ import annotations
 
@@ -22,13 +22,7 @@ FRAMES = 4
 
 
 class CommonFeatures:
-    """Features that pairs of cameras see in common.
-
-    Args:
-        rig: lenses.
-        frames: of every camera.
-        seed: of the epipolar geometry and the relative poses.
-    """
+    """Features that pairs of cameras see in common."""
 
     def __init__(self, rig: Rig, frames: Mapping[str, CameraFrames], *, seed: int) -> None:
         self._frames, self._seed = frames, seed

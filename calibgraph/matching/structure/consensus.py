@@ -26,11 +26,6 @@ def z_score(scores: ShiftScores, unknowns: Array) -> float:
 def find_consensus(scores: ShiftScores, level: Level, *, seed: int) -> tuple[Array, float]:
     """Maximise the summed score over twists, less a weak prior on their size.
 
-    Args:
-        scores: the groups of one camera.
-        level: half-widths of the search.
-        seed: of the search's samples.
-
     Returns:
         (6,) twist (rotation [rad], translation [m]); its z-score.
     """
@@ -43,14 +38,6 @@ def maximize_score(
     scores: ShiftScores, half_widths: Array, *, seed: int, searches: int = 3, prior: float = PRIOR
 ) -> Array:
     """Maximise the summed score over as many unknowns as the Jacobian has columns.
-
-    Args:
-        scores: the groups of one camera; the Jacobian may have more columns than a twist's six.
-        half_widths: (k,) of the box that is searched.
-        seed: of the search's samples.
-        searches: number of searches, of which the best counts; no more after two that end at the
-            same maximum.
-        prior: see ``PRIOR``.
 
     Returns:
         (k,) the best unknowns.

@@ -66,7 +66,7 @@ class CorrelationMaps:
         return np.asarray(np.array(squares) / self.maps[0].size - np.array(means) ** 2)
 
     def blur(self, sigma_cells: float, every: int = 1) -> CorrelationMaps:
-        """Blur the maps by a Gaussian, and keep only every so many rows and columns."""
+        """Blur the maps by a Gaussian and subsample their rows and columns."""
         maps = [cv2.GaussianBlur(m, (0, 0), sigma_cells)[::every, ::every] for m in self.maps]
         step_rad = every * self.step_rad
         return CorrelationMaps(np.stack(maps), self.points_lidar_m, self.origin_rad, step_rad)
@@ -137,17 +137,7 @@ def correlate(
     max_windows: int,
     seed: int,
 ) -> CorrelationMaps:
-    """Correlate the images of a camera with their clouds, at all places.
-
-    Args:
-        grays: (height, width) images.
-        clouds: one per image.
-        camera: lens, and the guess, of which only the orientation is used.
-        cores: works on several frames in parallel.
-        range_rad: largest error of the orientation, per axis.
-        max_windows: per frame; fewer where the maps would be too large.
-        seed: of the choice of windows.
-    """
+    """Correlate the images of a camera with their clouds, at all places."""
     cells = _to_angular_image(grays[0], camera).log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
     one = partial(_correlate_frame, camera=camera, range_rad=range_rad, draw=(max_windows, seed))
@@ -163,13 +153,14 @@ def correlate(
 def _correlate_frame(
     gray: NDArray[np.uint8],
     cloud: PreparedCloud,
+    *,
     camera: Camera,
     range_rad: float,
     draw: tuple[int, int],
 ) -> CorrelationMaps:
     """The maps of one frame; the windows are drawn by their largest number and a seed."""
     image = _to_angular_image(gray, camera)
-    windows = _cut_windows_in_reach(image, cloud, camera, range_rad, draw)
+    windows = _cut_windows_in_reach(image, cloud, camera, range_rad, draw=draw)
     if not len(windows.counts):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
@@ -190,6 +181,7 @@ def _cut_windows_in_reach(
     cloud: PreparedCloud,
     camera: Camera,
     range_rad: float,
+    *,
     draw: tuple[int, int],
 ) -> Windows:
     """Windows of the part of the cloud that the camera may see from anywhere in the range."""

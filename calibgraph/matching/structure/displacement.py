@@ -1,4 +1,4 @@
-"""Whether a pose stands out: its score beside those of displaced poses, over the same windows."""
+"""Whether a pose stands out: its score against displaced poses, over the same windows."""
 
 from __future__ import annotations
 

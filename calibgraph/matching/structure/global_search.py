@@ -29,11 +29,11 @@ SEARCHES = 2  # per body
 RETRY_EFFORT = 2
 """Factor on the candidates, and as far as memory allows on the windows, of a second search."""
 TRIES = {1: len(ROLLS_RAD), 2: (1 + RETRY_EFFORT) * len(ROLLS_RAD)}
-"""How much has been searched after so many searches, in searches for one roll."""
+"""Amount of searching after a number of searches, in searches for one roll."""
 ALONE = 1 / CANDIDATES  # the same of a single pose
 
 SAME_DEG, SAME_CM = 1.0, 30.0
-"""Poses nearer than this are the same: what refinements leave, the rounds correct."""
+"""Poses nearer than this are the same: the rounds correct the error that refinements leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,24 +64,15 @@ def locate_cameras(
 ) -> dict[str, Located]:
     """Locate all cameras of a rig.
 
-    Args:
-        rig: lenses, the guess, and relative poses if known.
-        frames: images and clouds, by the names of the cameras.
-        search_range: about the guess.
-        seed: of the search.
-        out_of_time: checked before each search, and after each pose that is tried.
-        pool: a thread per camera, which waits for the cores of its frames.
-        progress: called as the work goes on.
-
     Returns:
         The best pose per camera, accepted if the camera has been located.
     """
-    search = PoseSearch(rig, frames, search_range, seed, out_of_time)
+    search = PoseSearch(rig, frames, search_range, seed=seed, out_of_time=out_of_time)
     return Locator(search, pool, progress).locate()
 
 
 class Locator:
-    """What has been tried for each body of a rig, and decides what is tried next.
+    """The poses tried so far for each body of a rig; chooses the next one.
 
     Attributes:
         best: the candidate of the highest z-score of each body, by its lead's name.
@@ -153,7 +144,7 @@ class Locator:
         self._consider(name, self._search.from_afar(guessed), ALONE)
 
     def _compare(self, one: Candidate, two: Candidate) -> None:
-        """Where two located bodies see each other elsewhere, keep what agrees better all in all."""
+        """Resolve two inconsistent bodies: keep the placement with the higher summed z-score."""
         seen_two = self._search.seen_by(one.body, two.body)
         if seen_two is None or _is_same_pose(seen_two, two.body):
             return
@@ -189,7 +180,7 @@ class Locator:
     def _accept_guess(self) -> bool:
         """Accept a body near its guess, if a search found nothing better anywhere.
 
-        It is unlikely that of all poses that were tried the guess is the best one by chance.
+        The guess is unlikely to be the best of all tried poses by chance.
         """
         for name in self._missing():
             near = self._near[name]
@@ -210,7 +201,7 @@ class Locator:
         return True
 
     def _last_hope(self, again: list[str]) -> list[str]:
-        """Of several bodies, none of which was found: the most promising, once.
+        """If no body of several was found, try the most promising one, once.
 
         A first search misses 5 % of the cameras that can be found (KITTI, 143 searches). Where it
         has missed all, there is hardly anything to find: one more search decides.
@@ -246,7 +237,7 @@ class Locator:
 
 
 def _distinct(bodies: Iterable[Body]) -> list[Body]:
-    """Without those that are at the pose of an earlier one."""
+    """The candidates without those at the pose of an earlier one."""
     kept: list[Body] = []
     for body in bodies:
         if not any(_is_same_pose(body, other) for other in kept):

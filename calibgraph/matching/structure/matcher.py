@@ -42,14 +42,14 @@ lower z-scores were 2 degrees off, and the first rounds corrected them."""
 
 FRAME_WINDOWS = 6_000  # bounds the time of a single frame
 SHARING_FRAMES = 20
-"""At most so many frames share a level's windows: with fewer windows per frame, few of its groups
-have enough of them, and more frames would give fewer matches."""
+"""Largest number of frames that share a level's windows: with fewer windows per frame, few of its
+groups have enough of them, and more frames would give fewer matches."""
 MOST_FRAMES = 30  # bounds time and memory, which are proportional from SHARING_FRAMES on
 SEARCH_FRAMES = 7
 SEARCH_DEG, SEARCH_M = 20.0, 1.5
 MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
 LEAST_WINDOWS, TRIED_WINDOWS = 300, 2_000
-"""So many of so many fine windows of a cloud must have structure, else the search fails slowly. Of
+"""Least number of fine windows with structure, of those tried; with fewer the search fails. Of
 scans thinned to 2000, 3000, 4000 and 5000 points 25, 250, 750 and 1300 have it: with 4000 cameras
 are found. Whole scans of 16 beams have 1600."""
 
@@ -72,7 +72,7 @@ class StructureMatcher:
     """
 
     stage1: Stage1Source = "rig"
-    fails_on_images: bool = True
+    image_checks_can_fail: bool = True
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class StructureMatcher:
         tables, z_scores = [], {}
         with core_pool() as cores, core_pool() as pool:  # a few cameras' scores are copied at once
             level = self.levels[round_index]
-            waiting = self._submit_scores(cache, dataset.frames, rig, level, cores)
+            waiting = self._submit_scores(cache, dataset.frames, rig, level, cores=cores)
             matches = pool.map(partial(self._match_camera, level), waiting, waiting.values())
             for index, name in enumerate(rig.cameras):
                 what = f"round {round_index + 1} of {self.rounds}: {name}"
@@ -149,7 +149,7 @@ class StructureMatcher:
         return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
 
     def _require_structure(self, cache: FrameCache, frames: Sequence[Frame], rig: Rig) -> None:
-        """Refuse clouds none of which has enough windows."""
+        """Raise if no cloud has enough windows."""
         camera, finest = next(iter(rig.cameras.values())), self.levels[-1]
         spacings = finest.spacing_rad, finest.stride_spacings
         most, best = -1, frames[0]
@@ -170,7 +170,7 @@ class StructureMatcher:
         self._cache = FrameCache()
 
     def _cache_of(self, dataset: Dataset) -> FrameCache:
-        """Of a dataset's frames, and no others."""
+        """The caches of this dataset's frames alone."""
         cache = cache_of(dataset.frames, self._cache)
         cache.keep_only(dataset.frames)
         return cache
@@ -180,7 +180,7 @@ class StructureMatcher:
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
     def _submit_scores(
-        self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, cores: Executor
+        self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, *, cores: Executor
     ) -> dict[str, deque[Future[ShiftScores]]]:
         """Score every camera in every frame; frame by frame, so that cameras share its windows.
 

@@ -23,12 +23,6 @@ def extract_correspondences(
     The information of a pixel is the curvature of the group's score (of rank one where the group
     is an edge) times the mean score of its windows at the peak, their quality. The confidence is
     twice the quality, and at least twice MIN_QUALITY, which a solve keeps by default.
-
-    Args:
-        scores: the groups of one camera.
-        unknowns: (k,) the consensus, one value per column of the Jacobian.
-        camera: name of the camera.
-        min_quality: groups of less quality are dropped.
     """
     if not len(scores.counts):  # nothing of the cloud is in view
         return _no_correspondences(camera)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from calibgraph.matching.structure.shift_scores import (
     pad_grids,
     score_frame,
 )
-from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
 
 APPROACH = (WIDE, 4_000)
@@ -52,14 +50,7 @@ MAX_REFINEMENTS = 4
 
 @dataclass(frozen=True, eq=False)
 class CameraFrames:
-    """The data of one camera in a few frames.
-
-    Attributes:
-        frames: that they are of.
-        grays: (height, width) images.
-        clouds: one per image.
-        cores: a thread per core, which works on several frames in parallel.
-    """
+    """The data of one camera in a few frames."""
 
     frames: Sequence[Frame]
     grays: Sequence[NDArray[np.uint8]]
@@ -69,13 +60,7 @@ class CameraFrames:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A candidate pose of a body.
-
-    Attributes:
-        body: its cameras at their places.
-        z_score: agreement of images and clouds there, in standard deviations of chance agreement.
-        stands_out: whether they agree less at displaced poses; not looked at below CONFIDENT.
-    """
+    """A candidate pose of a body."""
 
     body: Body
     z_score: float
@@ -95,8 +80,8 @@ def approach(frames: Mapping[str, CameraFrames], body: Body) -> Candidate:
 def refine(frames: Mapping[str, CameraFrames], body: Body) -> Candidate:
     """Improve a pose that may be off by about two degrees and half a metre.
 
-    The z-score of the last level is that of the candidate, so that those of different poses can be
-    compared; of the first level where nothing comes of it.
+    The candidate has the z-score of the last level, so that different poses can be compared;
+    a hopeless pose has the z-score of the first level.
     """
     for level, windows in REFINEMENT:
         candidate = _improve(frames, body, level, windows)
@@ -135,28 +120,20 @@ def _score_body(
     frames: Mapping[str, CameraFrames], body: Body, level: Level, windows: int
 ) -> ShiftScores:
     """The scores of all cameras, by twists of the body's lead."""
-    scores = [_score_camera(frames[name], body, name, level, windows) for name in body]
+    scores = [_score_camera(frames[name], body, name, level, windows=windows) for name in body]
     return concatenate_scores(pad_grids(scores))
 
 
 def _score_camera(
-    frames: CameraFrames, body: Body, name: str, level: Level, windows: int
+    frames: CameraFrames, body: Body, name: str, level: Level, *, windows: int
 ) -> ShiftScores:
     """The scores of a camera in all its frames, by twists of the body's lead."""
-    score = partial(_score, body[name], level, windows // len(frames.grays))
-    numbers = range(len(frames.grays))
+
+    def score(gray: NDArray[np.uint8], cloud: PreparedCloud, number: int) -> ShiftScores:
+        return score_frame(gray, cloud, body[name], level, frame=number, max_windows=most)
+
+    most, numbers = windows // len(frames.grays), range(len(frames.grays))
     scores = concatenate_scores(list(frames.cores.map(score, frames.grays, frames.clouds, numbers)))
     if body[name] is lead(body):
         return scores
     return replace(scores, jacobian=scores.jacobian @ adjoint(body, name))
-
-
-def _score(
-    camera: Camera,
-    level: Level,
-    max_windows: int,
-    gray: NDArray[np.uint8],
-    cloud: PreparedCloud,
-    number: int,
-) -> ShiftScores:
-    return score_frame(gray, cloud, camera, level, frame=number, max_windows=max_windows)

@@ -23,7 +23,7 @@ from calibgraph.matching.structure.pose_refinement import (
     refine,
     refine_on,
 )
-from calibgraph.model.geometry import relative_transform
+from calibgraph.model.geometry import relative_transform, transform
 from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS = 2100  # of the maps, per camera over all frames
@@ -59,6 +59,7 @@ class PoseSearch:
         rig: Rig,
         frames: Mapping[str, CameraFrames],
         search_range: SearchRange,
+        *,
         seed: int,
         out_of_time: Callable[[], bool],
     ) -> None:
@@ -70,7 +71,7 @@ class PoseSearch:
         return CommonFeatures(self.rig, self._frames, seed=self._seed)
 
     def near(self, body: Body) -> Candidate:
-        """The body about its guess, refined on: from there, and from what an approach leads to."""
+        """Refine the body from its guess, and from the best pose of a coarse approach."""
         direct = refine(self._frames, body)
         if direct.is_beyond_doubt or self.out_of_time():
             return direct
@@ -193,6 +194,5 @@ def _by_z_score(candidate: Candidate) -> float:
 
 def _turn_about_axis(body: Body, angle_rad: float) -> Body:
     """The body after a turn about the axis of its lead."""
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
+    turn = transform(Rotation.from_rotvec([0.0, 0.0, angle_rad]))
     return place(body, turn @ lead(body).T_camera_lidar)

@@ -72,7 +72,13 @@ class PreparedCloud:
         return np.zeros(3) if self.seen_from_origin else camera_center(T)
 
     def windows(
-        self, camera: Camera, usable: Mask, spacing_rad: float, stride_spacings: float, fine: bool
+        self,
+        camera: Camera,
+        usable: Mask,
+        spacing_rad: float,
+        stride_spacings: float,
+        *,
+        fine: bool,
     ) -> WindowTable:
         """The windows of the cloud: if it was seen from the origin, the same for every camera.
 
@@ -102,7 +108,7 @@ class PreparedCloud:
     def count_windows(
         self, camera: Camera, spacing_rad: float, stride_spacings: float, *, most: int
     ) -> int:
-        """How many fine windows have structure, of so many at most that are tried, all around."""
+        """Number of fine windows with structure, of a limited number tried all around."""
         everywhere = np.ones(len(self.points_lidar_m), np.bool_)
         table = self.windows(camera, everywhere, spacing_rad, stride_spacings, fine=True)
         return len(table.cut(everywhere, everywhere, max_covered=1.0, max_windows=most).rays_m)

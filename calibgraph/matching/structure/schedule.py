@@ -25,7 +25,7 @@ class Level:
         group_rad: cell of directions in which the shift is nearly constant.
         max_windows: per camera, over all frames: bounds the time. More windows average more of
             the image; errors that all windows of a place share remain.
-        searches: number of pose searches, of which the best counts. One is enough where a single
+        searches: number of pose searches; the best counts. One is enough where a single
             maximum is in reach.
         min_quality: least mean score of a group's windows at its peak, above the grid's mean.
     """
@@ -47,10 +47,10 @@ class Level:
 def _level(
     step_deg: float,
     reach_deg: float,
+    *,
     rotation_deg: float,
     translation_m: float,
     spacing_deg: float,
-    *,
     fine: bool,
 ) -> Level:
     return Level(
@@ -64,7 +64,7 @@ def _level(
     )
 
 
-WIDE = _level(0.5, 10.0, 7.0, 1.2, 0.6, fine=False)
+WIDE = _level(0.5, 10.0, rotation_deg=7.0, translation_m=1.2, spacing_deg=0.6, fine=False)
 """From errors of about 4 degrees and 0.8 m, where a search ends, to 1 degree and 0.3 m."""
 
 
@@ -74,12 +74,12 @@ def _last(level: Level) -> Level:
 
 
 LEVELS = (
-    _level(0.25, 4.5, 2.5, 0.25, 0.35, fine=False),
-    _level(0.20, 2.5, 1.2, 0.25, 0.30, fine=False),
-    _level(0.14, 1.8, 0.7, 0.20, 0.20, fine=False),
-    _level(0.10, 1.2, 0.7, 0.25, 0.14, fine=True),
-    _last(_level(0.06, 0.8, 0.7, 0.25, 0.14, fine=True)),
-    _last(_level(0.06, 0.6, 0.7, 0.25, 0.14, fine=True)),
+    _level(0.25, 4.5, rotation_deg=2.5, translation_m=0.25, spacing_deg=0.35, fine=False),
+    _level(0.20, 2.5, rotation_deg=1.2, translation_m=0.25, spacing_deg=0.30, fine=False),
+    _level(0.14, 1.8, rotation_deg=0.7, translation_m=0.20, spacing_deg=0.20, fine=False),
+    _level(0.10, 1.2, rotation_deg=0.7, translation_m=0.25, spacing_deg=0.14, fine=True),
+    _last(_level(0.06, 0.8, rotation_deg=0.7, translation_m=0.25, spacing_deg=0.14, fine=True)),
+    _last(_level(0.06, 0.6, rotation_deg=0.7, translation_m=0.25, spacing_deg=0.14, fine=True)),
 )
 """From errors of about 2.5 degrees and 25 cm down to the resolution of a camera pixel.
 

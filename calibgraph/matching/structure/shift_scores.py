@@ -67,16 +67,7 @@ class ShiftScores:
 def score_frame(
     gray: Gray, cloud: PreparedCloud, camera: Camera, level: Level, *, frame: int, max_windows: int
 ) -> ShiftScores:
-    """Score one image against one cloud, about the camera's estimated pose.
-
-    Args:
-        gray: (height, width) image.
-        cloud: the frame's cloud.
-        camera: lens, and the estimated extrinsic.
-        level: reach and resolution.
-        frame: number of the frame.
-        max_windows: at most so many windows of the cloud.
-    """
+    """Score one image against one cloud, about the camera's estimated pose."""
     image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
@@ -115,7 +106,7 @@ def select_windows(
         in_view if level.fine else clear,
         level.spacing_rad,
         level.stride_spacings,
-        level.fine,
+        fine=level.fine,
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
     return table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)

@@ -98,7 +98,7 @@ def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: igno
 
 
 def _least_cosine(camera: Camera) -> float:
-    """Of the angle to the camera's axis, within its image: -1 where that may be any angle."""
+    """Smallest cosine of the angle to the camera's axis in its image; -1 if any may be."""
     u = np.linspace(-0.5, camera.width_px - 0.5, _BORDER_PIXELS)
     v = np.linspace(-0.5, camera.height_px - 0.5, _BORDER_PIXELS)
     sides = [np.column_stack([u, np.full_like(u, end)]) for end in (v[0], v[-1])]

@@ -1,4 +1,4 @@
-"""The kernel that describes windows: what varies over their rays, and where silhouettes are."""
+"""The kernel that describes windows: the variation over their rays, and their silhouettes."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class WindowTable:
             in_view: (n,) of all points of the cloud.
             clear: (n,) those that nothing nearer covers.
             max_covered: share of a window that may be covered.
-            max_windows: at most so many centres in view are taken.
+            max_windows: largest number of centres in view.
             seed: of the choice.
         """
         chosen = np.flatnonzero(in_view[self._rows[self._centres]])
@@ -85,7 +85,7 @@ class WindowTable:
         return windows.select(slots[in_view[rows].all(axis=1) & (covered <= max_covered)])
 
     def _take(self, chosen: Rows) -> tuple[Windows, NDArray[np.int32]]:
-        """Room for all windows, and the rows of those of some centres, which are cut."""
+        """The window buffer and the rows of the chosen centres; missing windows are extracted."""
         with self._lock:
             missing = chosen[self._slots[chosen] == _UNCUT]
             if len(missing):
@@ -129,7 +129,7 @@ class WindowTables:
         self._tables: Once[tuple[Hashable, ...], WindowTable] = Once()
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], WindowTable]) -> WindowTable:
-        """The table of a key, of which the first is the cloud; made if it is not there."""
+        """The table of a key whose first entry is the cloud; made if it is missing."""
         table = self._tables.get(key, make)
         self._tables.keep_last(MAX_BYTES, lambda table: table.nbytes)
         self._keep_last_trees()

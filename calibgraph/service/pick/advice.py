@@ -41,7 +41,7 @@ class Advice:
 
 
 def advise(
-    camera: Camera, covariance: Array, scale: float, points_lidar_m: Array, pixels_px: Array
+    camera: Camera, covariance: Array, scale: float, *, points_lidar_m: Array, pixels_px: Array
 ) -> Advice | None:
     """Where one more pair reduces the weakest direction most; None if there is nothing to pick.
 

@@ -82,7 +82,8 @@ def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> PickEstimate:
     solve = solve_pairs(start, joint_pairs)
     changes = influences(solve, joint_pairs)
     return PickEstimate(solve, {
-        name: _camera(solve, name, some, solvers[name], tuple(changes.get(name, ())), shapes)
+        name: _camera(solve, name, some, solvers=solvers[name],
+                      changes=tuple(changes.get(name, ())), shapes=shapes)
         for name, some in numbered.items()
     })  # fmt: skip
 
@@ -111,6 +112,7 @@ def _camera(
     solve: JointSolve,
     name: str,
     numbered: tuple[tuple[int, Pair], ...],
+    *,
     solvers: tuple[SolverPose, ...],
     changes: tuple[Influence, ...],
     shapes: Mapping[str, tuple[Shape, float]],

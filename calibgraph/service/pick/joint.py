@@ -91,7 +91,7 @@ def _graph(
     rig: Rig, pairs: Mapping[str, Sequence[Pair]], scale: float
 ) -> gtsam.NonlinearFactorGraph:
     blocks = {name: _block(rig.cameras[name], some, scale) for name, some in pairs.items()}
-    return objective_graph(rig, blocks, {}, Config(), "reprojection")
+    return objective_graph(rig, blocks, {}, Config(), terms="reprojection")
 
 
 def _block(camera: Camera, pairs: Sequence[Pair], scale: float) -> ProjectionBlock:

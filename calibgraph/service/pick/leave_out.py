@@ -63,7 +63,9 @@ def _of_camera(solve: JointSolve, name: str, pairs: Sequence[Pair], count: int) 
     jacobians = pixel_jacobians(camera, points_of(pairs)) / sigmas[:, None, None]
     covariance = solve.covariance_of(name)
     return [
-        _influence(solve, covariance, residuals[i], jacobians[i], float(sigmas[i]), count)
+        _influence(
+            solve, covariance, residuals[i], jacobians[i], sigma_px=float(sigmas[i]), count=count
+        )
         for i in range(len(pairs))
     ]
 
@@ -73,6 +75,7 @@ def _influence(
     covariance: Array | None,
     residual: Array,
     jacobian: Array,
+    *,
     sigma_px: float,
     count: int,
 ) -> Influence:

@@ -122,6 +122,7 @@ def _add_data(router: APIRouter, workspace: Workspace) -> None:
         caller: Reader,
         frame: int,
         camera: str,
+        *,
         u: Annotated[float, Query(ge=-1e5, le=1e5)],
         v: Annotated[float, Query(ge=-1e5, le=1e5)],
     ) -> CornerAnswer:

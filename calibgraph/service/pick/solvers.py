@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import normalized
 
@@ -103,10 +104,7 @@ def _transforms(solver: Callable[[_Problem], Poses], problem: _Problem) -> list[
     found = []
     for rotation, translation in poses:
         if np.isfinite(rotation).all() and np.isfinite(translation).all():
-            T = np.eye(4)
-            T[:3, :3] = cv2.Rodrigues(rotation)[0]
-            T[:3, 3] = translation.ravel()
-            found.append(T)
+            found.append(transform(cv2.Rodrigues(rotation)[0], translation.ravel()))
     return found
 
 

@@ -127,7 +127,13 @@ class Workspace:
             return None
         seen = self.visible(index, name, estimated=True)
         points = self.cloud(index)[seen.rows, :3].astype(np.float64)
-        return advise(solve.rig.cameras[name], covariance, solve.scale, points, seen.pixels_px)
+        return advise(
+            solve.rig.cameras[name],
+            covariance,
+            solve.scale,
+            points_lidar_m=points,
+            pixels_px=seen.pixels_px,
+        )
 
     def write(self) -> list[Path]:
         """Write the reference and the table of pairs.

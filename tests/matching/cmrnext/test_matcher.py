@@ -47,7 +47,7 @@ def replace_networks(
             full = np.zeros((2, *network_size(*lidar.shape)), np.float32)
             full[:, lidar.cells[:, 0], lidar.cells[:, 1]] = (target - lidar.pixels_px).T
             coarse = np.stack([np.zeros_like(full[0]), np.ones_like(full[0])])[:, ::8, ::8]
-            tables.append(to_table(job, lidar, full, coarse, 8))
+            tables.append(to_table(job, lidar, full, coarse, cell=8))
         return tables
 
     monkeypatch.setattr(FlowMatcher, "match", match)
@@ -177,9 +177,9 @@ def test_findings_keep_their_keys_on_disk(sample: Dataset, weights: Path) -> Non
     table = CmrNextMatcher([weights], iterations=1, half_resolution=True).match(
         sample.select("0"), sample.rig, round_index=0, progress=lambda *_: None
     )
-    for key in ("failed_share", "failed_frames", "start_dependence", "recall"):
+    for key in ("failed_share", "failed_frames", "start_dependence", "memorization"):
         assert table.metadata[key].keys() == sample.rig.cameras.keys()
-    assert table.findings.recall == table.metadata["recall"]
+    assert table.findings.memorization == table.metadata["memorization"]
     assert table.metadata["systematic_rotation_rad"] == np.radians(0.06)
     assert table.metadata["systematic_translation_m"] == 0.025
 
@@ -187,7 +187,7 @@ def test_findings_keep_their_keys_on_disk(sample: Dataset, weights: Path) -> Non
 def test_it_has_every_member_of_a_matcher(sample: Dataset, weights: Path) -> None:
     matcher: FullMatcher = CmrNextMatcher([weights])
     assert (matcher.rounds, matcher.stage1, matcher.most_frames) == (1, "pnp", None)
-    assert (matcher.tracking_rounds, matcher.fails_on_images) == ((), False)
+    assert (matcher.tracking_rounds, matcher.image_checks_can_fail) == ((), False)
     start = matcher.locate(sample, sample.rig, out_of_time=lambda: False, progress=lambda *_: None)
     assert (start.rig, start.first_round) == (sample.rig, 0)
 

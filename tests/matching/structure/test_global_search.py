@@ -56,7 +56,7 @@ class MadeUp(PoseSearch):
         searched: Mapping[str, list[np.ndarray]] | None = None,
         sees: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
-        super().__init__(rig, {}, SearchRange(0.3, 1.5), 0, never)
+        super().__init__(rig, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
         self.z_scores, self.found, self.sees = list(z_scores), dict(searched or {}), sees or {}
         self.searches: list[str] = []
 
@@ -149,7 +149,9 @@ def test_near_the_guess_a_pose_that_does_not_stand_out_is_looked_around(
     monkeypatch.setattr(
         pose_search, "refine", lambda _, body: Candidate(body, z_score, stands_out=stands_out)
     )
-    found = Around(one, {}, SearchRange(0.3, 1.5), 0, never).near(dict(one.cameras))
+    found = Around(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never).near(
+        dict(one.cameras)
+    )
     assert (len(looked), found.z_score) == (looks, 72.0 if looks else z_score)
 
 
@@ -167,7 +169,7 @@ def test_of_the_rolls_those_are_tried_until_a_pose_is_beyond_doubt(
             tried.append(roll_rad)
             return Candidate(body, by_roll[len(tried) - 1])
 
-    search = Rolled(one, {}, SearchRange(0.3, 1.5), 0, never)
+    search = Rolled(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
     found = search.everywhere(dict(one.cameras), 1)
     assert (len(tried), found.z_score) == (rolls, max(by_roll[:rolls]))
 

@@ -89,7 +89,7 @@ def test_a_tree_of_neighbours_that_was_dropped_is_built_again_alike(
 
     def table() -> WindowTable:
         return cloud.windows(
-            left, np.empty(0, np.bool_), level.spacing_rad, level.stride_spacings, level.fine
+            left, np.empty(0, np.bool_), level.spacing_rad, level.stride_spacings, fine=level.fine
         )
 
     select_windows(cloud, left, level, max_windows=500)

@@ -22,7 +22,7 @@ def test_a_pair_where_it_is_advised_reduces_the_weakest_direction_more_than_most
     camera = found.rig.cameras[CAMERA]
     seen = visible_points(points, camera)
     some = points[seen.rows]
-    advice = advise(camera, covariance, found.scale, some, seen.pixels_px)
+    advice = advise(camera, covariance, found.scale, points_lidar_m=some, pixels_px=seen.pixels_px)
     assert advice is not None
     place = np.floor(3 * (seen.pixels_px + 0.5) / [camera.width_px, camera.height_px])
     there = (place == [advice.column, advice.row]).all(axis=1)

@@ -43,12 +43,6 @@ def correlation_loss(
 
     The windows' centres are drawn at random around the truth, so that each contains its target and
     the targets are spread over the windows.
-
-    Args:
-        correlation: of the batch.
-        samples: of the batch.
-        seed: of the offsets.
-        halved: whether the network's images have half the size.
     """
     height, width = (size // CELL for size in samples[0].rgb.shape[1:])
     truth, known = _true_cells(samples, height, width, CELL * (1 + halved))

@@ -45,12 +45,7 @@ _MALFORMED = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeEr
 
 
 class TrainingRun:
-    """A network in training.
-
-    Args:
-        settings: of the training.
-        device: ``cpu``, ``cuda``, or ``auto``.
-    """
+    """A network in training."""
 
     def __init__(self, settings: TrainSettings, device: str) -> None:
         self.settings, self.device, self.step = settings, torch_device(device), 0

@@ -26,7 +26,7 @@ from calibgraph.matching.cmrnext.inputs import (
     rgb_tensor,
 )
 from calibgraph.matching.cmrnext.training.scenes import Scene
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 
 Array = NDArray[np.float64]
 
@@ -68,12 +68,10 @@ def draw_perturbation(rng: np.random.Generator, rotation_deg: float, translation
 
     Never more than 1 m downwards. The perturbed extrinsic is E^-1 T_camera_lidar.
     """
-    E = np.eye(4)
     angles = rng.uniform(-rotation_deg, rotation_deg, 3)
-    E[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     high = np.array([translation_m, min(translation_m, _MAX_DOWN_M), translation_m])
-    E[:3, 3] = rng.uniform(-translation_m, high)
-    return E
+    turn = Rotation.from_euler("xyz", angles, degrees=True)
+    return transform(turn, rng.uniform(-translation_m, high))
 
 
 @dataclass(frozen=True)

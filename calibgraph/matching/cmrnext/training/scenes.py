@@ -18,13 +18,7 @@ REFERENCE_NAME = "reference.yaml"
 
 @dataclass(frozen=True)
 class Scene:
-    """One camera's image and the cloud of one frame.
-
-    Attributes:
-        frame: of the dataset.
-        name: of the camera.
-        camera: with its trusted T_camera_lidar.
-    """
+    """One camera's image and the cloud of one frame."""
 
     frame: Frame
     name: str

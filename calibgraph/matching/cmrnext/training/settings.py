@@ -65,7 +65,7 @@ class TrainSettings(BaseModel):
     max_depth_m: Annotated[float, Field(ge=1, le=10_000)] = 160.0
     """Divisor of depths."""
     seed: Seed = 0
-    """Of the initial weights and of all samples."""
+    """Seed of the initial weights and of all samples."""
 
     @model_validator(mode="after")
     def _require_trainable(self) -> Self:

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Halves:
+class SplitHalf:
     """Sums of every other epoch, per camera, about the references.
 
     Attributes:
@@ -31,10 +31,10 @@ class Halves:
     next_half: NDArray[np.int64]
 
     @staticmethod
-    def of_closed_epochs(state: State) -> Halves:
+    def of_closed_epochs(state: State) -> SplitHalf:
         """The sums without the open epoch."""
         summaries = [camera.summary for camera in state.cameras]
-        halves = Halves(
+        halves = SplitHalf(
             np.array([summary.halves_hessian for summary in summaries]),
             np.array([summary.halves_gradient for summary in summaries]),
             np.array([summary.next_half for summary in summaries], dtype=np.int64),
@@ -43,14 +43,14 @@ class Halves:
             halves = halves.add(epoch.frames)
         return halves
 
-    def add(self, frames: Iterable[LiveFrame]) -> Halves:
+    def add(self, frames: Iterable[LiveFrame]) -> SplitHalf:
         """The sums with an epoch's frames added."""
         hessian, gradient = self.hessian.copy(), self.gradient.copy()
         cameras = np.arange(len(self.next_half))
         for frame in frames:
             hessian[cameras, self.next_half] += frame.hessian
             gradient[cameras, self.next_half] += frame.gradient
-        return Halves(hessian, gradient, 1 - self.next_half)
+        return SplitHalf(hessian, gradient, 1 - self.next_half)
 
     def estimates(self, state: State, camera: int) -> tuple[Array, Array] | None:
         """Two (4, 4) T_camera_lidar of a camera; None if one of them is undetermined."""
