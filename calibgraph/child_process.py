@@ -40,12 +40,7 @@ class ChildTimeoutError(Exception):
 
 
 class ChildProcess:
-    """A process that answers one request at a time; started when needed, and again after its end.
-
-    Args:
-        module: that it runs, with :func:`answer_requests`.
-        arguments: of its command line.
-    """
+    """A process of a module that answers one request at a time; started again after its end."""
 
     def __init__(self, module: str, arguments: Sequence[str] = ()) -> None:
         self._module, self._arguments = module, tuple(arguments)
@@ -66,11 +61,6 @@ class ChildProcess:
 
     def ask(self, request: Any, timeout_s: float, on_note: Note | None = None) -> Any:
         """The answer of the process that :meth:`start` started.
-
-        Args:
-            request: that can be pickled.
-            timeout_s: longest time until the answer.
-            on_note: called with what comes before it.
 
         Raises:
             ChildEndedError: if the process ends first.

@@ -190,12 +190,7 @@ def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, 
 
 
 def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding]:
-    """Frames with the same cloud or image: they are not independent.
-
-    Args:
-        what: of which sources.
-        sources: a frame's name and its file or message.
-    """
+    """Frames with the same cloud or image: they are not independent."""
     hashes = map_on_cores(hash_source, [path for _, path in sources])
     first: dict[str, str] = {}
     repeated = [

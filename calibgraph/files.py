@@ -65,12 +65,7 @@ def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSE
 
 
 def require_place_for_file(path: Path, *suffixes: str) -> None:
-    """Check, before hours of work, that a file can be written.
-
-    Args:
-        path: the file.
-        suffixes: the endings that its name may have, if given: so that no other kind of file is
-            overwritten by mistake.
+    """Check, before hours of work, that a file with one of the suffixes can be written.
 
     Raises:
         FileError: if it is a folder, if a folder above it is a file or not writable, or if it ends
@@ -192,13 +187,7 @@ def read_text(path: Path) -> str:
 
 
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:
-    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line.
-
-    Args:
-        path: of the file.
-        content: the mapping.
-        first_line: a comment above it.
-    """
+    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line."""
     text = yaml_text(content)
     write_text(path, f"{first_line}\n{text}" if first_line else text)
 

@@ -32,14 +32,7 @@ def checked_arguments() -> Iterator[None]:
 def dataset_from(
     folders: list[Path], rig: Path | None, frames: str | None, bag: BagOptions | None = None
 ) -> Dataset:
-    """The dataset in these folders; of bags, a line each is printed.
-
-    Args:
-        folders: of one rig.
-        rig: file of the initial guess; the dataset's own if None.
-        frames: positions, ``A:B:STEP``; all if None.
-        bag: how ROS bags are read.
-    """
+    """The dataset in these folders; of bags, a line each is printed."""
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
@@ -52,10 +45,6 @@ def dataset_from(
 
 def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | None:
     """How bags are read; None if no option is given.
-
-    Args:
-        topic: ``NAME=/TOPIC``, each.
-        options: the fields of :class:`calibgraph.BagOptions`; None if not given.
 
     Raises:
         CalibrationError: if a value is out of range, or a topic has no name.

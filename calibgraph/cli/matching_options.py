@@ -83,11 +83,7 @@ class MatchingOptions:
 
 
 def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``.
-
-    Args:
-        command: a function for typer, one of whose parameters has this name.
-    """
+    """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``."""
     hints = get_type_hints(MatchingOptions, include_extras=True)
     names = [field.name for field in fields(MatchingOptions)]
     options = [

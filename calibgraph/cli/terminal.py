@@ -72,12 +72,7 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
 def progress_lines(
     print_line: Callable[[str], None], clock: Callable[[], float] = time.monotonic
 ) -> Progress:
-    """A progress callback that prints a line per stage, and not more often than is readable.
-
-    Args:
-        print_line: takes a line: the seconds so far, the stage, and the steps that are done.
-        clock: the time [s].
-    """
+    """A progress callback that prints a line per stage, and not more often than is readable."""
     start = printed = clock()
 
     def progress(what: str, done: int, total: int) -> None:

@@ -17,12 +17,7 @@ from calibgraph.client.inputs import Source, form_of
 
 
 class AsyncClient:
-    """A server of ``calibgraph serve``; see :class:`calibgraph.client.Client`.
-
-    Args:
-        url: of the server.
-        token: of ``calibgraph token``; the variable CALIBGRAPH_TOKEN if None.
-    """
+    """A server of ``calibgraph serve``; see :class:`calibgraph.client.Client`."""
 
     def __init__(self, url: str, token: str | None = None) -> None:
         self._url = url.rstrip("/")

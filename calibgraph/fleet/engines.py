@@ -38,11 +38,7 @@ class Engine(Protocol):
 
 
 class ProcessEngine:
-    """Child processes of this one.
-
-    Args:
-        slots: how many; one per core if None.
-    """
+    """Child processes of this one: one per core if ``slots`` is None."""
 
     def __init__(self, slots: int | None = None) -> None:
         self.slots = slots or count_cores()
@@ -78,13 +74,7 @@ class ProcessEngine:
 
 
 class RayEngine:
-    """Tasks of a Ray cluster.
-
-    Args:
-        address: of the cluster; a local one if empty.
-        slots: tasks at once; the cluster's cores if None.
-        memory_bytes: that a task reserves on its machine.
-    """
+    """Tasks of a Ray cluster, or of a local one; each reserves ``memory_bytes``."""
 
     def __init__(
         self, address: str = "", slots: int | None = None, memory_bytes: int | None = None
@@ -132,12 +122,7 @@ class RayEngine:
 
 
 class DaskEngine:
-    """Tasks of a Dask cluster.
-
-    Args:
-        address: of the scheduler; a local cluster of one-threaded processes if empty.
-        slots: tasks at once; the cluster's threads if None.
-    """
+    """Tasks of a Dask cluster, or of a local one of one-threaded processes."""
 
     def __init__(self, address: str = "", slots: int | None = None) -> None:
         distributed = _require("distributed", "dask")

@@ -23,12 +23,7 @@ class _FetchError(Exception):
 
 
 def execute(task: Task, folder: Path) -> Outcome:
-    """Run a job; what is wrong with its data or its machine is part of the outcome.
-
-    Args:
-        task: the job and its limits.
-        folder: for copies of what is remote; its name is in no message.
-    """
+    """Run a job; what is wrong with its data or its machine is part of the outcome."""
     places = dict[str, str]()
     try:
         cameras = _results(_calibrate(task, _fetcher(task, folder, places)))

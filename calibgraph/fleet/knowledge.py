@@ -39,12 +39,6 @@ def outputs_of_knowledge(folder: Path) -> list[Output]:
 def write_knowledge(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
     """Write what a fleet knows.
 
-    Args:
-        fleet: its model.
-        folder: for ``estimates.parquet`` (a row per vehicle and camera), ``fleet_model.json`` and,
-            per model of vehicle with a rig, ``prior_MODEL.yaml`` and one for each batch.
-        rigs: per model of vehicle, any of its rigs, for the lenses.
-
     Returns:
         The files.
 

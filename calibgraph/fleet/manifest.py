@@ -104,13 +104,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The jobs of a manifest.
-
-    Attributes:
-        uri: where it is from.
-        jobs: one per row.
-        others: the further columns, which the rows of the results carry, by row of the manifest.
-    """
+    """The jobs of a manifest, and its further columns, which the rows of results carry."""
 
     uri: str
     jobs: tuple[Job, ...]

@@ -119,11 +119,6 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 def relative_observations(of: Observations, camera: str, reference: str) -> Observations:
     """The poses between two cameras, of the vehicles that have both.
 
-    Args:
-        of: the observations of one model.
-        camera: b.
-        reference: a.
-
     Returns:
         With T_b_a in place of T_camera_lidar, and its covariance in the axes of b. The errors of
         both cameras are taken as independent: a row holds no covariance between cameras.

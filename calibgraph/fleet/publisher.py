@@ -22,13 +22,7 @@ _WAIT_S = 5.0
 
 
 class Publisher:
-    """Publishes outcomes, some at a time.
-
-    Args:
-        store: of the rows.
-        others: the manifest's further columns, by its rows.
-        logs: whether to keep what jobs print.
-    """
+    """Publishes outcomes, some at a time."""
 
     def __init__(self, store: RowStore, others: pa.Table, *, logs: bool) -> None:
         self._store, self._others, self._logs = store, others, logs

@@ -108,9 +108,6 @@ class RowStore:
     Writers of one bucket on local disks wait for each other; on an object store, which has no
     locks, the last one of two at the same moment wins.
 
-    Args:
-        uri: of a folder, local or of fsspec.
-
     Raises:
         CalibrationError: if it is empty, or nothing can be written there.
     """

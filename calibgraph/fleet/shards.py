@@ -20,10 +20,6 @@ _ARRAYS = (
 class Shard:
     """The buckets ``b`` with ``b % count == index``: no two shards write one file.
 
-    Attributes:
-        index: from 0.
-        count: of shards.
-
     Raises:
         CalibrationError: if the index is not below the count, or there are more than 256.
     """

@@ -35,13 +35,7 @@ class Standing:
 
 
 def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> Standing:
-    """Where every row stands.
-
-    Args:
-        rows: one per vehicle and camera, from which the model was fitted.
-        fleet: its model.
-        before: earlier rows, if there are any.
-    """
+    """Where every row stands."""
     changed = np.zeros(len(rows), dtype=np.bool_)
     if before is not None and len(before):
         changed = changed_poses(fleet.observations, observe(before))

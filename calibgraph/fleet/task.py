@@ -41,13 +41,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """One try of a job.
-
-    Attributes:
-        job: of the manifest.
-        limits: of the try.
-        release: of this package in the process that made the task.
-    """
+    """One try of a job, made by this release of the package."""
 
     job: Job
     limits: Limits
@@ -81,16 +75,7 @@ class CameraResult:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a try ended.
-
-    Attributes:
-        cameras: the results, none if it failed.
-        error_kind: None if it did not fail.
-        error: the failure, in one line.
-        seconds: wall time.
-        versions: of the packages in the process that ran it, as JSON; empty if it died.
-        log: what the job printed.
-    """
+    """How a try ended; without versions its process died."""
 
     cameras: tuple[CameraResult, ...] = ()
     error_kind: ErrorKind | None = None

@@ -123,12 +123,7 @@ def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
-    """The local path of a URI; what is remote is copied into a folder.
-
-    Args:
-        uri: of a file or folder.
-        folder: for the copy, which keeps the name.
-        most_bytes: that are copied.
+    """The local path of a URI; remote data are copied into a folder, up to so many bytes.
 
     Raises:
         FileError: if there are more bytes than these.

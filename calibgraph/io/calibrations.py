@@ -226,12 +226,6 @@ def _table(
 ) -> Table | None:
     """A table of the result, if there is one.
 
-    Args:
-        result: path of the result's file.
-        name: of the table's file beside it.
-        content: of the result, with the table's hash; results of earlier versions have none.
-        load: reads the table.
-
     Raises:
         FileError: if it is another table than that of the result.
     """

@@ -80,10 +80,6 @@ def read_cloud(path: Path) -> RawCloud:
 def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.float32]:
     """The rows of a cloud (n, 4) with a return.
 
-    Args:
-        cloud: with NaN or zeros in x, y and z where there is none.
-        path: of the cloud, or its name.
-
     Raises:
         FileError: if there is no point, or one is not finite.
     """
@@ -133,10 +129,6 @@ def _read_npy(path: Path) -> RawCloud:
 
 def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
     """The cloud in an array, (n, 3) or (n, 4+) or of named fields.
-
-    Args:
-        array: of any type of number.
-        path: of the array, or its name.
 
     Raises:
         FileError: if it has another shape or type.

@@ -67,9 +67,6 @@ def parts_of_table(table: Path) -> Iterator[Correspondences]:
     Of Parquet the bytes of one row group are in memory: about a million rows, by most writers. The
     metadata is that of the first file of a folder, with the places that any of its files names.
 
-    Args:
-        table: its file, or a folder of Parquet files.
-
     Raises:
         FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
             counted from the beginning of the file.
@@ -141,12 +138,7 @@ def read_arrow(path: Path) -> pa.Table:
 
 
 def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
-    """A Parquet file, whose pages are compared with their checksums, if it has them.
-
-    Args:
-        path: of the file.
-        names: columns of names: each is in memory once, however many rows have it.
-    """
+    """A Parquet file, its checksums verified; each value of the columns ``names`` is held once."""
     from pyarrow import parquet
 
     checked = partial(parquet.ParquetFile, path, page_checksum_verification=True)

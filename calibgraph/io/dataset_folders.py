@@ -17,12 +17,7 @@ from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Where a dataset folder keeps its files; those of one frame have the same stem.
-
-    Attributes:
-        clouds: the folder of the clouds.
-        images: per camera, the folder of its images, or its video.
-    """
+    """Where a dataset folder keeps its files; those of one frame have the same stem."""
 
     clouds: Path
     images: Mapping[str, Path]

@@ -27,10 +27,6 @@ def feather_columns(path: Path) -> tuple[str, ...]:
 def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Columns of a file, as arrays of one length.
 
-    Args:
-        path: of the file.
-        columns: that it must have.
-
     Raises:
         FileError: if it cannot be read, a column is missing, or a value is.
     """

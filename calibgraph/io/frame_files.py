@@ -14,13 +14,7 @@ _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame.
-
-    Attributes:
-        stem: their common stem, or the stamp of the cloud.
-        cloud: the cloud's file.
-        images: per camera that has one, the image's file.
-    """
+    """The files of one frame, which share their stem."""
 
     stem: str
     cloud: Path

@@ -28,10 +28,6 @@ _UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
 def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """Decode an image, after its header's size was checked against the rig's.
 
-    Args:
-        path: a file, or the address of a message in a bag or of a picture in a video.
-        camera: the camera that took it.
-
     Returns:
         (height, width, 3) uint8, BGR.
 

@@ -16,12 +16,7 @@ class IncompleteCamera(FileError):
 
 
 class RigRead(NamedTuple):
-    """A rig of a data set.
-
-    Attributes:
-        rig: of its complete cameras.
-        notes: what was left out, added or taken from elsewhere, a line each.
-    """
+    """The complete cameras of a data set, and what was left out or assumed, a line each."""
 
     rig: Rig
     notes: tuple[str, ...] = ()
@@ -31,12 +26,6 @@ def rig_of_complete(
     lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
 ) -> RigRead:
     """The rig of the cameras that have all parts.
-
-    Args:
-        lidar: name of the LiDAR.
-        names: of the cameras.
-        read: one by its name; raises IncompleteCamera.
-        path: of the data set, for errors.
 
     Raises:
         FileError: if a camera is malformed, or none is complete.

@@ -36,9 +36,6 @@ def read_kitti_rig(sequence: Path) -> RigRead:
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
     translate(K^-1 P_k[:, 3]) Tr.
 
-    Args:
-        sequence: its folder.
-
     Raises:
         FileError: if ``calib.txt`` is malformed or there is no image.
     """

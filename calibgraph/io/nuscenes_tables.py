@@ -104,14 +104,7 @@ class Instant:
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """The samples of a nuScenes folder, or of one of its scenes.
-
-    Attributes:
-        folder: of the tables, beside that of the files.
-        instants: in order of time.
-        cameras: the channels that are cameras.
-        calibrated: the sensors' poses, by token.
-    """
+    """The samples of a nuScenes folder, or of one of its scenes."""
 
     folder: Path
     instants: tuple[Instant, ...]
@@ -125,9 +118,6 @@ class Tables:
 
 def find_tables(path: Path) -> tuple[Path, str | None] | None:
     """The folder of the tables, and the scene if the path names one; None if there are no tables.
-
-    Args:
-        path: of the data set, of its tables, or one of these and a scene: ``nuscenes/scene-0061``.
 
     Raises:
         FileError: if there are several versions.

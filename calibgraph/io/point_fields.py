@@ -67,11 +67,6 @@ def raw_cloud(
 ) -> RawCloud:
     """The cloud of fields.
 
-    Args:
-        path: of the cloud, or its name.
-        names: of the fields.
-        column: (n,) values of a field.
-
     Raises:
         FileError: if a coordinate is missing, or there are two.
     """

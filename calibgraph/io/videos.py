@@ -29,10 +29,6 @@ def pictures_of_video(video: Path, stems: Sequence[str]) -> dict[str, Path]:
     clouds' stems; a cloud belongs to the nearest picture, not more than half a picture's time
     apart. Without that file there are as many pictures as clouds, in the same order.
 
-    Args:
-        video: its file.
-        stems: of the clouds, in order.
-
     Raises:
         FileError: if the video cannot be read, its pictures are not as many as its stamps or the
             clouds, or a stamp or stem is no number.

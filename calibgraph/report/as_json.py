@@ -16,12 +16,7 @@ from calibgraph.model.verdict import Verdict
 
 
 def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
-    """A result as plain values; every key names its unit.
-
-    Args:
-        result: the calibration.
-        written: the files that were written.
-    """
+    """A result as plain values; every key names its unit."""
     cameras = {}
     for name, T in result.T_camera_lidar.items():
         residuals = result.residuals.get(name)

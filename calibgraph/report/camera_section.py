@@ -98,15 +98,7 @@ def camera_section(
     overlays: Overlays | None,
     errors: BeforeAfter | None,
 ) -> CameraSection:
-    """Collect what the page shows of a camera.
-
-    Args:
-        result: the calibration.
-        name: of the camera.
-        index: of the camera in the rig, for the anchor.
-        overlays: its pictures; None if the images are missing.
-        errors: of its correspondences; None if there are none.
-    """
+    """Collect what the page shows of a camera."""
     camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
     moved = pose_error(result.T_camera_lidar[name], result.initial_rig.T_camera_lidar[name])
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]

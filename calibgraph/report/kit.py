@@ -8,13 +8,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 
 
 def load_template(name: str, package: str = "calibgraph.report", folder: str = "") -> Template:
-    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report.
-
-    Args:
-        name: of its file.
-        package: that the file is in.
-        folder: of the package.
-    """
+    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report."""
     return _environment(package, folder).get_template(name)
 
 

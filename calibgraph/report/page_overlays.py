@@ -37,15 +37,7 @@ _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
 
 @dataclass(frozen=True)
 class Overlays:
-    """One camera's pictures of one frame, as data URIs; by residual is None without matches.
-
-    Attributes:
-        frame: the frame's name.
-        by_depth: before, after.
-        by_residual: before, after.
-        depth_scale: colours by depth.
-        residual_scale: colours by residual.
-    """
+    """A camera's pictures of a frame, before and after, as data URIs; None without matches."""
 
     frame: str
     by_depth: tuple[str, str]

@@ -29,13 +29,6 @@ def write_overlays(
 ) -> list[Path]:
     """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
 
-    Args:
-        frame: the cloud and images to show.
-        initial: the rig before.
-        final: the rig after.
-        folder: to write to.
-        mark: prefix of the title of the second picture, such as that the result is FAIL.
-
     Returns:
         The paths.
 

@@ -22,12 +22,6 @@ def write_result(
 ) -> list[Path]:
     """Write a result: of images with an overlay picture per camera.
 
-    Args:
-        result: the calibration.
-        folder: for the files.
-        data: the images and clouds; None for a solve of correspondences.
-        with_report: whether to write the report.
-
     Returns:
         The files to name to the user.
     """

@@ -37,12 +37,7 @@ class WorkedPoint:
 
 
 def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoint:
-    """Project the used correspondence nearest to 10 m, or a point on the optical axis.
-
-    Args:
-        camera: lens and extrinsic.
-        errors: of its correspondences there; None if there are none.
-    """
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis."""
     T = camera.T_camera_lidar
     used = None if errors is None else errors.select(errors.is_inlier)
     if used is None or not len(used.frame):

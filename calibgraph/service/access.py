@@ -58,12 +58,7 @@ class TokenFile(BaseModel):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls.
-
-    Attributes:
-        tenant: whose jobs are meant.
-        scope: what the call may do.
-    """
+    """Who calls: whose jobs are meant, and what the call may do."""
 
     tenant: str
     scope: Scope
@@ -111,11 +106,7 @@ def _hash(token: str) -> str:
 
 
 class Gate:
-    """Finds out who calls.
-
-    Args:
-        tokens: that may call; None: anyone may, as admin.
-    """
+    """Finds out who calls; without tokens (None) anyone may, as admin."""
 
     def __init__(self, tokens: tuple[Token, ...] | None) -> None:
         self._tokens = tokens

@@ -37,11 +37,7 @@ _TABLES = {b"PAR1": ".parquet"}
 
 
 def open_upload(path: Path, most_bytes: int) -> Path:
-    """The recording in an upload: what it is, its first bytes show.
-
-    Args:
-        path: of the uploaded file.
-        most_bytes: of an archive, unpacked.
+    """The recording in an upload, by its first bytes; unpacked it has ``most_bytes`` at most.
 
     Returns:
         A folder or a bag beside it, in whose place it is.

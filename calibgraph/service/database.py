@@ -76,12 +76,7 @@ about = Table(
 
 
 def open_database(folder: Path, url: str | None, owner: str) -> Engine:
-    """The database of a server, with its tables.
-
-    Args:
-        folder: the data folder.
-        url: of SQLAlchemy; SQLite in the folder if None.
-        owner: id of the data folder: a database belongs to one.
+    """The database of a server: SQLite in its folder without a URL; it belongs to one owner.
 
     Raises:
         CalibrationError: if it cannot be opened, or is another server's or another layout.

@@ -17,14 +17,7 @@ TITLES: Mapping[JobKind, str] = {
 
 @dataclass(frozen=True)
 class Field:
-    """An input of a form.
-
-    Attributes:
-        name: of the input, of a setting, or ``name`` and ``note``.
-        label, hint: for people.
-        type: of HTML's inputs, or textarea.
-        required, multiple: of HTML's inputs.
-    """
+    """An input of a form; its type is that of HTML's inputs, or textarea."""
 
     name: str
     label: str

@@ -17,18 +17,7 @@ FILES, SUMMARY = "files", "summary.json"
 
 @dataclass(frozen=True)
 class JobTask:
-    """A job for a process.
-
-    Attributes:
-        job: what is asked for.
-        folder: of the job.
-        roots: from which it may read.
-        memory_bytes: that it may allocate.
-        fetch_bytes: of remote recordings.
-        unpacked_bytes: of uploaded archives.
-        free_bytes: of the disk, that stay free.
-        timeout_s: after which it is ended.
-    """
+    """A job for a process, with its limits; ``free_bytes`` of the disk stay free."""
 
     job: Job
     folder: Path
@@ -42,13 +31,7 @@ class JobTask:
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """How a job ended.
-
-    Attributes:
-        verdict: of the result; None if it failed.
-        cannot_tell: whether the data determine too little for another one.
-        error_kind, error: why it failed, in one line.
-    """
+    """How a job ended: the verdict of its result, or why it failed, in one line."""
 
     verdict: str | None = None
     cannot_tell: bool | None = None

@@ -10,15 +10,7 @@ _JOB_S = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000)
 
 
 class Metrics:
-    """The numbers of one server, in a registry of its own.
-
-    Attributes:
-        jobs: that ended, by kind and state.
-        job_s: from the start of a job to its end.
-        queued: jobs that wait.
-        running: jobs that run.
-        frames: that trackers have taken in.
-    """
+    """The numbers of one server, in a registry of its own."""
 
     def __init__(self) -> None:
         self._registry = registry = CollectorRegistry()

@@ -44,19 +44,7 @@ def render(template: str, **content: object) -> str:
 
 @dataclass(frozen=True)
 class JobView:
-    """A job as a page shows it.
-
-    Attributes:
-        id, kind: of the job.
-        title: its name, or kind and id.
-        note: that was given with it.
-        question: that the result answers.
-        result: verdict, or else state.
-        created, took: times in words.
-        stage: what it does.
-        error: why it failed.
-        is_finished: whether nothing will change.
-    """
+    """A job as a page shows it."""
 
     id: str
     kind: str
@@ -104,13 +92,7 @@ def _in_words(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera's row.
-
-    Attributes:
-        name: of the camera.
-        verdict: of it.
-        numbers: in the order of the columns.
-    """
+    """A camera's row; its numbers are in the order of the columns."""
 
     name: str
     verdict: str

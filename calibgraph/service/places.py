@@ -14,12 +14,7 @@ _SHOWN = 200
 
 @dataclass(frozen=True)
 class Root:
-    """A folder from which jobs may read.
-
-    Attributes:
-        protocol: of fsspec.
-        path: in it, without a slash at the end; of a local folder without links.
-    """
+    """A folder from which jobs may read: its fsspec protocol, and its path without links."""
 
     protocol: str
     path: str

@@ -43,13 +43,7 @@ class ProblemDetails(BaseModel):
 
 
 class Problem(Exception):
-    """An answer that refuses a request.
-
-    Args:
-        status: of HTTP.
-        detail: what is wrong, and what to do, in one line.
-        headers: of the answer.
-    """
+    """An answer that refuses a request; its detail states in one line what to do."""
 
     def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(detail)

@@ -82,12 +82,7 @@ Recordings = Annotated[tuple[Uri, ...], Field(min_length=1, max_length=MAX_RECOR
 
 
 class _Request(_Strict):
-    """What every request may add.
-
-    Attributes:
-        name: of the job, for people.
-        note: about it, for people.
-    """
+    """What every request may add."""
 
     name: JobName = ""
     note: JobNote = ""
@@ -146,15 +141,7 @@ REQUESTS: Mapping[JobKind, type[AnyRequest]] = {
 
 
 class Job(_Request):
-    """A job as it is kept.
-
-    Attributes:
-        kind: of the job.
-        uris: what is read from where, by the name of the input; uploads are in the job's folder.
-        recordings: how many there are.
-        settings: of the kind, as JSON.
-        name, note: for people.
-    """
+    """A job as it is kept: its URIs by the name of the input; uploads are in its folder."""
 
     kind: JobKind
     uris: dict[str, str] = {}

@@ -17,13 +17,7 @@ _RETRY_AFTER = {"Retry-After": "30"}
 
 @dataclass
 class Held:
-    """Room that is reserved for a body.
-
-    Attributes:
-        tenant: whose body it is.
-        bytes: that are reserved.
-        arrived: of them, those that have arrived.
-    """
+    """Room that is reserved for a body, and the part of it that has arrived."""
 
     tenant: str
     bytes: int = 0

@@ -18,11 +18,7 @@ router = APIRouter()
 
 
 class Status(BaseModel):
-    """That the server is well.
-
-    Attributes:
-        status: ok.
-    """
+    """That the server is well."""
 
     status: str = "ok"
 

@@ -42,16 +42,7 @@ class _Slot:
 
 
 class Runner:
-    """The threads that run jobs.
-
-    Args:
-        table: of the jobs.
-        folder: of the server.
-        settings: of the server.
-        roots: from which jobs may read.
-        metrics: that count them.
-        ring: called with the id of a job that has changed.
-    """
+    """The threads that run jobs."""
 
     def __init__(
         self,

@@ -28,13 +28,7 @@ _BACKLOG = 4096
 
 @dataclass(frozen=True)
 class Address:
-    """Where a server listens.
-
-    Attributes:
-        host: name or address.
-        port: number.
-        certificate, key: files for TLS; None for plain HTTP.
-    """
+    """Where a server listens; without a certificate by plain HTTP."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -82,12 +76,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def serve(app: FastAPI, address: Address, announce: Callable[[str], None] | None = None) -> None:
-    """Serve an application of :func:`calibgraph.service.app.create_app` until SIGTERM or Ctrl-C.
-
-    Args:
-        app: to serve.
-        address: where it listens.
-        announce: called with the URL of the pages once it listens.
+    """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens.
 
     Raises:
         CalibrationError: if the address cannot be used.
@@ -117,11 +106,6 @@ class Server(uvicorn.Server):
     """A server of uvicorn with limits on connections.
 
     It wakes requests that wait as soon as a signal comes: uvicorn would wait for them.
-
-    Args:
-        app: of :func:`calibgraph.service.app.create_app`.
-        address: where it listens.
-        announce: called with the URL of the pages once it listens.
     """
 
     def __init__(

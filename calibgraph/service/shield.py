@@ -37,11 +37,6 @@ class Shield:
 
     A page of another site that a browser shows could otherwise call a server without tokens: its
     name is then not one of ours, or its ``Origin`` is another one.
-
-    Args:
-        app: that answers.
-        hosts: names by which the server may be called; any if empty.
-        observe: see :data:`Observe`.
     """
 
     def __init__(self, app: ASGIApp, hosts: tuple[str, ...], observe: Observe) -> None:

@@ -27,22 +27,7 @@ _RETRY_AFTER = {"Retry-After": "5"}
 
 @dataclass
 class Service:
-    """The parts of a server.
-
-    Attributes:
-        settings: of the server.
-        folder: its data.
-        engine: its database.
-        jobs: their table.
-        runner: runs them.
-        tracker_table: the trackers' table.
-        trackers: the processes that hold them.
-        roots: from which jobs may read.
-        metrics: numbers for Prometheus.
-        disk, memory: room for uploads, and for bodies that are not written to disk.
-        bell: wakes requests that wait.
-        is_stopping: whether the server was told to stop.
-    """
+    """The parts of a server."""
 
     settings: Settings
     folder: DataFolder

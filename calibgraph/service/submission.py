@@ -50,14 +50,7 @@ _RETRY_AFTER_S = 5
 async def submit(
     service: Service, request: Request, caller: Caller, kind: JobKind, key: str | None
 ) -> tuple[JobRecord, bool]:
-    """Take in a job; it is durable when this returns.
-
-    Args:
-        service: of the server.
-        request: its body is JSON with URIs, or a form with files.
-        caller: whose the job will be.
-        kind: of the job.
-        key: idempotency key; None if there is none.
+    """Take in a job, of JSON with URIs or a form with files; it is durable when this returns.
 
     Returns:
         The job, and whether it was known before.

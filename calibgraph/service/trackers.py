@@ -115,12 +115,7 @@ def _stopping() -> Problem:
 
 
 class Trackers:
-    """All trackers of a server.
-
-    Args:
-        folder: of the server.
-        settings: of the server.
-    """
+    """All trackers of a server."""
 
     def __init__(self, folder: DataFolder, settings: Settings) -> None:
         self._folder, self._settings = folder, settings
@@ -139,12 +134,7 @@ class Trackers:
             self._begun[tenant] -= 1
 
     async def answer(self, id: str, tenant: str, request: TrackerRequest) -> Any:
-        """What the process of a tracker answers; no thread waits for it.
-
-        Args:
-            id: of the tracker.
-            tenant: who asks: tenants take turns.
-            request: to it.
+        """Ask the process of a tracker; tenants take turns, and no thread waits for the answer.
 
         Raises:
             Problem: if it is refused, too much waits, or the process ended: then it may be asked

@@ -33,11 +33,6 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     (CameraCalibration, of lenses that Foxglove has), ``/CAMERA/before`` and ``/CAMERA/after``
     (ImageAnnotations), ``/verdict`` (Log).
 
-    Args:
-        result: of ``calibrate``, or with frames relocated.
-        path: file to write.
-        progress: called as frames are done.
-
     Raises:
         CalibrationError: if mcap is missing, or an image or cloud cannot be read.
     """

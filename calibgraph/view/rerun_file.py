@@ -29,11 +29,6 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
     ``lidar/after/CAMERA`` (poses of the optical frames), ``images/CAMERA`` with ``before`` and
     ``after`` below it (points coloured by distance), ``verdict``.
 
-    Args:
-        result: of ``calibrate``, or with frames relocated.
-        path: file to write.
-        progress: called as frames are done.
-
     Raises:
         CalibrationError: if rerun-sdk is missing, or an image or cloud cannot be read.
         OSError: if the file cannot be written.

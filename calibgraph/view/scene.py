@@ -41,13 +41,7 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """One camera in one frame.
-
-    Attributes:
-        jpeg: the image as recorded.
-        before: the points by the guess.
-        after: the points by the result.
-    """
+    """One camera in one frame."""
 
     jpeg: bytes
     before: Projected

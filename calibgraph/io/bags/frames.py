@@ -59,11 +59,6 @@ class BagFrames:
 def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> BagFrames:
     """Pair the clouds of a bag with its images, without keeping any of them.
 
-    Args:
-        path: the bag.
-        cameras: the rig's, each of which a frame has an image of.
-        options: topics, tolerance, and which frames to pick.
-
     Raises:
         FileError, DatasetError: if the bag is damaged, a topic is missing, or nothing pairs.
     """

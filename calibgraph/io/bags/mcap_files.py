@@ -140,12 +140,7 @@ class McapFile:
                 yield block
 
     def _records_at(self, offset: int, *, without_data: bool = False) -> list[McapRecord]:
-        """The record at an offset, of a chunk those in it; none of the kinds that are not read.
-
-        Args:
-            offset: in the file.
-            without_data: leave the data out of a message outside of chunks.
-        """
+        """The record at an offset, of a chunk those in it; none of the kinds that are not read."""
         self._file.seek(offset)
         stream = ReadDataStream(self._file)
         opcode, length = _HEAD.unpack(stream.read(_HEAD.size))

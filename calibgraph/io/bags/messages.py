@@ -58,13 +58,7 @@ class Message:
 
 
 class Bag:
-    """An open bag. It is closed when it is no longer referred to.
-
-    Attributes:
-        path: its file or folder.
-        topics: by name.
-        start_ns, stop_ns: when the first message was recorded, and after the last [ns].
-    """
+    """An open bag. It is closed when it is no longer referred to."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -86,12 +80,7 @@ class Bag:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """The messages of some topics in the order of recording, read as they are asked for.
-
-        Args:
-            topics: names.
-            start_ns: when the first was recorded at the earliest [ns].
-            stop_ns: before which the last was recorded [ns].
+        """The messages recorded from ``start_ns`` to before ``stop_ns``, in that order, lazily.
 
         Raises:
             FileError: if the bag is damaged.

@@ -20,10 +20,6 @@ _LONGEST_S = 1.0
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
     """The points of a message that are returns.
 
-    Args:
-        message: a PointCloud2.
-        where: the message, for errors.
-
     Returns:
         (n, 4) x y z [m], and the intensity as recorded, NaN where there is none. Points with a
         coordinate that is not finite and points at the origin are no returns.

@@ -108,10 +108,6 @@ class BagRig:
 def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
     """What a bag holds about its rig; extrinsics may be missing.
 
-    Args:
-        path: the bag.
-        options: which topics, those found by type if None; and the bags beside it.
-
     Raises:
         FileError, DatasetError: if the bag is damaged, or a topic or a lens is missing.
     """

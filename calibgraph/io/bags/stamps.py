@@ -64,13 +64,7 @@ def _to_ns(stamp: object) -> int:
 def read_stamps(
     bag: Bag, topics: Collection[str], windows: Iterable[tuple[int, int]], stamps: Stamps
 ) -> dict[str, TopicStamps]:
-    """The stamps of some topics.
-
-    Args:
-        bag: the bag.
-        topics: their names.
-        windows: from when to when messages were recorded that are read [ns], one after another.
-        stamps: those of the headers, or of recording.
+    """The stamps of some topics within windows of recording time [ns], one after another.
 
     Raises:
         FileError, DatasetError: if the bag or a cloud is damaged.

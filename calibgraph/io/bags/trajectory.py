@@ -40,11 +40,6 @@ _NEIGHBOUR_S = 0.35  # of a scan, that is registered with it
 def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -> MotionOf:
     """A function of a frame that returns the motion during its scan.
 
-    Args:
-        path: of the bag.
-        frames: all that were recorded, in order.
-        options: where the motion is from.
-
     Raises:
         FileError, DatasetError: if the bag has no such topic or no such transforms.
     """

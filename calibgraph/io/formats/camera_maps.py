@@ -67,11 +67,6 @@ _PROGRAMS = (
 def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -> Part | None:
     """The cameras and transforms of a mapping; None if it holds none.
 
-    Args:
-        content: of the file.
-        path: of the file.
-        name: of the camera, if there is a single one; None for the file's own name of it.
-
     Raises:
         FileError: if it is malformed, or a lens is none of ours.
     """
@@ -133,13 +128,7 @@ def _extrinsics(named: Iterable[tuple[str, _Map]], path: Path) -> dict[str, Arra
 
 
 class _Map:
-    """A mapping in a file.
-
-    Args:
-        above: the keys that lead to it.
-        where: the file and these keys, for errors.
-        content: its keys and values.
-    """
+    """A mapping in a file, with the keys that lead to it."""
 
     def __init__(self, above: tuple[str, ...], where: str, content: Mapping[str, Any]) -> None:
         self.numbers = LensKeys(content, where)

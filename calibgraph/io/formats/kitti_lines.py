@@ -49,10 +49,6 @@ def is_kitti_lines(text: str) -> bool:
 def read_kitti_lines(path: Path, name: str | None) -> Part:
     """The lenses and transforms of a file.
 
-    Args:
-        path: of the file.
-        name: of the camera of a single matrix; None for the only one, KITTI-360's for image_00.
-
     Raises:
         FileError: if it is malformed, or no such file.
     """

@@ -88,12 +88,7 @@ def is_koide(content: dict[str, Any]) -> bool:
 
 
 def read_koide(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens and the result, or else an initial guess; without image size.
-
-    Args:
-        content: of calib.json.
-        path: of it.
-        name: of the camera, unless the file was written here.
+    """The lens and the result, or else an initial guess; a file written here has its own name.
 
     Raises:
         FileError: if the file is malformed, or the lens is none of ours.

@@ -61,12 +61,7 @@ _LENS_KEYS = frozenset(alias for aliases in _KEYS.values() for alias in aliases)
 
 
 class LensKeys:
-    """The numbers of a lens in a mapping.
-
-    Args:
-        content: keys and values, of a file or a part of one.
-        where: the file, and the key of the part, for errors.
-    """
+    """The numbers of a lens in a mapping."""
 
     def __init__(self, content: Mapping[str, Any], where: str) -> None:
         self._where = where

@@ -38,11 +38,7 @@ _COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:
-    """What a file holds about a rig.
-
-    Args:
-        path: of the file, or of a KITTI sequence, a result's folder or a ROS bag.
-        name: of the camera, if the file is of a single one; None for the file's own name of it.
+    """Read a file; ``name`` is that of its camera if it has a single one, None for the file's own.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.

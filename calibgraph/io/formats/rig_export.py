@@ -82,11 +82,7 @@ class RigExport:
         return next(iter(self.cameras.items()))
 
     def statement(self, *direction: str) -> list[str]:
-        """Lines for a comment: origin, direction, and a worked point of each camera.
-
-        Args:
-            direction: sentences on what the file's numbers map to what.
-        """
+        """Lines for a comment: origin, direction, and a worked point of each camera."""
         verdict = f"verdict {self.verdict}" if self.verdict else "a rig file, without verdict"
         frames = ", ".join(f"{name}: {frame}" for name, frame in self.optical_frames.items())
         lines = [

@@ -20,11 +20,7 @@ from calibgraph.service.shield import LOCAL_NAMES, Shield
 
 
 def create_pick_app(workspace: Workspace) -> FastAPI:
-    """The application of a session: its routes, without jobs and trackers.
-
-    Args:
-        workspace: of the session.
-    """
+    """The application of a session: its routes, without jobs and trackers."""
     app = FastAPI(title="calibgraph pick", docs_url=None, redoc_url=None)
     app.state.gate = Gate(None)
     app.add_middleware(Shield, hosts=LOCAL_NAMES, observe=Metrics().observe_request)
@@ -36,9 +32,6 @@ def create_pick_app(workspace: Workspace) -> FastAPI:
 
 def loopback_socket(port: int) -> socket.socket:
     """A socket that listens on this machine alone.
-
-    Args:
-        port: 0 for any that is free.
 
     Raises:
         CalibrationError: if the port is taken.

@@ -61,11 +61,7 @@ class PairChange(_Body):
 
 
 def pick_router(workspace: Workspace) -> APIRouter:
-    """The routes of a session.
-
-    Args:
-        workspace: of the session.
-    """
+    """The routes of a session."""
     router = APIRouter(responses=documented(404, 409, 422))
     _add_page(router)
     _add_data(router, workspace)

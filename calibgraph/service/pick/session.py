@@ -87,11 +87,6 @@ def load_session(path: Path) -> Session:
 def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> Session:
     """The session of a file, or a new one.
 
-    Args:
-        path: of the file.
-        frames: names of the dataset's frames.
-        cameras: of the rig.
-
     Raises:
         FileError: if the file is of another dataset or no session.
     """

@@ -32,10 +32,6 @@ class StaleError(Exception):
 class Workspace:
     """A session of picking, for the routes.
 
-    Args:
-        dataset: frames and the guess.
-        folder: of the session and what it gives; written after every change.
-
     Raises:
         FileError: if the folder holds a session of another dataset.
     """
@@ -58,10 +54,6 @@ class Workspace:
 
     def change(self, revision: int, change: Change) -> Session:
         """Change the session and save it.
-
-        Args:
-            revision: of the session that is meant.
-            change: from the session to the next.
 
         Raises:
             StaleError: if the session was changed since.
