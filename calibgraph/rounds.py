@@ -168,9 +168,6 @@ def _solve(
 
     A camera with too few correspondences is placed by what it sees in common with another; if that
     does not place it either, it is excluded, and the others are calibrated.
-
-    Raises:
-        CorrespondenceError: if that is so of all cameras.
     """
     try:
         return solve_joint(*matched, config, terms)

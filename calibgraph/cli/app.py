@@ -158,11 +158,7 @@ def main() -> None:
 
 
 def _require_utf8(arguments: list[str]) -> None:
-    """Check the arguments: results hold the paths of their input, as text.
-
-    Raises:
-        CalibrationError: if one is not UTF-8.
-    """
+    """Check the arguments: results hold the paths of their input, as text."""
     from calibgraph.errors import CalibrationError
 
     for argument in arguments:

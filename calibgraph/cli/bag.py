@@ -68,11 +68,7 @@ def bag(
 
 
 def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
-    """The sigmas of relative poses, [rad] and [m].
-
-    Raises:
-        ValueError: if only one is given.
-    """
+    """The sigmas of relative poses, [rad] and [m]."""
     from math import radians
 
     if tie_deg is None and tie_m is None:
@@ -83,11 +79,7 @@ def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] |
 
 
 def _topics(path: Path) -> list[tuple[str, str, int]]:
-    """Name, type and number of messages of each topic.
-
-    Raises:
-        FileError: if the path is no bag.
-    """
+    """Name, type and number of messages of each topic."""
     from calibgraph.errors import FileError
     from calibgraph.io.bags.messages import Bag
     from calibgraph.io.bags.storage import is_bag

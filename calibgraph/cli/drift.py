@@ -81,11 +81,7 @@ def drift(
 
 
 def _parse_days(text: str) -> list[float]:
-    """Days of dates or numbers, separated by commas.
-
-    Raises:
-        ValueError: if one is neither.
-    """
+    """Days of dates or numbers, separated by commas."""
     return [_parse_day(part.strip()) for part in text.split(",")]
 
 

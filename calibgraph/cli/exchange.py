@@ -138,11 +138,7 @@ def export(
 
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
-    """The (4, 4) of six numbers.
-
-    Raises:
-        ValueError: if they are not six, or an angle is in degrees.
-    """
+    """The (4, 4) of six numbers."""
     from calibgraph.io.rotations import pose_of_angles
 
     try:

@@ -119,11 +119,7 @@ def calibrate(
 
 
 def _search_of(matching: MatchingOptions) -> dict[str, Any]:
-    """The settings of the search; what a server does not offer is refused.
-
-    Raises:
-        CalibrationError: if an option is given that it does not have.
-    """
+    """The settings of the search; what a server does not offer is refused."""
     from calibgraph.cli.matching_options import MatchingOptions
     from calibgraph.errors import CalibrationError
 

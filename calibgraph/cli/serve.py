@@ -158,11 +158,7 @@ def token(
 
 
 def _one_of(known: tuple[Word, ...], option: str, word: str) -> Word:
-    """The word that an option gives.
-
-    Raises:
-        CalibrationError: if it is not known.
-    """
+    """The word that an option gives."""
     for each in known:
         if word == each:
             return each

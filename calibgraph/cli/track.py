@@ -90,11 +90,7 @@ def _tracking_matcher(
     seed: int,
     device: str | None,
 ) -> Matcher | None:
-    """The matcher for the frames of datasets; None for a source of correspondences.
-
-    Raises:
-        ValueError: if options need a matcher and there is none.
-    """
+    """The matcher for the frames of datasets; None for a source of correspondences."""
     if name:
         return matcher_from(name, weights, seed=seed, device=device)
     for option, value in (("--weights", weights), ("--device", device)):

@@ -121,11 +121,7 @@ def _states(store: RowStore, jobs: Sequence[Job]) -> Iterator[dict[str, str]]:
 def _first_tries(
     manifest: Manifest, jobs: Sequence[Job], report: Progress, *, allow_missing: bool
 ) -> list[Try]:
-    """The jobs by bucket, with the hashes of their inputs.
-
-    Raises:
-        FileError: if inputs are missing, and may not be.
-    """
+    """The jobs by bucket, with the hashes of their inputs."""
     ordered = sorted(jobs, key=lambda job: (job.bucket, job.row))
     tries = []
     with ThreadPoolExecutor(_READERS) as pool:

@@ -96,11 +96,7 @@ def _layout_of(path: Path, data: bytes) -> _Layout | None:
 
 
 def _count_columns(path: Path, values: NDArray[Any]) -> int | None:
-    """The smallest number of columns that tells as much as any; None if none is significant.
-
-    Raises:
-        FileError: if all x come first, then all y.
-    """
+    """The smallest number of columns that tells as much as any; None if none is significant."""
     blocks = values[: len(values) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
     values = blocks[:: max(1, len(blocks) // _MOST_BLOCKS)].ravel()
     ordered = np.sort(values[np.isfinite(values)])

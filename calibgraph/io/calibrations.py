@@ -65,11 +65,7 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def _square(value: Any) -> Array:
-    """A square matrix of finite numbers as an array.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """A square matrix of finite numbers as an array."""
     try:
         found = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -82,11 +78,7 @@ def _square(value: Any) -> Array:
 
 
 def _of_pose(value: Any) -> Array:
-    """A 4x4 matrix.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """A 4x4 matrix."""
     found = _square(value)
     if len(found) != 4:  # noqa: PLR2004 - homogeneous coordinates
         raise ValueError(f"expected a 4x4 matrix, found {found.shape}")
@@ -94,11 +86,7 @@ def _of_pose(value: Any) -> Array:
 
 
 def _covariance(value: Any) -> Array:
-    """A covariance of one or more poses: symmetric, without a negative variance in any direction.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """The covariance of one or more poses: symmetric, and of no negative variance."""
     found = _square(value)
     if len(found) % _POSE:
         raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
@@ -113,11 +101,7 @@ def _covariance(value: Any) -> Array:
 
 
 def _covariance_of_one(value: Any) -> Array:
-    """A (6, 6) covariance.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """A (6, 6) covariance."""
     found = _covariance(value)
     if len(found) != _POSE:
         raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
@@ -177,11 +161,7 @@ class _Parts(BaseModel):
 def _require_consistent(
     path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
 ) -> None:
-    """Check that the verdict is that of its checks, and all parts are of the same cameras.
-
-    Raises:
-        FileError: if not: the file was edited.
-    """
+    """Check that the verdict is that of its checks, and all parts are of the same cameras."""
     verdict = content.get("verdict", {})
     stated = {"the rig": verdict.get("status") if isinstance(verdict, dict) else verdict}
     derived = {"the rig": found.verdict.status}
@@ -224,11 +204,7 @@ assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields
 def _table(
     result: Path, name: str, content: Mapping[str, Any], load: Callable[[Path], Table]
 ) -> Table | None:
-    """A table of the result, if there is one.
-
-    Raises:
-        FileError: if it is another table than that of the result.
-    """
+    """A table of the result, if there is one."""
     path = result.with_name(name)
     if not path.is_file():
         return None

@@ -134,11 +134,7 @@ def load_dataset(
 
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
-    """The rig of all sources, which may differ in their extrinsics, and notes on it.
-
-    Raises:
-        FileError, DatasetError: if a rig is missing, or the rigs differ.
-    """
+    """The rig of all sources, which may differ in their extrinsics, and notes on it."""
     read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
     first = read[0].rig
     for path, other in zip(paths, read, strict=True):
@@ -188,11 +184,7 @@ def _next_index(data: Dataset) -> int:
 
 
 def _complete(data: Dataset) -> Dataset:
-    """The dataset, of whose frames that are not selected only complete ones are kept.
-
-    Raises:
-        DatasetError: if a selected frame lacks an image.
-    """
+    """The dataset, of whose frames that are not selected only complete ones are kept."""
     cameras = data.rig.cameras.keys()
     for frame in data.frames:
         for name in cameras - frame.image_paths.keys():

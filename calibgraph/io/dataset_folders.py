@@ -81,11 +81,7 @@ def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
-    """The folder of a camera's images.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """The folder of a camera's images."""
     if camera not in layout.images:
         raise FileError(
             folder,

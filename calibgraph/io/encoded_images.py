@@ -50,9 +50,6 @@ def _pixels_alone(png: bytes) -> bytes:
     """A verified PNG without what does not change its pixels.
 
     libpng prints warnings about profiles and gammas, which OpenCV ignores.
-
-    Raises:
-        ValueError: if its end is damaged, which is not verified.
     """
     kept, place = [png[: len(_PNG_MARK)]], len(_PNG_MARK)
     while kept[-1][4:8] != b"IEND":

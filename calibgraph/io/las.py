@@ -48,11 +48,7 @@ def read_las(path: Path) -> RawCloud:
 
 
 def _require_header(path: Path) -> None:
-    """Check what a header claims: laspy would read billions of records that are not there.
-
-    Raises:
-        FileError: if it is none, or the file is too short for what it claims.
-    """
+    """Check what a header claims: laspy would read billions of records that are not there."""
     with path.open("rb") as file:
         head = file.read(_WITH_END_RECORDS)
         size = file.seek(0, 2)

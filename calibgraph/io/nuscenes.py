@@ -74,11 +74,7 @@ def _camera(tables: Tables, taken: SampleData, T_ego_lidar: Array, where: Path) 
 
 
 def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> None:
-    """Check that all scenes have the same sensors at the same poses.
-
-    Raises:
-        DatasetError: with the scenes of each rig.
-    """
+    """Check that all scenes have the same sensors at the same poses."""
     for name in (LIDAR, *tables.cameras):
         scenes: dict[str, dict[str, None]] = {}  # by what the sensor's record holds
         for each in instants:

@@ -216,11 +216,7 @@ def _by_token(
 
 
 def _read_list(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON list.
-
-    Raises:
-        FileError: if the file is missing or is none.
-    """
+    """The objects of a JSON list."""
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:

@@ -77,11 +77,7 @@ def read_pcd(path: Path) -> RawCloud:
 
 
 def _layout(path: Path, header: str) -> tuple[int, list[_Field]]:
-    """The number of points and the fields of each.
-
-    Raises:
-        FileError: if the header is malformed.
-    """
+    """The number of points and the fields of each."""
     lines = {words[0]: words[1:] for words in map(str.split, header.split("\n")) if words}
     try:
         names = lines.get("FIELDS") or lines["COLUMNS"]

@@ -90,11 +90,7 @@ def read_ply(path: Path) -> RawCloud:
 
 
 def _parse(path: Path, header: str) -> tuple[str, list[_Element]]:
-    """The byte order, "" if it is text, and the elements.
-
-    Raises:
-        FileError: if the header is malformed.
-    """
+    """The byte order, "" if it is text, and the elements."""
     order, elements = None, list[_Element]()
     for line in header.split("\n"):
         try:

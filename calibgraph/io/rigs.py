@@ -89,11 +89,7 @@ def _exported_rig(content: dict[str, Any], path: Path) -> Rig:
 
 
 def _require_filled(content: object, path: Path) -> None:
-    """Refuse a rig file in which a placeholder is left.
-
-    Raises:
-        FileError: with the first key that holds one.
-    """
+    """Refuse a rig file in which a placeholder is left."""
     keys = list(_placeholders(content, ""))
     if keys:
         others = f", and {len(keys) - 1} more keys" if keys[1:] else ""

@@ -36,11 +36,7 @@ _SUFFIXES = {
 
 
 def _result_folder(state: Service, caller: Reader, id: str) -> Path:
-    """The folder of a result.
-
-    Raises:
-        Problem: if there is no such job, or it has none.
-    """
+    """The folder of a result."""
     record = find_job(state, caller, id)
     if record.state != "succeeded":
         why = f" ({record.error})" if record.error else ""

@@ -164,11 +164,7 @@ class Trackers:
 
 
 def _checked(result: Callable[[], Any]) -> Any:
-    """An answer that is none of the refusals.
-
-    Raises:
-        Problem: if it is one, or the process ended.
-    """
+    """An answer that is none of the refusals."""
     try:
         answer = result()
     except ChildEndedError:

@@ -117,11 +117,7 @@ class Bag:
         return data[0], self._deserialize(topic, record_ns, data[0])
 
     def _deserialize(self, topic: str, record_ns: int, data: bytes) -> Any:
-        """The content of a message.
-
-        Raises:
-            FileError: if it is none of its type.
-        """
+        """The content of a message."""
         kind = self.topics[topic]
         ros1 = kind.encoding == "ros1"
         store = type_store(ros1=ros1)

@@ -84,11 +84,7 @@ class BagRig:
         return checked_model(Rig, content, self.path)
 
     def _content(self, name: str) -> dict[str, Any]:
-        """The fields of a Camera.
-
-        Raises:
-            DatasetError: if the extrinsic is missing.
-        """
+        """The fields of a Camera."""
         camera = self.cameras[name]
         if camera.T_camera_lidar is None:
             frame = camera.lens.frame

@@ -80,11 +80,7 @@ class BagFolder:
 
 
 def _files_of(folder: Path) -> list[Path]:
-    """The files of a folder, of whichever storage; none if they are compressed.
-
-    Raises:
-        FileError: if one is not there.
-    """
+    """The files of a folder, of whichever storage; none if they are compressed."""
     stated = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
     if (stated.get("compression_mode") or "none").lower() != "none":
         return []

@@ -145,12 +145,7 @@ def _xyz(frame: BagFrame) -> Array:
 
 
 def _register(target: Array, source: Array, where: Path) -> Array:
-    """(4, 4) T_target_source of two scans, coarse and then fine.
-
-    Raises:
-        CalibrationError: if small_gicp is missing.
-        DatasetError: if they do not fit.
-    """
+    """(4, 4) T_target_source of two scans, coarse and then fine."""
     try:
         import small_gicp
     except ImportError as error:

@@ -171,11 +171,7 @@ class _Map:
                 )
 
     def _transform(self, names: tuple[str, ...]) -> Array:
-        """(4, 4) of a matrix of 3 or 4 rows, or of a rotation and a translation.
-
-        Raises:
-            FileError: if it is none.
-        """
+        """(4, 4) of a matrix of 3 or 4 rows, or of a rotation and a translation."""
         if len(names) == 1:
             rows = self.numbers.array(names[0], (4, 4), (3, 4))
         else:

@@ -101,11 +101,7 @@ def export_calibration(
 
 
 def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
-    """Check the verdicts of the cameras that are to be written.
-
-    Raises:
-        CalibrationError: if one is FAIL.
-    """
+    """Check the verdicts of the cameras that are to be written."""
     failed = [name for name in cameras if result.camera_verdicts[name].status == "FAIL"]
     if not failed:
         return
@@ -120,11 +116,7 @@ def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
 
 
 def _require_known(format: str, *, with_base: bool) -> None:
-    """Check the format, and that it has a base frame if one is given.
-
-    Raises:
-        ValueError: if not.
-    """
+    """Check the format, and that it has a base frame if one is given."""
     if format not in WRITERS:
         raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
     if with_base and format not in _WITH_BASE:

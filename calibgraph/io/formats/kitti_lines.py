@@ -90,11 +90,7 @@ def _rectified(lines: dict[str, list[float]], numbers: list[str], path: Path) ->
 
 
 def _T_camera_lidar(lines: dict[str, list[float]], path: Path) -> Array:
-    """(4, 4) of the one matrix of a file, in the direction that its name states.
-
-    Raises:
-        FileError: if it holds another one, or its name states no direction.
-    """
+    """(4, 4) of the one matrix of a file, in the direction that its name states."""
     if {"R", "T"} <= lines.keys():
         R, t = _matrix(lines, "R", (3, 3), path), _matrix(lines, "T", (3, 1), path)
         row = np.hstack([R, t]).ravel().tolist()
@@ -146,11 +142,7 @@ def _matrix(lines: dict[str, list[float]], key: str, shape: tuple[int, int], pat
 
 
 def _rigid(row: list[float], path: Path, what: str) -> Array:
-    """(4, 4) of 12 or 16 numbers.
-
-    Raises:
-        FileError: if they are no rigid transform.
-    """
+    """(4, 4) of 12 or 16 numbers."""
     if len(row) not in (12, 16):
         raise FileError(path, f"{what} has {len(row)} numbers, expected 12 or 16; {_EXPECTED}")
     rows = row if len(row) == 16 else [*row, 0.0, 0.0, 0.0, 1.0]  # noqa: PLR2004 - 4 x 4

@@ -122,11 +122,7 @@ class LensKeys:
         raise FileError(where, f"has {found.size} numbers, expected {sizes}")
 
     def _key(self, quantity: str) -> str | None:
-        """The key of a quantity.
-
-        Raises:
-            FileError: if two keys give it different values.
-        """
+        """The key of a quantity."""
         given = [self._keys[alias] for alias in _KEYS[quantity] if alias in self._keys]
         for other in given[1:]:
             if self._content[other] != self._content[given[0]]:
@@ -196,11 +192,7 @@ class LensKeys:
         return unified_coefficients(mirror, others, self._where)
 
     def _assume(self, found: Array, key: str) -> str:
-        """The note on a pinhole that no key states.
-
-        Raises:
-            FileError: if it may as well be a fisheye: four coefficients in a column.
-        """
+        """The note on a pinhole that no key states."""
         if found.size != _FISHEYE_COUNT or not found.any():
             return ""
         if found.ndim > 1 and len(found) > 1:
@@ -212,11 +204,7 @@ class LensKeys:
         )
 
     def _named(self, model: LensModel, stated: LensModel | None) -> list[float]:
-        """The coefficients that have a key each, as k1 or d0.
-
-        Raises:
-            FileError: if the model is open.
-        """
+        """The coefficients that have a key each, as k1 or d0."""
         plain = {f"{part}{i}" for part in ("d", "camd") for i in range(8)} & self._keys.keys()
         if plain:
             return [self._number(self._keys[name]) for name in sorted(plain)]

@@ -175,11 +175,7 @@ def read_rig_parts(
 def _read_all(
     files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
 ) -> list[Part]:
-    """The parts, of which one has a lens at least.
-
-    Raises:
-        CalibrationError: if a file is malformed, or none has a lens.
-    """
+    """The parts, of which one has a lens at least."""
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
     lenses = sorted({name for part in read for name in part.lenses})
@@ -211,11 +207,7 @@ def _merged(
     what: str,
     is_same: Callable[[Value, Value], bool],
 ) -> dict[str, Value]:
-    """What the parts hold, by camera.
-
-    Raises:
-        FileError: if two parts differ.
-    """
+    """What the parts hold, by camera."""
     merged: dict[str, Value] = {}
     for part in parts:
         for name, value in select(part).items():
@@ -275,11 +267,7 @@ def _camera(
     size_px: tuple[int, int] | None,
     parts: RigParts,
 ) -> dict[str, Any]:
-    """The content of a rig file for a camera.
-
-    Raises:
-        RigError: if the image size or the extrinsic is missing.
-    """
+    """The content of a rig file for a camera."""
     size = lens.size_px or size_px
     if size is None:
         raise RigError(

@@ -156,11 +156,7 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
 
 
 def _link(stamped: _Stamped) -> FrameLink:
-    """The frame of a message.
-
-    Raises:
-        ValueError: if its numbers are no transform.
-    """
+    """The frame of a message."""
     t, q = stamped.transform.translation, stamped.transform.rotation
     if not np.isfinite([t.x, t.y, t.z]).all():
         raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")

@@ -184,11 +184,7 @@ def _add_changes(router: APIRouter, workspace: Workspace) -> None:
 
 
 def _pair(workspace: Workspace, body: NewPair) -> Pair:
-    """The pair that is to be added.
-
-    Raises:
-        Problem: if there is no such point.
-    """
+    """The pair that is to be added."""
     workspace.camera(body.camera, estimated=False)
     cloud = workspace.cloud(body.frame)
     if body.point_index >= len(cloud):
@@ -204,11 +200,7 @@ def _with(session: Session, pairs: Sequence[Pair]) -> Session:
 
 
 def _pairs_with(session: Session, place: int) -> list[Pair]:
-    """The pairs of a session that has this place.
-
-    Raises:
-        Problem: if it has not.
-    """
+    """The pairs of a session that has this place."""
     if place >= len(session.pairs):
         raise Problem(404, f"the session has {len(session.pairs)} pairs")
     return list(session.pairs)
