@@ -49,11 +49,7 @@ class ChildProcess:
         self._is_closed = False
 
     def start(self) -> None:
-        """Start the process unless it runs, and wait until it is ready.
-
-        Raises:
-            ChildEndedError: if it cannot be started.
-        """
+        """Start the process unless it runs, and wait until it is ready."""
         try:
             self._start()
         except (OSError, EOFError) as error:

@@ -79,11 +79,7 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
 
 
 def require_place_for_folder(folder: Path) -> None:
-    """Check, before hours of work, that a folder exists or can be created.
-
-    Raises:
-        FileError: if it or a parent is a file, or not writable.
-    """
+    """Check, before hours of work, that a folder exists or can be created."""
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():
             raise FileError(part, "is a file, expected a folder to write into; choose another")
@@ -175,11 +171,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file.
-
-    Raises:
-        FileError: if it is missing, or not UTF-8.
-    """
+    """Read a text file."""
     try:
         return require_file(path).read_text("utf-8")
     except UnicodeDecodeError as error:

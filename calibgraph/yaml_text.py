@@ -28,11 +28,7 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
 
 
 def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
-    """The mappings in the text of a YAML file, between lines ``---``; without empty ones.
-
-    Raises:
-        FileError: as of :func:`parse_yaml`.
-    """
+    """The mappings in the text of a YAML file, between lines ``---``; without empty ones."""
     separators = sum(map(text.count, _SEPARATORS))
     if separators > MAX_YAML_VALUES:
         why = f"holds some {separators} values, expected up to {MAX_YAML_VALUES}; is it a table?"

@@ -214,11 +214,7 @@ def parse_file(text: str) -> tuple[str, Path]:
 
 
 def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
-    """The pairs of a repeated option A=B.
-
-    Raises:
-        ValueError: if there is no ``=``, or one A twice.
-    """
+    """The pairs of a repeated option A=B."""
     for text in texts or ():
         if "=" not in text:
             raise ValueError(f"{option} {text!r}: give two names with = between them")
@@ -230,11 +226,7 @@ def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height.
-
-    Raises:
-        ValueError: if they are not.
-    """
+    """Width and height."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise ValueError(f"--size {text!r}: give WIDTHxHEIGHT, as 1920x1200")

@@ -28,11 +28,7 @@ Inputs = Mapping[str, Sequence[Path]]
 
 
 def require_known(command: str | None) -> None:
-    """Check that a command can be carried out by a server.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that a command can be carried out by a server."""
     from calibgraph.errors import CalibrationError
 
     if SERVER.get() is not None and command not in COMMANDS:

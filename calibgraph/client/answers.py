@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+
+import httpx
 
 from calibgraph.errors import CalibrationError
 
@@ -76,22 +79,36 @@ def job_of(answer: Mapping[str, Any]) -> RemoteJob:
     )
 
 
-def refusal(url: str, status: int, body: bytes, retry_after: str | None) -> ServerError:
-    """The error of an answer that is none of success."""
+@contextmanager
+def reached(url: str) -> Iterator[None]:
+    """Turn the errors of a connection into :class:`ServerError`."""
     try:
-        detail = str(json.loads(body)["detail"])
+        yield
+    except httpx.HTTPError as error:
+        raise ServerError(f"{url}: does not answer ({error})") from error
+
+
+def require_accepted(url: str, answer: httpx.Response) -> None:
+    """Check that a server did not refuse; its answer has been read."""
+    if answer.is_success:
+        return
+    try:
+        detail = str(answer.json()["detail"])
     except (ValueError, KeyError, TypeError):
-        detail = body[:200].decode(errors="replace") or "no more is known"
-    seconds = float(retry_after) if retry_after and retry_after.isdecimal() else None
-    return ServerError(f"{url}: {detail}", status, seconds)
+        detail = answer.content[:200].decode(errors="replace") or "no more is known"
+    retry_after = answer.headers.get("retry-after", "")
+    seconds = float(retry_after) if retry_after.isdecimal() else None
+    raise ServerError(f"{url}: {detail}", answer.status_code, seconds)
+
+
+def job_in_event(line: str) -> Iterator[RemoteJob]:
+    """The job in a line of server-sent events, if it holds one."""
+    if line.startswith("data: "):
+        yield job_of(json.loads(line.removeprefix("data: ")))
 
 
 def require_success(job: RemoteJob) -> RemoteJob:
-    """The job, if it has a result.
-
-    Raises:
-        CalibrationError: if it failed or was cancelled.
-    """
+    """The job, if it has a result."""
     if job.state == "succeeded":
         return job
     raise CalibrationError(job.error or f"the job was {job.state}")

@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import httpx
 
-from calibgraph.client.answers import RemoteJob, ServerError, job_of, refusal, require_success
-from calibgraph.client.client import TIMEOUT, headers_of, lines_of, path_of, unpack
+from calibgraph.client.answers import (
+    RemoteJob,
+    job_in_event,
+    job_of,
+    reached,
+    require_accepted,
+    require_success,
+)
+from calibgraph.client.client import LINES, TIMEOUT, headers_of, lines_of, path_of, unpack
 from calibgraph.client.inputs import Source, form_of
 
 
@@ -48,23 +55,13 @@ class AsyncClient:
 
     async def follow(self, id: str) -> AsyncIterator[RemoteJob]:
         """The job now, on every change, and when it is finished."""
-        try:
-            async with self._http.stream("GET", f"/v1/jobs/{id}/events") as answer:
-                if answer.is_error:
-                    await answer.aread()
-                    self._raise_for(answer)
-                async for line in answer.aiter_lines():
-                    if line.startswith("data: "):
-                        yield job_of(json.loads(line.removeprefix("data: ")))
-        except httpx.HTTPError as error:
-            raise ServerError(f"{self._url}: does not answer ({error})") from error
+        async with self._stream(f"/v1/jobs/{id}/events") as answer:
+            async for line in answer.aiter_lines():
+                for job in job_in_event(line):
+                    yield job
 
     async def wait(self, id: str) -> RemoteJob:
-        """A job, once it has a result.
-
-        Raises:
-            CalibrationError: if it failed or was cancelled.
-        """
+        """A job, once it has a result."""
         while not (job := await self.job(id, wait_s=20.0)).is_finished:
             pass
         return require_success(job)
@@ -81,15 +78,9 @@ class AsyncClient:
     async def download(self, id: str, folder: Path) -> list[Path]:
         """Write the files of a result into a folder; their paths."""
         with tempfile.TemporaryFile() as file:
-            try:
-                async with self._http.stream("GET", f"/v1/jobs/{id}/files.zip") as answer:
-                    if answer.is_error:
-                        await answer.aread()
-                        self._raise_for(answer)
-                    async for chunk in answer.aiter_bytes():
-                        file.write(chunk)
-            except httpx.HTTPError as error:
-                raise ServerError(f"{self._url}: does not answer ({error})") from error
+            async with self._stream(f"/v1/jobs/{id}/files.zip") as answer:
+                async for chunk in answer.aiter_bytes():
+                    file.write(chunk)
             return unpack(file, folder)
 
     async def create_tracker(
@@ -100,10 +91,7 @@ class AsyncClient:
         return str((await self._json("POST", "/v1/trackers", json=body))["id"])
 
     async def add_frames(
-        self,
-        tracker: str,
-        frames: Iterable[Mapping[str, Any]] | bytes,
-        media: str = "application/x-ndjson",
+        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = LINES
     ) -> dict[str, Any]:
         """Take in frames: mappings as ``track`` reads them, or a body with its media type."""
         content = frames if isinstance(frames, bytes) else lines_of(frames)
@@ -118,25 +106,22 @@ class AsyncClient:
         return found
 
     async def _json(self, method: str, path: str, **options: Any) -> Any:
-        try:
+        with reached(self._url):
             answer = await self._http.request(method, path, **options)
-        except httpx.HTTPError as error:
-            raise ServerError(f"{self._url}: does not answer ({error})") from error
-        self._raise_for(answer)
+        require_accepted(self._url, answer)
         return answer.json()
 
-    def _raise_for(self, answer: httpx.Response) -> None:
-        if not answer.is_success:
-            retry_after = answer.headers.get("retry-after")
-            raise refusal(self._url, answer.status_code, answer.content, retry_after)
+    @asynccontextmanager
+    async def _stream(self, path: str) -> AsyncIterator[httpx.Response]:
+        with reached(self._url):
+            async with self._http.stream("GET", path) as answer:
+                if answer.is_error:
+                    await answer.aread()
+                require_accepted(self._url, answer)
+                yield answer
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._http.aclose()

@@ -7,13 +7,21 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import httpx
 
-from calibgraph.client.answers import RemoteJob, ServerError, job_of, refusal, require_success
+from calibgraph.client.answers import (
+    RemoteJob,
+    ServerError,
+    job_in_event,
+    job_of,
+    reached,
+    require_accepted,
+    require_success,
+)
 from calibgraph.client.inputs import Source, form_of
 from calibgraph.progress import Progress, no_progress
 
@@ -22,14 +30,13 @@ TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
 
 TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
 _PATHS = {"calibration": "calibrations", "solve": "solves", "check": "checks"}
-_LINES = "application/x-ndjson"
+LINES = "application/x-ndjson"
 
 
-def headers_of(token: str | None, key: str | None = None) -> dict[str, str]:
-    """The headers of a request."""
+def headers_of(token: str | None) -> dict[str, str]:
+    """The headers of all requests."""
     given = token or os.environ.get(TOKEN_VARIABLE)
-    headers = {} if given is None else {"Authorization": f"Bearer {given}"}
-    return headers if key is None else {**headers, "Idempotency-Key": key}
+    return {} if given is None else {"Authorization": f"Bearer {given}"}
 
 
 def path_of(kind: str) -> str:
@@ -68,8 +75,8 @@ class Client:
             inputs: paths, which are sent, or URIs, which the server reads: ``rig``,
                 ``correspondences``, ``recording``.
             settings: of the kind.
-            name: for people, shown in the list of jobs.
-            note: for people, shown with the job.
+            name: for people, shown with the job.
+            note: likewise.
             key: a repeated request with it gives the job of the first.
         """
         texts = {"settings": json.dumps(dict(settings or {})), "name": name, "note": note}
@@ -88,21 +95,12 @@ class Client:
 
     def follow(self, id: str) -> Iterator[RemoteJob]:
         """The job now, on every change, and when it is finished."""
-        try:
-            with self._http.stream("GET", f"/v1/jobs/{id}/events") as answer:
-                if answer.is_error:
-                    answer.read()
-                    self._raise_for(answer)
-                yield from map(job_of, events(answer.iter_lines()))
-        except httpx.HTTPError as error:
-            raise ServerError(f"{self._url}: does not answer ({error})") from error
+        with self._stream(f"/v1/jobs/{id}/events") as answer:
+            for line in answer.iter_lines():
+                yield from job_in_event(line)
 
     def wait(self, id: str, progress: Progress | None = None) -> RemoteJob:
-        """A job, once it has a result.
-
-        Raises:
-            CalibrationError: if it failed or was cancelled.
-        """
+        """A job, once it has a result."""
         report = progress or no_progress
         while True:
             for job in self.follow(id):
@@ -122,15 +120,9 @@ class Client:
     def download(self, id: str, folder: Path) -> list[Path]:
         """Write the files of a result into a folder; their paths."""
         with tempfile.TemporaryFile() as file:
-            try:
-                with self._http.stream("GET", f"/v1/jobs/{id}/files.zip") as answer:
-                    if answer.is_error:
-                        answer.read()
-                        self._raise_for(answer)
-                    for chunk in answer.iter_bytes():
-                        file.write(chunk)
-            except httpx.HTTPError as error:
-                raise ServerError(f"{self._url}: does not answer ({error})") from error
+            with self._stream(f"/v1/jobs/{id}/files.zip") as answer:
+                for chunk in answer.iter_bytes():
+                    file.write(chunk)
             return unpack(file, folder)
 
     def create_tracker(
@@ -141,7 +133,7 @@ class Client:
         return str(self._json("POST", "/v1/trackers", json=body)["id"])
 
     def add_frames(
-        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = _LINES
+        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = LINES
     ) -> dict[str, Any]:
         """Take in frames: mappings as ``track`` reads them, or a body with its media type."""
         content = frames if isinstance(frames, bytes) else lines_of(frames)
@@ -156,17 +148,18 @@ class Client:
         return found
 
     def _json(self, method: str, path: str, **options: Any) -> Any:
-        try:
+        with reached(self._url):
             answer = self._http.request(method, path, **options)
-        except httpx.HTTPError as error:
-            raise ServerError(f"{self._url}: does not answer ({error})") from error
-        self._raise_for(answer)
+        require_accepted(self._url, answer)
         return answer.json()
 
-    def _raise_for(self, answer: httpx.Response) -> None:
-        if not answer.is_success:
-            retry_after = answer.headers.get("retry-after")
-            raise refusal(self._url, answer.status_code, answer.content, retry_after)
+    @contextmanager
+    def _stream(self, path: str) -> Iterator[httpx.Response]:
+        with reached(self._url), self._http.stream("GET", path) as answer:
+            if answer.is_error:
+                answer.read()
+            require_accepted(self._url, answer)
+            yield answer
 
     def close(self) -> None:
         """Close the connections."""
@@ -175,12 +168,7 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -189,19 +177,8 @@ def lines_of(frames: Iterable[Mapping[str, Any]]) -> bytes:
     return b"".join(json.dumps(frame).encode() + b"\n" for frame in frames)
 
 
-def events(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The content of server-sent events."""
-    for line in lines:
-        if line.startswith("data: "):
-            yield json.loads(line.removeprefix("data: "))
-
-
 def unpack(file: Any, folder: Path) -> list[Path]:
-    """Write the files of a result's archive into a folder.
-
-    Raises:
-        ServerError: if it holds anything else.
-    """
+    """Write the files of a result's archive into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     file.seek(0)
     with zipfile.ZipFile(file) as archive:

@@ -37,9 +37,6 @@ def form_of(
     Args:
         inputs: by name: ``rig``, ``correspondences``, ``recording``.
         texts: by name: ``settings`` as JSON, ``name``, ``note``.
-
-    Raises:
-        FileError: if one cannot be read.
     """
     with ExitStack() as stack:
         fields: list[Field] = [(name, (None, text)) for name, text in texts.items()]
@@ -73,11 +70,7 @@ def _archive(folder: Path) -> Iterator[IO[bytes]]:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files of a dataset folder, a KITTI sequence or a ROS 2 bag.
-
-    Raises:
-        FileError: if there are none.
-    """
+    """The files of a dataset folder, a KITTI sequence or a ROS 2 bag."""
     layout = folder_layout(folder)
     found = [folder / name for name in _BESIDE if (folder / name).is_file()]
     for part in (layout.clouds, *layout.images.values()):

@@ -92,11 +92,7 @@ class Job:
         return is_table(self.recordings[0])
 
     def input_hash(self) -> str:
-        """SHA-256 of the rig, the settings and the recordings.
-
-        Raises:
-            FileNotFoundError: if one is not there.
-        """
+        """SHA-256 of the rig, the settings and the recordings."""
         parts = [fingerprint(uri) for uri in (*self.recordings, *([self.rig] if self.rig else []))]
         text = json.dumps([self.settings.model_dump(), len(self.recordings), *parts])
         return hashlib.sha256(text.encode()).hexdigest()
@@ -116,9 +112,6 @@ def load_manifest(uri: str) -> Manifest:
 
     Args:
         uri: of a file. Relative paths in it start at its folder.
-
-    Raises:
-        FileError: if it is missing, or a row of it is wrong.
     """
     table = _read(uri)
     for name, count in Counter(table.column_names).items():

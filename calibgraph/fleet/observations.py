@@ -141,11 +141,7 @@ def words(rows: pa.Table, name: str) -> Words:
 
 
 def days(rows: pa.Table) -> Array:
-    """(n,) the column ``date`` in days since 1970; NaN where there is none.
-
-    Raises:
-        CalibrationError: if it holds what is no date.
-    """
+    """(n,) the column ``date`` in days since 1970; NaN where there is none."""
     if "date" not in rows.column_names:
         return np.full(len(rows), np.nan)
     try:

@@ -24,9 +24,6 @@ def expected_pose(mount: Mount, pooled: Pooled, batch: str | None = None) -> tup
     Returns:
         (4, 4) T_camera_lidar; (6, 6) covariance of xi in T_camera_lidar = exp(xi) that, which
         holds the spread of vehicles and batches and the uncertainty of the nominal pose.
-
-    Raises:
-        ValueError: if the batch has no vehicle.
     """
     centers = mount.centers
     if batch is None:

@@ -89,9 +89,6 @@ def fingerprint(uri: str) -> str:
 
     Of the contents of local files; of the ETag, size and time of remote ones, which needs one
     listing and no byte of them.
-
-    Raises:
-        FileNotFoundError: if nothing is there.
     """
     filesystem, path = locate(uri)
     digest = hashlib.sha256()
@@ -123,11 +120,7 @@ def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
-    """The local path of a URI; remote data are copied into a folder, up to so many bytes.
-
-    Raises:
-        FileError: if there are more bytes than these.
-    """
+    """The local path of a URI; remote data are copied into a folder, up to so many bytes."""
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)

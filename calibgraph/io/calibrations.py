@@ -234,9 +234,6 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
 
     Returns:
         None if the file is no result.
-
-    Raises:
-        FileError: if it is a malformed one.
     """
     if not is_calibration_file(path):
         return None

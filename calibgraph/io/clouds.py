@@ -65,11 +65,7 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
 
 
 def read_cloud(path: Path) -> RawCloud:
-    """All points of a file, and the names of its fields.
-
-    Raises:
-        FileError: if the file is missing, truncated, or of another format.
-    """
+    """All points of a file, and the names of its fields."""
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
@@ -78,11 +74,7 @@ def read_cloud(path: Path) -> RawCloud:
 
 
 def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.float32]:
-    """The rows of a cloud (n, 4) with a return.
-
-    Raises:
-        FileError: if there is no point, or one is not finite.
-    """
+    """The rows of a cloud (n, 4) with a return."""
     xyz, (x, y, z) = cloud[:, :3], cloud[:, :3].T
     measured = ~(np.isnan(x) & np.isnan(y) & np.isnan(z))
     if not measured.any():
@@ -128,11 +120,7 @@ def _read_npy(path: Path) -> RawCloud:
 
 
 def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
-    """The cloud in an array, (n, 3) or (n, 4+) or of named fields.
-
-    Raises:
-        FileError: if it has another shape or type.
-    """
+    """The cloud in an array, (n, 3) or (n, 4+) or of named fields."""
     if array.dtype.names:
         numbers = [name for name in array.dtype.names if array.dtype[name].kind in "fiu"]
         return raw_cloud(path, numbers, lambda name: array[name].ravel())

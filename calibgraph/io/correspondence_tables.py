@@ -48,11 +48,7 @@ def load_correspondences(path: Path | str) -> Correspondences:
 
 
 def table_files(table: Path) -> list[Path]:
-    """The files of a table: itself, or the Parquet files of a folder, by name.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """The files of a table: itself, or the Parquet files of a folder, by name."""
     if not table.is_dir():
         return [require_file(table)]
     paths = sorted(table.rglob("*.parquet"))
@@ -121,11 +117,7 @@ def _arrow_parts(path: Path) -> Iterator[pa.Table]:
 
 
 def read_arrow(path: Path) -> pa.Table:
-    """A whole Parquet or CSV file, with any columns.
-
-    Raises:
-        FileError: if it cannot be read.
-    """
+    """A whole Parquet or CSV file, with any columns."""
     import pyarrow as pa
     from pyarrow import csv
 
@@ -162,21 +154,13 @@ def arrow_reads(path: Path) -> Iterator[None]:
 
 
 def require_rows(path: Path, rows: int) -> None:
-    """Check that a file has rows.
-
-    Raises:
-        FileError: if not.
-    """
+    """Check that a file has rows."""
     if not rows:
         raise FileError(path, "holds no rows; write the correspondences into it")
 
 
 def from_arrow(table: pa.Table) -> Correspondences:
-    """Build correspondences from an Arrow table that has the file format's columns.
-
-    Raises:
-        CorrespondenceError: if a column, a value or the metadata is wrong.
-    """
+    """Build correspondences from an Arrow table that has the file format's columns."""
     import pyarrow as pa
 
     check_schema(table.schema)

@@ -69,9 +69,6 @@ class Dataset:
 
         Args:
             frames: ``start:stop:step`` as in Python, or positions separated by commas.
-
-        Raises:
-            ValueError: if the text is neither, or selects nothing.
         """
         try:
             kept = [self.frames[i] for i in _indices(frames, len(self.frames))]

@@ -51,9 +51,6 @@ def frames_of_folder(
         folder: a dataset folder, a KITTI odometry sequence, or one of a published data set.
         cameras: the rig's.
         complete: whether every cloud must have an image of every camera, and every image a cloud.
-
-    Raises:
-        FileError, DatasetError: if a folder is missing or empty, or frames do not pair up.
     """
     published = published_format(folder)
     if published is not None:

@@ -15,21 +15,13 @@ from calibgraph.files import require_file
 
 
 def feather_columns(path: Path) -> tuple[str, ...]:
-    """The names of all columns of a file.
-
-    Raises:
-        FileError: if it cannot be read.
-    """
+    """The names of all columns of a file."""
     with _damage_named(path):
         return tuple(_read_table(path).column_names)
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Columns of a file, as arrays of one length.
-
-    Raises:
-        FileError: if it cannot be read, a column is missing, or a value is.
-    """
+    """Columns of a file, as arrays of one length."""
     with _damage_named(path):
         table = _read_table(path)
         for name in columns:

@@ -128,11 +128,7 @@ class MovingFrame(Frame):
 
 
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
-    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was.
-
-    Raises:
-        FileError, DatasetError: if it cannot be read.
-    """
+    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
     motion = entry.get(_MOTION)
     return load_cloud(entry["cloud"], None if motion is None else ScanMotion.of_entry(motion))
 

@@ -22,11 +22,7 @@ class FrameFiles:
 
 
 def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """Files of a folder with one of the suffixes, by stem, in order.
-
-    Raises:
-        FileError: if there is no such folder or file, or two have the same stem.
-    """
+    """Files of a folder with one of the suffixes, by stem, in order."""
     kinds = ", ".join(suffixes)
     if not folder.is_dir():
         beside = ", ".join(sorted(path.name for path in folder.parent.glob("*/"))) or "none"

@@ -63,11 +63,7 @@ def _require_size(path: Path, found: tuple[int, int], camera: Camera) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the header.
-
-    Raises:
-        FileError: if the image is missing, or its header damaged.
-    """
+    """Width and height in pixels, from the header."""
     return _read(path)[1].size
 
 

@@ -25,11 +25,7 @@ class RigRead(NamedTuple):
 def rig_of_complete(
     lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
 ) -> RigRead:
-    """The rig of the cameras that have all parts.
-
-    Raises:
-        FileError: if a camera is malformed, or none is complete.
-    """
+    """The rig of the cameras that have all parts."""
     cameras: dict[str, Camera] = {}
     missing: dict[str, IncompleteCamera] = {}
     for name in names:

@@ -35,9 +35,6 @@ def read_kitti_rig(sequence: Path) -> RigRead:
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
     translate(K^-1 P_k[:, 3]) Tr.
-
-    Raises:
-        FileError: if ``calib.txt`` is malformed or there is no image.
     """
     path = require_file(sequence / CALIBRATION_NAME)
     matrices = _read_matrices(path)
@@ -68,9 +65,6 @@ def camera_of_projection(
         T_rectified_lidar: (4, 4) to that frame.
         size_px: width and height.
         where: the file and its line, for errors.
-
-    Raises:
-        FileError: if P is no such matrix, or the transform is none.
     """
     K = P[:, :3]
     intrinsics = intrinsics_of_matrix(K, where)
@@ -103,11 +97,7 @@ def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def first_image_size(folder: Path) -> tuple[int, int]:
-    """Width and height of the first image of a folder.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """Width and height of the first image of a folder."""
     images = sorted(folder.glob("*.png"))
     if not images:
         raise IncompleteCamera(folder, "holds no .png image")

@@ -38,9 +38,6 @@ def read_kitti_object_rig(folder: Path) -> RigRead:
 
     Camera k projects by P_k R0_rect Tr_velo_to_cam, so T_camera_lidar is
     translate(K^-1 P_k[:, 3]) R0_rect Tr_velo_to_cam.
-
-    Raises:
-        FileError: if a file is missing or malformed.
     """
     stem = _stems(folder)[0]
     path = folder / _CALIBRATIONS / f"{stem}.txt"
@@ -59,11 +56,7 @@ def read_kitti_object_rig(folder: Path) -> RigRead:
 
 
 def kitti_object_frames(folder: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The frames of the calibration that most have, in order.
-
-    Raises:
-        FileError: if a file is missing.
-    """
+    """The frames of the calibration that most have, in order."""
     clouds = files_by_stem(folder / CLOUD_FOLDER, (".bin",))
     folders = camera_folders(folder)
     images = {

@@ -35,11 +35,7 @@ def kitti_raw_folders(drive: Path) -> tuple[Path, dict[str, Path]]:
 
 
 def kitti_raw_frames(drive: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The frames of a drive, in order.
-
-    Raises:
-        FileError: if a folder is missing or empty.
-    """
+    """The frames of a drive, in order."""
     scans, folders = kitti_raw_folders(drive)
     clouds = files_by_stem(scans, (".bin",))
     images = {
@@ -57,9 +53,6 @@ def read_kitti_raw_rig(drive: Path) -> RigRead:
 
     Camera k projects by P_rect_0k R_rect_00 [R | T], so T_camera_lidar is
     translate(K^-1 P[:, 3]) R_rect_00 [R | T].
-
-    Raises:
-        FileError: if a file is missing or malformed, or images are not rectified.
     """
     cameras, lidar = (_read(drive, name) for name in (_CAMERAS, _LIDAR))
     T_camera0_lidar, rectify = np.eye(4), np.eye(4)

@@ -54,11 +54,7 @@ class CameraLens:
 
 
 def lens_model(name: str, where: Path | str) -> LensModel:
-    """The model here of a name in a file of others.
-
-    Raises:
-        FileError: if calibgraph has no such lens.
-    """
+    """The model here of a name in a file of others."""
     found = find_lens_model(name)
     if found is None:
         raise FileError(
@@ -74,9 +70,6 @@ def stated_model(content: Mapping[str, Any], where: Path | str) -> LensModel | N
 
     A pinhole with the distortion of a fisheye is a fisheye, as in Kalibr; an omnidirectional lens
     may have the distortion of a pinhole.
-
-    Raises:
-        FileError: if a name is none of ours, or two keys contradict each other.
     """
     named = {str(key): _model_name(str(key), value) for key, value in content.items()}
     kept = {key: name for key, name in named.items() if name}
@@ -147,11 +140,7 @@ def fitted_coefficients(
 def listed_coefficients(
     values: Sequence[float], model: LensModel, path: Path | str
 ) -> tuple[float, ...]:
-    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does.
-
-    Raises:
-        FileError: if there are more or fewer than the model has.
-    """
+    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does."""
     fewest = min((count for count in COEFFICIENTS[model] if count), default=0)
     if 0 < len(values) < fewest:
         raise FileError(

@@ -37,11 +37,7 @@ def is_nuscenes(path: Path | str) -> bool:
 
 
 def read_nuscenes_rig(path: Path) -> RigRead:
-    """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted.
-
-    Raises:
-        FileError, DatasetError: if a table is malformed, or the scenes are of several rigs.
-    """
+    """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted."""
     tables = read_tables(path)
     instants = [each for each in tables.instants if LIDAR in each.taken]
     if not instants:
@@ -90,11 +86,7 @@ def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> Non
 
 
 def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The samples, in order of time; their stems are their stamps.
-
-    Raises:
-        FileError: if a table is malformed, or there is no scan.
-    """
+    """The samples, in order of time; their stems are their stamps."""
     tables = read_tables(path)
     root = tables.folder.parent
     frames = [
@@ -112,11 +104,7 @@ def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
 
 
 def describe_motion(path: Path) -> str:
-    """How far the vehicle moves between scans and images, in a line; empty without ego_pose.
-
-    Raises:
-        FileError: if a table is malformed.
-    """
+    """How far the vehicle moves between scans and images, in a line; empty without ego_pose."""
     tables = read_tables(path)
     poses = read_ego_poses(tables)
     if not poses:

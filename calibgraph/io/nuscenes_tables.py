@@ -43,11 +43,7 @@ class Pose(_Record):
     rotation: tuple[Finite, Finite, Finite, Finite]  # w x y z
 
     def matrix(self, where: Path) -> Array:
-        """(4, 4), from the sensor's or ego's coordinates.
-
-        Raises:
-            FileError: if the quaternion has not the length 1.
-        """
+        """(4, 4), from the sensor's or ego's coordinates."""
         w, x, y, z = self.rotation
         try:
             return pose_of_quaternion(self.translation, (x, y, z, w))
@@ -133,11 +129,7 @@ def find_tables(path: Path) -> tuple[Path, str | None] | None:
 
 
 def read_tables(path: Path) -> Tables:
-    """The samples of a nuScenes folder or scene.
-
-    Raises:
-        FileError: if a table is missing or malformed, or there is no such scene.
-    """
+    """The samples of a nuScenes folder or scene."""
     found = find_tables(path)
     if found is None:
         raise FileError(path, "no nuScenes tables; expected v1.0-*/sample_data.json")
@@ -190,11 +182,7 @@ def describe_no_scan(tables: Tables) -> str:
 
 
 def read_ego_poses(tables: Tables) -> dict[str, Array] | None:
-    """(4, 4) T_world_ego by token, of the samples' images and scans; None without the table.
-
-    Raises:
-        FileError: if it is malformed.
-    """
+    """(4, 4) T_world_ego by token, of the samples' images and scans; None without the table."""
     path = tables.folder / "ego_pose.json"
     if not path.is_file():
         return None

@@ -57,9 +57,6 @@ def read_pcd(path: Path) -> RawCloud:
     Fields may be of any type and count; those named ``_`` are padding. ``VIEWPOINT`` is the pose of
     the sensor in the world when it recorded the cloud. It is not applied, as PCL does not either:
     points of one sensor stay in its frame.
-
-    Raises:
-        FileError: if the file is malformed, truncated, or has no one x, y and z.
     """
     data = path.read_bytes()
     end = _DATA.search(data[:_HEADER_BYTES])

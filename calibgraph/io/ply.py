@@ -67,11 +67,7 @@ class _Element:
 
 
 def read_ply(path: Path) -> RawCloud:
-    """The vertices of a file.
-
-    Raises:
-        FileError: if the file is malformed, truncated, or its vertices have no one x, y and z.
-    """
+    """The vertices of a file."""
     data = path.read_bytes()
     end = _END.search(data[:_HEADER_BYTES])
     if end is None or not data.startswith(b"ply"):

@@ -39,11 +39,7 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
 
 
 def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
-    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere.
-
-    Raises:
-        FileError, DatasetError: if there is none, or it is malformed.
-    """
+    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere."""
     path = rig_file(path)
     if is_bag(path):
         read = read_bag_rig(path, bag)
@@ -109,11 +105,7 @@ def _placeholders(content: object, key: str) -> Iterator[str]:
 
 
 def rig_file(path: Path | str) -> Path:
-    """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder.
-
-    Raises:
-        FileError: if there is no such path, or a folder holds none.
-    """
+    """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder."""
     found = find_rig_file(path)
     if found is None or not (found.exists() or published_format(found)):
         what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"

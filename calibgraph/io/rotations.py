@@ -29,11 +29,7 @@ def roll_pitch_yaw(T: Array) -> list[float]:
 
 
 def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
-    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits.
-
-    Raises:
-        ValueError: if the quaternion has another length.
-    """
+    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits."""
     length = math.hypot(*xyzw)
     if not abs(length - 1.0) <= ROUNDING:
         raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")

@@ -49,11 +49,7 @@ def pictures_of_video(video: Path, stems: Sequence[str]) -> dict[str, Path]:
 
 
 def load_picture(address: Path) -> NDArray[np.uint8]:
-    """(height, width, 3) the picture with this address, BGR.
-
-    Raises:
-        FileError: if it cannot be decoded, or is to be turned.
-    """
+    """(height, width, 3) the picture with this address, BGR."""
     video, number = address.parent, int(address.stem)
     times = _times(video)
     if number >= len(times):

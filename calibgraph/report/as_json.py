@@ -91,11 +91,7 @@ def print_line(text: str) -> None:
 
 
 def require_stdout() -> None:
-    """Check, before hours of work, that there is a standard output.
-
-    Raises:
-        FileError: if it is closed.
-    """
+    """Check, before hours of work, that there is a standard output."""
     if sys.stdout is None:
         raise FileError("standard output", "is closed; give what is printed somewhere to go")
 

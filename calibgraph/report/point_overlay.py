@@ -112,9 +112,6 @@ def write_image(path: Path, image: Image, *, command: str = "") -> None:
         path: of the file.
         image: (height, width, 3) BGR.
         command: which marks the picture as its own; empty for no mark.
-
-    Raises:
-        CalibrationError: if it cannot be encoded or written.
     """
     encoded, data = cv2.imencode(".png", image)
     if not encoded:

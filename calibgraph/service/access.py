@@ -73,11 +73,7 @@ class Caller:
 
 
 def load_tokens(path: Path) -> tuple[Token, ...]:
-    """The tokens of a file.
-
-    Raises:
-        FileError: if it is missing or malformed.
-    """
+    """The tokens of a file."""
     return checked_model(TokenFile, read_yaml(path), path).tokens
 
 
@@ -86,9 +82,6 @@ def add_token(path: Path, tenant: str, scope: Scope) -> str:
 
     Returns:
         The token, which is kept nowhere.
-
-    Raises:
-        FileError: if the file or an argument is malformed.
     """
     known = load_tokens(path) if path.exists() else ()
     secret = secrets.token_urlsafe(32)

@@ -92,11 +92,7 @@ class JobTable:
         self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
     def add(self, id: str, tenant: str, job: Job, digest: str, key: str | None) -> JobRecord:
-        """Add a job; it is durable when this returns. A known idempotency key returns its job.
-
-        Raises:
-            OtherRequestError: if the key was given with another request.
-        """
+        """Add a job; it is durable when this returns. A known idempotency key returns its job."""
         values = {
             "id": id, "tenant": tenant, "kind": job.kind, "state": "queued",
             "request": job.model_dump_json(), "digest": digest, "idempotency_key": key,
@@ -112,11 +108,7 @@ class JobTable:
             return known
 
     def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
-        """The job that a request with an idempotency key made before.
-
-        Raises:
-            OtherRequestError: if it has another digest than the one given.
-        """
+        """The job that a request with an idempotency key made before."""
         if key is None:
             return None
         where = (jobs.c.tenant == tenant) & (jobs.c.idempotency_key == key)

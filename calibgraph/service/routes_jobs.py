@@ -91,11 +91,7 @@ for _kind in KINDS:
 
 
 def find_job(state: Service, caller: Reader, id: str) -> JobRecord:
-    """The job of an id.
-
-    Raises:
-        Problem: if there is none that the caller sees.
-    """
+    """The job of an id."""
     record = state.jobs.get(id, caller)
     if record is None:
         raise Problem(404, "no such job; finished jobs are removed after some time")

@@ -65,10 +65,6 @@ async def openapi(request: Request, state: State, credentials: Credentials) -> d
 
 
 def require_docs(state: Service) -> None:
-    """Check that this server describes its API.
-
-    Raises:
-        Problem: if not.
-    """
+    """Check that this server describes its API."""
     if state.settings.api_docs == "off":
         raise Problem(404, "this server does not describe its API; see calibgraph serve --api-docs")

@@ -112,11 +112,7 @@ def tracker_answer(record: TrackerRecord) -> TrackerAnswer:
 
 
 def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
-    """The tracker of an id.
-
-    Raises:
-        Problem: if there is none that the caller sees.
-    """
+    """The tracker of an id."""
     record = state.tracker_table.get(id, caller)
     if record is None:
         raise Problem(404, "no such tracker")

@@ -37,11 +37,7 @@ class Address:
 
 
 def require_safe(address: Address, *, has_tokens: bool) -> None:
-    """Check that a server without tokens is for this machine alone.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that a server without tokens is for this machine alone."""
     if not has_tokens and not _is_loopback(address.host):
         raise CalibrationError(
             f"--host {address.host}: others could call; give --tokens FILE (see calibgraph token), "
@@ -76,11 +72,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def serve(app: FastAPI, address: Address, announce: Callable[[str], None] | None = None) -> None:
-    """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens.
-
-    Raises:
-        CalibrationError: if the address cannot be used.
-    """
+    """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens."""
     service: Service = app.state.service
     require_safe(address, has_tokens=service.settings.tokens is not None)
     _allow_many_connections()

@@ -188,11 +188,7 @@ def _keep(
 
 
 def parse_json(body: bytes) -> Any:
-    """The content of a JSON body.
-
-    Raises:
-        Problem: if it is none.
-    """
+    """The content of a JSON body."""
     try:
         return json.loads(body)
     except RecursionError:

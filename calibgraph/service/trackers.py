@@ -46,11 +46,7 @@ class _Host:
         self._thread.start()
 
     def ask(self, tenant: str, request: TrackerRequest) -> Future[Any]:
-        """The answer, when it has come.
-
-        Raises:
-            Problem: if too much of the tenant waits already.
-        """
+        """The answer, when it has come."""
         asked = _Asked(request, Future())
         with self._changed:
             if self._is_closed:

@@ -57,11 +57,7 @@ class BagFrames:
 
 
 def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> BagFrames:
-    """Pair the clouds of a bag with its images, without keeping any of them.
-
-    Raises:
-        FileError, DatasetError: if the bag is damaged, a topic is missing, or nothing pairs.
-    """
+    """Pair the clouds of a bag with its images, without keeping any of them."""
     bag = Bag(path)
     topics = choose_topics(bag, options.topics, cameras)
     images = {name: each.image for name, each in topics.cameras.items()}

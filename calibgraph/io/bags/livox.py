@@ -31,9 +31,6 @@ def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
         data: the serialized message.
         types: message classes by name, of rosbags' type store.
         ros1: whether it is serialized as in ROS 1, else as CDR, which aligns numbers.
-
-    Raises:
-        ValueError: if there are fewer bytes than points.
     """
     big_endian = not ros1 and data[1] == 0
     order = ">" if big_endian else "<"

@@ -80,11 +80,7 @@ class Bag:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """The messages recorded from ``start_ns`` to before ``stop_ns``, in that order, lazily.
-
-        Raises:
-            FileError: if the bag is damaged.
-        """
+        """The messages recorded from ``start_ns`` to before ``stop_ns``, in that order, lazily."""
         last: dict[str, tuple[int, int]] = {}
         with errors_in_one_line(self.path):
             for topic, record_ns, data in self._recording.messages(topics, start_ns, stop_ns):
@@ -94,21 +90,13 @@ class Bag:
                 yield Message(topic, record_ns, last[topic][1], content)
 
     def first(self, topic: str) -> Any:
-        """The content of a topic's first message.
-
-        Raises:
-            FileError: if there is none, or the bag is damaged.
-        """
+        """The content of a topic's first message."""
         for message in self.messages([topic]):
             return message.content
         raise FileError(self.path, f"has no message of {topic}; choose another topic")
 
     def read(self, topic: str, record_ns: int, number: int) -> tuple[bytes, Any]:
-        """The bytes and the content of one message; threads may call this at the same time.
-
-        Raises:
-            FileError: if there is none, or the bag is damaged.
-        """
+        """The bytes and the content of one message; threads may call this at the same time."""
         with self._lock, errors_in_one_line(self.path):
             found = self._recording.messages([topic], record_ns, record_ns + 1)
             data = [each for _, _, each in islice(found, number, number + 1)]
@@ -156,11 +144,7 @@ class Drive:
 
 
 def read_message(path: Path) -> tuple[bytes, Any]:
-    """The bytes and the content of the message with this address.
-
-    Raises:
-        FileError: if its bag or itself is missing, or the bag is damaged.
-    """
+    """The bytes and the content of the message with this address."""
     bag = next((parent for parent in path.parents if is_bag(parent)), None)
     if bag is None:
         raise FileError(path, "no such message: its bag is not there")

@@ -102,11 +102,7 @@ class BagRig:
 
 
 def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
-    """What a bag holds about its rig; extrinsics may be missing.
-
-    Raises:
-        FileError, DatasetError: if the bag is damaged, or a topic or a lens is missing.
-    """
+    """What a bag holds about its rig; extrinsics may be missing."""
     options = options or BagOptions()
     bag = Bag(path)
     drive = Drive(bag, options.beside)

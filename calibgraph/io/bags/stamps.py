@@ -64,11 +64,7 @@ def _to_ns(stamp: object) -> int:
 def read_stamps(
     bag: Bag, topics: Collection[str], windows: Iterable[tuple[int, int]], stamps: Stamps
 ) -> dict[str, TopicStamps]:
-    """The stamps of some topics within windows of recording time [ns], one after another.
-
-    Raises:
-        FileError, DatasetError: if the bag or a cloud is damaged.
-    """
+    """The stamps of some topics within windows of recording time [ns], one after another."""
     found = {topic: TopicStamps() for topic in topics}
     for start_ns, stop_ns in windows:
         for message in bag.messages(topics, start_ns, stop_ns):

@@ -62,11 +62,7 @@ class _Trajectory:
 
     @staticmethod
     def of(path: Path, poses: Iterator[tuple[int, Array]]) -> _Trajectory:
-        """Of stamps [ns] and poses in any order; of several with one stamp, the last.
-
-        Raises:
-            DatasetError: if there are less than two.
-        """
+        """Of stamps [ns] and poses in any order; of several with one stamp, the last."""
         by_stamp = dict(sorted(dict(poses).items()))
         if len(by_stamp) < 2:  # noqa: PLR2004
             raise DatasetError(f"{path}: has {len(by_stamp)} poses of the LiDAR; --motion needs "

@@ -77,11 +77,7 @@ def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
 
 
 def read_autoware(content: dict[str, Any], path: Path) -> Part:
-    """The frames of a sensor kit.
-
-    Raises:
-        FileError: if it is malformed.
-    """
+    """The frames of a sensor kit."""
     return Part(path, links=tuple(_link(*entry, path) for entry in _entries(content)))
 
 

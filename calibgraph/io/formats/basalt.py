@@ -35,11 +35,7 @@ def is_basalt(content: dict[str, Any]) -> bool:
 
 
 def read_basalt(content: dict[str, Any], path: Path) -> Part:
-    """The lenses cam0, cam1, ... and their frames in that of the IMU.
-
-    Raises:
-        FileError: if it is malformed, or a lens is none of ours.
-    """
+    """The lenses cam0, cam1, ... and their frames in that of the IMU."""
     found = checked_model(_Calibration, content["value0"], path)
     try:
         lenses, links = {}, []

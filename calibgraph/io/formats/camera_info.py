@@ -56,11 +56,7 @@ def is_camera_info(content: dict[str, Any]) -> bool:
 
 
 def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame.
-
-    Raises:
-        FileError: if it is malformed, or the lens is none of ours.
-    """
+    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
     message = checked_model(_Message, content, path)
     lens = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     size = (lens.content["width_px"], lens.content["height_px"])

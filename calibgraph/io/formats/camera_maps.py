@@ -65,11 +65,7 @@ _PROGRAMS = (
 
 
 def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -> Part | None:
-    """The cameras and transforms of a mapping; None if it holds none.
-
-    Raises:
-        FileError: if it is malformed, or a lens is none of ours.
-    """
+    """The cameras and transforms of a mapping; None if it holds none."""
     maps = [_Map(keys, ": ".join([str(path), *keys]), each) for keys, each in _maps(content)]
     cameras = [each for each in maps if each.numbers.hold_a_lens]
     owner = name or ONLY_CAMERA

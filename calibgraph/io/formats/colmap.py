@@ -49,11 +49,7 @@ def is_colmap(text: str) -> bool:
 
 
 def read_colmap(path: Path) -> Part:
-    """The lenses, named camera_ID.
-
-    Raises:
-        FileError: if a line is malformed, or a lens is none of ours.
-    """
+    """The lenses, named camera_ID."""
     lenses = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):

@@ -18,22 +18,14 @@ YAML_SUFFIXES = (".yaml", ".yml")
 
 
 def read_documents(path: Path) -> list[dict[str, Any]]:
-    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them.
-
-    Raises:
-        FileError: if it is malformed.
-    """
+    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them."""
     if path.suffix.lower() in YAML_SUFFIXES:
         return parse_yaml_documents(re.sub(r"\A%YAML.*\n", "", read_text(path)), path)
     return [read_json(path)]
 
 
 def read_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file.
-
-    Raises:
-        FileError: if it is not XML.
-    """
+    """The root of an XML file."""
     try:
         root: ElementTree.Element = fromstring(read_text(path), forbid_dtd=True)
     except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:

@@ -121,9 +121,6 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     """Lenses, T_cam_lidar where it is given, and T_cn_cnm1 as relative poses.
 
     T_cam_imu maps IMU to camera coordinates: a file with the LiDAR in the IMU completes it.
-
-    Raises:
-        FileError: if the file is malformed, or a lens is none of ours.
     """
     keys = sorted((key for key in content if re.fullmatch(r"cam\d+", str(key))), key=_number)
     chain = checked_model(_Camchain, {"cameras": {key: content[key] for key in keys}}, path)

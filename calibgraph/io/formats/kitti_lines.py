@@ -47,11 +47,7 @@ def is_kitti_lines(text: str) -> bool:
 
 
 def read_kitti_lines(path: Path, name: str | None) -> Part:
-    """The lenses and transforms of a file.
-
-    Raises:
-        FileError: if it is malformed, or no such file.
-    """
+    """The lenses and transforms of a file."""
     lines = dict(_lines(path))
     transforms = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
     rectified = sorted(key[-2:] for key in lines if re.fullmatch(r"P_rect_\d\d", key))

@@ -88,11 +88,7 @@ def is_koide(content: dict[str, Any]) -> bool:
 
 
 def read_koide(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens and the result, or else an initial guess; a file written here has its own name.
-
-    Raises:
-        FileError: if the file is malformed, or the lens is none of ours.
-    """
+    """The lens and the result, or else an initial guess; a file written here has its own name."""
     found = checked_model(_Calibration, content, path)
     name = str(found.meta.get("camera", name or path.stem))
     r = found.results

@@ -85,11 +85,7 @@ class LensKeys:
         return any(self._key(name) is not None for name in ("width", "size"))
 
     def read(self) -> tuple[CameraLens, str]:
-        """The lens, and a note on what was assumed; empty if nothing was.
-
-        Raises:
-            FileError: if a number is missing or malformed, or the lens model is open.
-        """
+        """The lens, and a note on what was assumed; empty if nothing was."""
         stated = stated_model(self._content, self._where)
         model, coefficients, note = self._distortion(stated)
         return CameraLens(model, self._size(), self._intrinsics(), coefficients), note
@@ -108,11 +104,7 @@ class LensKeys:
         return self._keys[name]
 
     def array(self, name: str, *shapes: tuple[int, int]) -> Array:
-        """The numbers of a plain key in the one of some shapes that they fill.
-
-        Raises:
-            FileError: if they fill none.
-        """
+        """The numbers of a plain key in the one of some shapes that they fill."""
         where = f"{self._where}: {self._keys[name]}"
         found = numbers(self._content[self._keys[name]], where)
         for shape in shapes:
@@ -226,11 +218,7 @@ class _Image(StrictNumbers):
 
 
 def numbers(value: Any, where: str) -> Array:
-    """A number, a list, or OpenCV's matrix of rows, cols and data, as an array of its shape.
-
-    Raises:
-        FileError: if it is none of these, or its numbers are not finite or not as many as stated.
-    """
+    """A number, a list, or OpenCV's matrix of rows, cols and data, as an array of its shape."""
     is_matrix = isinstance(value, dict) and "data" in value
     data = value["data"] if is_matrix else value
     try:

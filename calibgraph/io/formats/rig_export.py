@@ -69,11 +69,7 @@ class RigExport:
         return ros_pose_covariance(self.covariance[name], self.cameras[name].T_camera_lidar)
 
     def only_camera(self, what: str) -> tuple[str, Camera]:
-        """The one camera, for a format that holds no more.
-
-        Raises:
-            CalibrationError: if there are several.
-        """
+        """The one camera, for a format that holds no more."""
         if len(self.cameras) > 1:
             raise CalibrationError(
                 f"{what} holds one camera, these are {', '.join(self.cameras)}: name one with "

@@ -106,11 +106,7 @@ class RigParts:
         relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
         relative_sigma_cm: float = RELATIVE_SIGMA_CM,
     ) -> Rig:
-        """The rig, with further (4, 4) T_camera_lidar, which stand in for those of the files.
-
-        Raises:
-            CalibrationError: if an image size or an extrinsic is missing.
-        """
+        """The rig, with further (4, 4) T_camera_lidar, which stand in for those of the files."""
         T = {**self.T_camera_lidar, **(extrinsics or {})}
         sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
         content: dict[str, Any] = {

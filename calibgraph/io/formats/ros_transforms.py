@@ -138,9 +138,6 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
     """The frames of TFMessages and TransformStampeds; the last of several for a child.
 
     A frame whose numbers are no transform is left out with a note: others may do without it.
-
-    Raises:
-        FileError: if one is malformed.
     """
     links: dict[str, FrameLink] = {}
     notes: list[str] = []

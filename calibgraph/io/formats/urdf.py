@@ -40,11 +40,7 @@ def _text(values: list[float] | NDArray[np.float64]) -> str:
 
 
 def read_urdf(root: ElementTree.Element, path: Path) -> Part:
-    """The frames of a URDF: its joints at their zero position.
-
-    Raises:
-        FileError: if it is not a URDF, or not expanded.
-    """
+    """The frames of a URDF: its joints at their zero position."""
     if root.tag != "robot":
         raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
     if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):

@@ -31,11 +31,7 @@ def create_pick_app(workspace: Workspace) -> FastAPI:
 
 
 def loopback_socket(port: int) -> socket.socket:
-    """A socket that listens on this machine alone.
-
-    Raises:
-        CalibrationError: if the port is taken.
-    """
+    """A socket that listens on this machine alone."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

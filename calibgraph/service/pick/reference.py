@@ -33,11 +33,7 @@ def outputs_of_pick(folder: Path) -> list[Output]:
 
 
 def reference_rig(estimate: PickEstimate) -> Rig:
-    """The rig of the cameras that the pairs determine, each with its covariance.
-
-    Raises:
-        CalibrationError: if there is none.
-    """
+    """The rig of the cameras that the pairs determine, each with its covariance."""
     solve = estimate.solve
     if solve is None or solve.covariance is None:
         reasons = [word for camera in estimate.cameras.values() for word in camera.warnings]

@@ -72,11 +72,7 @@ class Session(BaseModel):
 
 
 def load_session(path: Path) -> Session:
-    """Read a session.
-
-    Raises:
-        FileError: if it is none.
-    """
+    """Read a session."""
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:

@@ -53,11 +53,7 @@ class Workspace:
         return self._session
 
     def change(self, revision: int, change: Change) -> Session:
-        """Change the session and save it.
-
-        Raises:
-            StaleError: if the session was changed since.
-        """
+        """Change the session and save it."""
         with self._lock:
             if revision != self._session.revision:
                 raise StaleError
@@ -77,11 +73,7 @@ class Workspace:
             return self._estimated[1]
 
     def camera(self, name: str, *, estimated: bool) -> Camera:
-        """A camera at the guess, or at the estimate if there is one.
-
-        Raises:
-            DatasetError: if the rig has none of this name.
-        """
+        """A camera at the guess, or at the estimate if there is one."""
         cameras = self.dataset.rig.cameras
         if name not in cameras:
             raise DatasetError(f"the rig has no camera {name!r}; it has {', '.join(cameras)}")
@@ -89,11 +81,7 @@ class Workspace:
         return cameras[name] if solve is None else solve.rig.cameras.get(name, cameras[name])
 
     def frame(self, index: int) -> Frame:
-        """The frame of a number.
-
-        Raises:
-            DatasetError: if there is none.
-        """
+        """The frame of a number."""
         if index not in self._frames:
             raise DatasetError(f"the dataset has no frame {index}")
         return self._frames[index]
@@ -122,11 +110,7 @@ class Workspace:
         return advise(solve.rig.cameras[name], covariance, solve.scale, points, seen.pixels_px)
 
     def write(self) -> list[Path]:
-        """Write the reference and the table of pairs.
-
-        Raises:
-            CalibrationError: if the pairs determine no camera.
-        """
+        """Write the reference and the table of pairs."""
         return write_reference(self.folder, self.estimate(), self._session.pairs)
 
     def _load_cloud(self, index: int) -> NDArray[np.float32]:
