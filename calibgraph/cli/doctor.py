@@ -7,37 +7,27 @@ from typing import Annotated
 
 import typer
 
+from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
-from calibgraph.cli.options import (
-    DatasetArgument,
-    EverySecondsOption,
-    FramesOption,
-    JsonOption,
-    MotionOption,
-    RigOption,
-    StampsOption,
-    ToleranceOption,
-    TopicOption,
-)
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 
 
 def doctor(
-    dataset: DatasetArgument,
-    rig: RigOption = None,
-    frames: FramesOption = None,
+    dataset: options.DatasetArgument,
+    rig: options.RigOption = None,
+    frames: options.FramesOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR", help="Folder for guess_CAMERA.png: the guess on an image of each camera."
         ),
     ] = None,
-    topic: TopicOption = None,
-    every_s: EverySecondsOption = None,
-    tolerance_s: ToleranceOption = None,
-    stamps: StampsOption = None,
-    motion: MotionOption = None,
-    as_json: JsonOption = False,
+    topic: options.TopicOption = None,
+    every_s: options.EverySecondsOption = None,
+    tolerance_s: options.ToleranceOption = None,
+    stamps: options.StampsOption = None,
+    motion: options.MotionOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
     from calibgraph.doctor import diagnose

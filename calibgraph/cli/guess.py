@@ -7,18 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibgraph.cli import exchange
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.exchange import (
-    CameraFrameOption,
-    FilesArgument,
-    LidarFrameOption,
-    RenameOption,
-    SizeOption,
-    parse_file,
-    parse_names,
-    parse_size,
-    print_doubts,
-)
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 
@@ -38,7 +28,7 @@ ForwardOption = Annotated[
 
 
 def guess(
-    files: FilesArgument,
+    files: exchange.FilesArgument,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
     mount: MountOption = None,
     dataset: Annotated[
@@ -56,10 +46,10 @@ def guess(
         ),
     ] = None,
     forward: ForwardOption = "+x",
-    rename: RenameOption = None,
-    lidar_frame: LidarFrameOption = None,
-    camera_frame: CameraFrameOption = None,
-    size: SizeOption = None,
+    rename: exchange.RenameOption = None,
+    lidar_frame: exchange.LidarFrameOption = None,
+    camera_frame: exchange.CameraFrameOption = None,
+    size: exchange.SizeOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -68,22 +58,22 @@ def guess(
     from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.outputs import yaml_mark
 
-    named = [parse_file(text) for text in files]
+    named = [exchange.parse_file(text) for text in files]
     with checked_arguments(), progress_bar("reading") as progress:
         parts = read_rig_parts(
             [path for _, path in named],
             names={path: name for name, path in named if name},
-            rename=parse_names("--rename", rename),
+            rename=exchange.parse_names("--rename", rename),
             lidar_frame=lidar_frame,
-            camera_frames=parse_names("--camera-frame", camera_frame),
+            camera_frames=exchange.parse_names("--camera-frame", camera_frame),
         )
         found = guess_rig(
             parts,
-            mountings=parse_names("--mount", mount),
+            mountings=exchange.parse_names("--mount", mount),
             data=dataset or None,
             search=search or (),
             forward=forward,
-            size_px=None if size is None else parse_size(size),
+            size_px=None if size is None else exchange.parse_size(size),
             seed=seed,
             progress=progress,
         )
@@ -92,7 +82,7 @@ def guess(
         from calibgraph.report.as_json import print_json
 
         print_json(found.to_mapping())
-    print_doubts(found.rig, parts.notes)
+    exchange.print_doubts(found.rig, parts.notes)
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")
