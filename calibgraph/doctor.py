@@ -14,7 +14,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
-from calibgraph.io.formats.words import describe_rig
+from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs

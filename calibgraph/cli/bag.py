@@ -41,7 +41,7 @@ def bag(
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static."""
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
-    from calibgraph.io.formats.words import describe_rig
+    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
 

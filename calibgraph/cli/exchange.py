@@ -171,8 +171,8 @@ def import_(
     ] = 0.005,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
+    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
-    from calibgraph.io.formats.words import describe_rig
     from calibgraph.outputs import yaml_mark
 
     named = [parse_file(text) for text in files]

@@ -77,9 +77,9 @@ def fleet_page(given: Given) -> list[Output]:
 
 def fleet_model(given: Given) -> list[Output]:
     """What a fleet knows, in the folder of ``--out``."""
-    from calibgraph.fleet.knowledge import outputs_of_knowledge
+    from calibgraph.fleet.model_files import outputs_of_fleet_model
 
-    return outputs_of_knowledge(given["out"])
+    return outputs_of_fleet_model(given["out"])
 
 
 def guess(given: Given) -> list[Output]:

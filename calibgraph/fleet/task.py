@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import traceback
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
+from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
 
 ErrorKind = Literal[
     "bad input", "io", "out of memory", "timeout", "worker died", "internal error"
 ]  # fmt: skip
+
+
+def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
+    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"
+    if isinstance(error, (CalibrationError, ValueError)):
+        return "bad input", str(error)
+    traceback.print_exception(error)
+    if isinstance(error, OSError):
+        return "io", str(error)
+    return "internal error", f"{type(error).__name__}: {error}"
+
 
 RETRIES: dict[ErrorKind, int] = {
     "bad input": 0,

@@ -21,7 +21,7 @@ from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.cloud_notes import read_cloud_notes
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
-from calibgraph.io.formats.words import describe_rig
+from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format

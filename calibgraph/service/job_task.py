@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import BaseModel, ConfigDict
+
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.service.places import Root
 from calibgraph.service.requests import Job
@@ -39,14 +41,15 @@ class JobOutcome:
     error: str | None = None
 
 
-@dataclass(frozen=True)
-class Step:
-    """How far a job is.
+class JobProgress(BaseModel):
+    """How far a running job is.
 
     Attributes:
         stage: what it does.
         done, total: steps of the stage.
     """
+
+    model_config = ConfigDict(frozen=True)
 
     stage: str
     done: int

@@ -10,7 +10,7 @@ from typing import Any
 
 from calibgraph.report.kit import load_template
 from calibgraph.service.answers import utc
-from calibgraph.service.job_task import Step
+from calibgraph.service.job_task import JobProgress
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.requests import JobKind
 
@@ -59,7 +59,7 @@ class JobView:
     is_finished: bool
 
 
-def job_view(record: JobRecord, step: Step | None) -> JobView:
+def job_view(record: JobRecord, step: JobProgress | None) -> JobView:
     """A job as a page shows it."""
     took = ""
     if record.started_s is not None and record.finished_s is not None:

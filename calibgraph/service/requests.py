@@ -148,18 +148,6 @@ class Job(_Request):
     recordings: int = 0
     settings: dict[str, Any] = {}
 
-    def calibration_settings(self) -> CalibrationSettings:
-        """The settings of a calibration."""
-        return CalibrationSettings.model_validate(self.settings)
-
-    def solve_settings(self) -> SolveSettings:
-        """The settings of a solve."""
-        return SolveSettings.model_validate(self.settings)
-
-    def check_settings(self) -> CheckSettings:
-        """The settings of a check."""
-        return CheckSettings.model_validate(self.settings)
-
 
 RIG, TABLE, RECORDING = "rig", "correspondences", "recording"
 """Names of inputs: the files of an upload, and in the job's folder."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from functools import partial
 from typing import Annotated, Any
 from urllib.parse import parse_qs
 
@@ -14,7 +16,6 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service import pages
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.api_page import operations, schemas
 from calibgraph.service.forms import form_of
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
@@ -172,8 +173,8 @@ async def api_page(request: Request, state: State) -> Response:
     return _page(
         request,
         "docs.html.j2",
-        operations=operations(request.app.openapi()),
-        schemas=schemas(request.app.openapi()),
+        api=request.app.openapi(),
+        as_text=partial(json.dumps, indent=1),
         url=str(request.base_url).rstrip("/"),
         is_open=gate.is_open,
     )

@@ -135,5 +135,5 @@ class Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to stop."""
         self._service.is_stopping = True
-        self._service.bell.ring_all()
+        self._service.events.notify()
         super().handle_exit(sig, frame)

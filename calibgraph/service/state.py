@@ -9,9 +9,9 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.bell import Bell
 from calibgraph.service.database import open_database
 from calibgraph.service.folders import DataFolder, remove_folder
+from calibgraph.service.job_events import JobEvents
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root, open_roots
@@ -38,7 +38,7 @@ class Service:
     trackers: Trackers
     roots: tuple[Root, ...]
     metrics: Metrics
-    bell: Bell
+    events: JobEvents
     disk: Room = field(init=False)
     memory: Room = field(init=False)
     is_stopping: bool = field(default=False)
@@ -53,14 +53,14 @@ class Service:
         for left in self.folder.trackers.iterdir():
             if left.name not in known:  # a server was killed while it made or removed it
                 remove_folder(left)
-        self.bell.open()
+        self.events.open()
         self.runner.start()
 
     def begin_stop(self) -> None:
         """Accept nothing more, and let those go who wait."""
         self.is_stopping = True
         self.runner.begin_stop()
-        self.bell.ring_all()
+        self.events.notify()
 
     def stop(self) -> None:
         """End the jobs and trackers, and release the data folder."""
@@ -95,18 +95,18 @@ def open_service(settings: Settings, metrics: Metrics) -> Service:
     except CalibrationError:
         folder.close()
         raise
-    table, bell = JobTable(engine), Bell()
+    table, events = JobTable(engine), JobEvents()
     return Service(
         settings=settings,
         folder=folder,
         engine=engine,
         jobs=table,
-        runner=Runner(table, folder, settings, roots, metrics, bell.ring),
+        runner=Runner(table, folder, settings, roots, metrics, events.notify),
         tracker_table=TrackerTable(engine),
         trackers=Trackers(folder, settings),
         roots=roots,
         metrics=metrics,
-        bell=bell,
+        events=events,
     )
 
 

@@ -32,7 +32,7 @@ Observe = Callable[[str, str, int, float], None]
 """Called with the method, the route, the status and the seconds of each request."""
 
 
-class Shield:
+class RequestGuard:
     """Checks requests before any route, and adds headers to all answers.
 
     A page of another site that a browser shows could otherwise call a server without tokens: its

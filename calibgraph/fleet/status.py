@@ -19,7 +19,7 @@ _PASS, _WARN, _FAIL, _NO_RESULT = range(4)
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class FleetStatus:
     """One entry per row of the fleet.
 
     Attributes:
@@ -34,7 +34,7 @@ class Standing:
     reasons: list[str]
 
 
-def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> Standing:
+def assess_status(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> FleetStatus:
     """Where every row stands."""
     changed = np.zeros(len(rows), dtype=np.bool_)
     if before is not None and len(before):
@@ -47,7 +47,7 @@ def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> 
     state[fleet.apart | (done & (verdict == "FAIL"))] = _FAIL
     turned = set(moved_lidars(fleet))
     lidar = np.isin(fleet.observations.vehicle, list(turned)) if turned else changed & False
-    return Standing(state, changed, _reasons(rows, fleet, changed, lidar))
+    return FleetStatus(state, changed, _reasons(rows, fleet, changed, lidar))
 
 
 def changed_poses(now: Observations, before: Observations) -> NDArray[np.bool_]:

@@ -26,7 +26,7 @@ COMMAND = "fleet-model"
 _MARK = f'{{\n "format": "{FORMAT}"'
 
 
-def outputs_of_knowledge(folder: Path) -> list[Output]:
+def outputs_of_fleet_model(folder: Path) -> list[Output]:
     """The files in a folder; its priors are those there."""
     of_model = starts_with(_MARK.encode())(folder / MODEL_FILE)
     return [
@@ -36,7 +36,7 @@ def outputs_of_knowledge(folder: Path) -> list[Output]:
     ]
 
 
-def write_knowledge(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
+def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
     """Write what a fleet knows.
 
     Returns:
