@@ -33,11 +33,11 @@ def doctor(
     from calibgraph.doctor import diagnose
     from calibgraph.files import require_place_for_folder
     from calibgraph.io.rigs import load_rig
-    from calibgraph.outputs import require_apart
+    from calibgraph.outputs import require_outside_dataset
 
     if out is not None:
         require_place_for_folder(out)
-        require_apart(out, dataset)
+        require_outside_dataset(out, dataset)
     bag = bag_options_from(
         topic, every_s=every_s, tolerance_s=tolerance_s, stamps=stamps, motion=motion
     )

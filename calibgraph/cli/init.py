@@ -30,10 +30,10 @@ def init(
 ) -> None:
     """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained."""
     from calibgraph.guessing.template import write_rig_template
-    from calibgraph.outputs import require_apart
+    from calibgraph.outputs import require_outside_dataset
 
     if out is not None:
-        require_apart(out, [dataset])
+        require_outside_dataset(out, [dataset])
     with checked_arguments():
         words = parse_names("--mount", mount)
         path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)

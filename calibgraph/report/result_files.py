@@ -25,7 +25,7 @@ def write_result(
     Returns:
         The files to name to the user.
     """
-    stale = [output.path for output in outputs_of_result(folder) if output.is_ours(output.path)]
+    stale = [output.path for output in outputs_of_result(folder) if output.is_ours]
     written = [result.save(folder)]
     if data is not None:
         middle = data.frames[len(data.frames) // 2]

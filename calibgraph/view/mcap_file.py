@@ -13,7 +13,6 @@ from calibgraph.files import write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.outputs import Output
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -51,16 +50,6 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
 
     write_atomically(path, write)
     return path
-
-
-def output_of_mcap(path: Path) -> Output:
-    """The file that is written, with its mark."""
-    return Output(path, "view", _is_ours, (".mcap",))
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return PROFILE.encode() in file.read(64)
 
 
 def _nanoseconds(frame: ViewFrame) -> int:

@@ -10,7 +10,6 @@ from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
-from calibgraph.outputs import Output
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -49,16 +48,6 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
 
     write_atomically(path, write)
     return path
-
-
-def output_of_rerun(path: Path) -> Output:
-    """The file that is written, with its mark."""
-    return Output(path, "view", _is_ours, (".rrd",))
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return APPLICATION.encode() in file.read(1024)
 
 
 def _import_rerun() -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -31,7 +30,7 @@ from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
-from calibgraph.outputs import Output, require_free
+from calibgraph.outputs import Output, require_writable
 
 WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
     "kalibr": write_kalibr,
@@ -50,8 +49,7 @@ WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
 }
 _WITH_BASE = ("autoware", "nuscenes")
 _WITHOUT_COMMENTS = "kitti"
-_MARK = re.compile(rb"calibgraph[ _]export")
-_MARK_BYTES = 2**16
+_MARKS = (b"calibgraph export", b"calibgraph_export")
 
 
 def export_calibration(
@@ -134,15 +132,7 @@ def _loaded(path: Path | str) -> Calibration | Rig:
 def outputs_of_export(path: Path, format: str) -> list[Output]:
     """The file of an export, and for the format without comments a text file beside it."""
     beside = [path.with_name(f"{path.stem}.direction.txt")] if format == _WITHOUT_COMMENTS else []
-    return [Output(file, "export", _is_exported) for file in (path, *beside)]
-
-
-def _is_exported(path: Path) -> bool:
-    """Whether a file was exported before, by its mark."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MARK.search(file.read(_MARK_BYTES)) is not None
+    return [Output(file, "export", _MARKS) for file in (path, *beside)]
 
 
 def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
@@ -151,7 +141,7 @@ def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
     contents = [WRITERS[format](export)]
     if format == _WITHOUT_COMMENTS:
         contents.append(commented(kitti_statement(export)))
-    require_free(outputs)
+    require_writable(outputs)
     for output, content in zip(outputs, contents, strict=True):
         if isinstance(content, bytes):
             write_bytes(output.path, content)

@@ -95,12 +95,3 @@ def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> S
             "is a session of other frames or cameras; give the same --frames, or another --out",
         )
     return session
-
-
-def is_session(path: Path) -> bool:
-    """Whether a file is a session."""
-    try:
-        load_session(path)
-    except FileError:
-        return False
-    return True
