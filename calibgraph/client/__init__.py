@@ -1,7 +1,6 @@
 """Calibrations by a server, from Python; needs the extra ``client``."""
 
 from calibgraph.client.answers import RemoteJob, ServerError
-from calibgraph.client.asynchronous import AsyncClient
 from calibgraph.client.client import Client
 
-__all__ = ["AsyncClient", "Client", "RemoteJob", "ServerError"]
+__all__ = ["Client", "RemoteJob", "ServerError"]

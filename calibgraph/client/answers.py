@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-import httpx
 
 from calibgraph.errors import CalibrationError
 
@@ -77,34 +73,6 @@ def job_of(answer: Mapping[str, Any]) -> RemoteJob:
         name=answer.get("name", ""),
         note=answer.get("note", ""),
     )
-
-
-@contextmanager
-def reached(url: str) -> Iterator[None]:
-    """Turn the errors of a connection into :class:`ServerError`."""
-    try:
-        yield
-    except httpx.HTTPError as error:
-        raise ServerError(f"{url}: does not answer ({error})") from error
-
-
-def require_accepted(url: str, answer: httpx.Response) -> None:
-    """Check that a server did not refuse; its answer has been read."""
-    if answer.is_success:
-        return
-    try:
-        detail = str(answer.json()["detail"])
-    except (ValueError, KeyError, TypeError):
-        detail = answer.content[:200].decode(errors="replace") or "no more is known"
-    retry_after = answer.headers.get("retry-after", "")
-    seconds = float(retry_after) if retry_after.isdecimal() else None
-    raise ServerError(f"{url}: {detail}", answer.status_code, seconds)
-
-
-def job_in_event(line: str) -> Iterator[RemoteJob]:
-    """The job in a line of server-sent events, if it holds one."""
-    if line.startswith("data: "):
-        yield job_of(json.loads(line.removeprefix("data: ")))
 
 
 def require_success(job: RemoteJob) -> RemoteJob:

@@ -13,35 +13,16 @@ from typing import Any, Self
 
 import httpx
 
-from calibgraph.client.answers import (
-    RemoteJob,
-    ServerError,
-    job_in_event,
-    job_of,
-    reached,
-    require_accepted,
-    require_success,
-)
+from calibgraph.client.answers import RemoteJob, ServerError, job_of, require_success
 from calibgraph.client.inputs import Source, form_of
 from calibgraph.progress import Progress, no_progress
 
 TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
 """In the environment: the token, if none is given."""
 
-TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
+_TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
 _PATHS = {"calibration": "calibrations", "solve": "solves", "check": "checks"}
-LINES = "application/x-ndjson"
-
-
-def headers_of(token: str | None) -> dict[str, str]:
-    """The headers of all requests."""
-    given = token or os.environ.get(TOKEN_VARIABLE)
-    return {} if given is None else {"Authorization": f"Bearer {given}"}
-
-
-def path_of(kind: str) -> str:
-    """Where jobs of a kind are asked for."""
-    return f"/v1/{_PATHS[kind]}"
+_LINES = "application/x-ndjson"
 
 
 class Client:
@@ -51,12 +32,15 @@ class Client:
         url: of the server.
         token: of ``calibgraph token``; the variable CALIBGRAPH_TOKEN if None.
 
-    Every method raises :class:`ServerError` if the server refuses, or does not answer.
+    Several threads may share it. Every method raises :class:`ServerError` if the server refuses, or
+    does not answer.
     """
 
     def __init__(self, url: str, token: str | None = None) -> None:
         self._url = url.rstrip("/")
-        self._http = httpx.Client(base_url=self._url, headers=headers_of(token), timeout=TIMEOUT)
+        given = token or os.environ.get(TOKEN_VARIABLE)
+        headers = {} if given is None else {"Authorization": f"Bearer {given}"}
+        self._http = httpx.Client(base_url=self._url, headers=headers, timeout=_TIMEOUT)
 
     def submit(
         self,
@@ -82,7 +66,7 @@ class Client:
         texts = {"settings": json.dumps(dict(settings or {})), "name": name, "note": note}
         with form_of(inputs, texts) as fields:
             headers = {} if key is None else {"Idempotency-Key": key}
-            return job_of(self._json("POST", path_of(kind), files=fields, headers=headers))
+            return job_of(self._json("POST", f"/v1/{_PATHS[kind]}", files=fields, headers=headers))
 
     def job(self, id: str, wait_s: float = 0.0) -> RemoteJob:
         """A job; waits until it is finished, not longer than this."""
@@ -97,7 +81,8 @@ class Client:
         """The job now, on every change, and when it is finished."""
         with self._stream(f"/v1/jobs/{id}/events") as answer:
             for line in answer.iter_lines():
-                yield from job_in_event(line)
+                if line.startswith("data: "):
+                    yield job_of(json.loads(line.removeprefix("data: ")))
 
     def wait(self, id: str, progress: Progress | None = None) -> RemoteJob:
         """A job, once it has a result."""
@@ -133,10 +118,11 @@ class Client:
         return str(self._json("POST", "/v1/trackers", json=body)["id"])
 
     def add_frames(
-        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = LINES
+        self, tracker: str, frames: Iterable[Mapping[str, Any]] | bytes, media: str = _LINES
     ) -> dict[str, Any]:
         """Take in frames: mappings as ``track`` reads them, or a body with its media type."""
-        content = frames if isinstance(frames, bytes) else lines_of(frames)
+        lines = () if isinstance(frames, bytes) else (f"{json.dumps(each)}\n" for each in frames)
+        content = frames if isinstance(frames, bytes) else "".join(lines).encode()
         headers = {"Content-Type": media}
         path = f"/v1/trackers/{tracker}/frames"
         found: dict[str, Any] = self._json("POST", path, content=content, headers=headers)
@@ -148,18 +134,38 @@ class Client:
         return found
 
     def _json(self, method: str, path: str, **options: Any) -> Any:
-        with reached(self._url):
+        with self._reached():
             answer = self._http.request(method, path, **options)
-        require_accepted(self._url, answer)
+        self._require_accepted(answer)
         return answer.json()
 
     @contextmanager
     def _stream(self, path: str) -> Iterator[httpx.Response]:
-        with reached(self._url), self._http.stream("GET", path) as answer:
+        with self._reached(), self._http.stream("GET", path) as answer:
             if answer.is_error:
                 answer.read()
-            require_accepted(self._url, answer)
+            self._require_accepted(answer)
             yield answer
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """Turn the errors of a connection into :class:`ServerError`."""
+        try:
+            yield
+        except httpx.HTTPError as error:
+            raise ServerError(f"{self._url}: does not answer ({error})") from error
+
+    def _require_accepted(self, answer: httpx.Response) -> None:
+        """Check that the server did not refuse; its answer has been read."""
+        if answer.is_success:
+            return
+        try:
+            detail = str(answer.json()["detail"])
+        except (ValueError, KeyError, TypeError):
+            detail = answer.content[:200].decode(errors="replace") or "no more is known"
+        retry_after = answer.headers.get("retry-after", "")
+        seconds = float(retry_after) if retry_after.isdecimal() else None
+        raise ServerError(f"{self._url}: {detail}", answer.status_code, seconds)
 
     def close(self) -> None:
         """Close the connections."""
@@ -170,11 +176,6 @@ class Client:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def lines_of(frames: Iterable[Mapping[str, Any]]) -> bytes:
-    """Frames as JSON lines."""
-    return b"".join(json.dumps(frame).encode() + b"\n" for frame in frames)
 
 
 def unpack(file: Any, folder: Path) -> list[Path]:
