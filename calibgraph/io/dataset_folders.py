@@ -9,7 +9,7 @@ from pathlib import Path
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io import kitti
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.published import published_format
 from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
@@ -64,10 +64,7 @@ def frames_of_folder(
     images = {name: _images(_image_folder(folder, layout, name), list(clouds)) for name in cameras}
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
-    return [
-        FrameFiles(stem, cloud, {n: images[n][stem] for n in cameras if stem in images[n]})
-        for stem, cloud in clouds.items()
-    ]
+    return frames_by_stem(clouds, images)
 
 
 def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,3 +41,13 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     if not files:
         raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
     return files
+
+
+def frames_by_stem(
+    clouds: Mapping[str, Path], images: Mapping[str, Mapping[str, Path]]
+) -> list[FrameFiles]:
+    """A frame per cloud, with the images of each camera that have its stem."""
+    return [
+        FrameFiles(stem, cloud, {name: of[stem] for name, of in images.items() if stem in of})
+        for stem, cloud in clouds.items()
+    ]

@@ -15,16 +15,21 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
-from calibgraph.io.kitti import CALIBRATION_NAME, CLOUD_FOLDER, camera_folders, camera_of_projection
+from calibgraph.io.kitti import (
+    CALIBRATION_NAME,
+    CLOUD_FOLDER,
+    NumberLines,
+    camera_folders,
+    camera_of_projection,
+)
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
 _CALIBRATIONS = "calib"
-_ROWS = {"P": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 def is_kitti_object(folder: Path) -> bool:
@@ -41,16 +46,16 @@ def read_kitti_object_rig(folder: Path) -> RigRead:
     """
     stem = _stems(folder)[0]
     path = folder / _CALIBRATIONS / f"{stem}.txt"
-    lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
+    lines = NumberLines(path)
     T, rectify = np.eye(4), np.eye(4)
-    T[:3] = _matrix(path, lines, "Tr_velo_to_cam")
-    rectify[:3, :3] = _matrix(path, lines, "R0_rect")
+    T[:3] = lines.array("Tr_velo_to_cam", 3, 4)
+    rectify[:3, :3] = lines.array("R0_rect", 3, 3)
     folders = camera_folders(folder)
     if not folders:
         raise FileError(folder, "has no image folder (image_0 .. image_3)")
 
     def read(name: str) -> Camera:
-        return _camera(path, lines, _image(folders[name], stem), rectify @ T)
+        return _camera(lines, _image(folders[name], stem), rectify @ T)
 
     return rig_of_complete(CLOUD_FOLDER, folders, read, folder)
 
@@ -62,10 +67,7 @@ def kitti_object_frames(folder: Path, cameras: Sequence[str]) -> list[FrameFiles
     images = {
         name: files_by_stem(folders.get(name, folder / name), IMAGE_SUFFIXES) for name in cameras
     }
-    return [
-        FrameFiles(stem, clouds[stem], {n: images[n][stem] for n in cameras if stem in images[n]})
-        for stem in _stems(folder)
-    ]
+    return frames_by_stem({stem: clouds[stem] for stem in _stems(folder)}, images)
 
 
 def describe_calibrations(folder: Path) -> str:
@@ -107,19 +109,10 @@ def _image(folder: Path, stem: str) -> Path:
     return next((path for path in found if path.is_file()), found[0])
 
 
-def _camera(path: Path, lines: dict[str, str], image: Path, T_rectified_lidar: Array) -> Camera:
+def _camera(lines: NumberLines, image: Path, T_rectified_lidar: Array) -> Camera:
     name = f"P{image.parent.name[-1]}"
     if name not in lines:
-        raise IncompleteCamera(path, f"line {name!r} is missing")
-    P = _matrix(path, lines, name)
-    return camera_of_projection(P, T_rectified_lidar, image_size(image), f"{path}: {name}")
-
-
-def _matrix(path: Path, lines: dict[str, str], name: str) -> Array:
-    shape = _ROWS[name.rstrip("0123") if name.startswith("P") else name]
-    try:
-        return np.array(lines[name].split(), dtype=np.float64).reshape(shape)
-    except KeyError:
-        raise FileError(path, f"line {name!r} is missing") from None
-    except ValueError as error:
-        raise FileError(path, f"line {name!r}: expected {np.prod(shape)} numbers") from error
+        raise IncompleteCamera(lines.path, f"line {name!r} is missing")
+    where = f"{lines.path}: {name}"
+    P = lines.array(name, 3, 4)
+    return camera_of_projection(P, T_rectified_lidar, image_size(image), where)
