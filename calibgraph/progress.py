@@ -15,11 +15,7 @@ def no_progress(task: str, done: int, total: int) -> None:
 
 
 class Stopwatch:
-    """Wall time of named stages: ``with watch("stage"): ...``.
-
-    Attributes:
-        seconds: by stage.
-    """
+    """Wall time of named stages: ``with watch("stage"): ...``."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -126,11 +126,7 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
 
 
 class UnusualInt(int):
-    """A whole number that other programs may take for another one, or for a text.
-
-    Attributes:
-        text: as it is written: ``0x10``, ``0b10``, ``010`` (8 to YAML 1.1), ``1_000``.
-    """
+    """A whole number that other programs may take for another one, or for a text."""
 
     text = ""
 

@@ -42,9 +42,6 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
     """Progress on stderr: a bar that is removed in the end, or lines if stderr is no terminal.
 
     Warnings that the work logs are printed, a line each.
-
-    Args:
-        first: description until the callback is called for the first time.
     """
     console = terminal()
     if not console.is_terminal:

@@ -32,12 +32,7 @@ def is_uri(source: Source) -> bool:
 def form_of(
     inputs: Mapping[str, Sequence[Source]], texts: Mapping[str, str]
 ) -> Iterator[list[Field]]:
-    """The parts of a form; its files are open in the body.
-
-    Args:
-        inputs: by name: ``rig``, ``correspondences``, ``recording``.
-        texts: by name: ``settings`` as JSON, ``name``, ``note``.
-    """
+    """The parts of a form; its files are open in the body."""
     with ExitStack() as stack:
         fields: list[Field] = [(name, (None, text)) for name, text in texts.items()]
         for name, sources in inputs.items():

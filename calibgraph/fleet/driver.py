@@ -44,10 +44,7 @@ class Driver:
         self._last_worker_s = time.monotonic()
 
     def run(self, tries: Iterable[Try], report: Progress) -> int:
-        """Run all, and publish what is done even if this is interrupted.
-
-        Returns:
-            How many tries were made beyond the first of each job.
+        """Run all, and publish what is done even if this is interrupted; count the retries.
 
         Raises:
             CalibrationError: if workers have another version of this package, or there are none.

@@ -19,11 +19,7 @@ from calibgraph.parallel import count_cores
 
 
 class Engine(Protocol):
-    """Runs tasks.
-
-    Attributes:
-        slots: tasks that run at once; a few more may be submitted.
-    """
+    """Runs tasks, ``slots`` of them at once; a few more may be submitted."""
 
     slots: int
 
@@ -166,12 +162,7 @@ class DaskEngine:
 
 
 def open_engine(name: str, slots: int | None = None, memory_bytes: int | None = None) -> Engine:
-    """The engine of a name.
-
-    Args:
-        name: ``processes``; ``ray`` or ``dask``, with ``:ADDRESS`` for a cluster that runs.
-        slots: jobs at once.
-        memory_bytes: limit per job.
+    """The engine of a name: ``processes``, ``ray`` or ``dask``, with ``:ADDRESS`` of a cluster.
 
     Raises:
         CalibrationError: if there is none, its package is missing, or its cluster is not there.

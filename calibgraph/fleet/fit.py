@@ -158,11 +158,7 @@ def moments_of(posterior: Posterior, moments: Array, spread: Array) -> Moments:
 
 
 def fit_mounts(observations: Observations) -> tuple[list[Mount], Pooled]:
-    """The mounts of one model's cameras that enough vehicles measured.
-
-    Args:
-        observations: of one model.
-    """
+    """The mounts of one model's cameras that enough vehicles measured."""
     usable = observations.select(observations.measured)
     names, counts = np.unique(usable.camera, return_counts=True)
     mounts = [start_mount(usable.select(usable.camera == name))

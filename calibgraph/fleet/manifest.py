@@ -108,11 +108,7 @@ class Manifest:
 
 
 def load_manifest(uri: str) -> Manifest:
-    """Read a manifest: Parquet, CSV or YAML.
-
-    Args:
-        uri: of a file. Relative paths in it start at its folder.
-    """
+    """Read a manifest: Parquet, CSV or YAML; relative paths in it start at its folder."""
     table = _read(uri)
     for name, count in Counter(table.column_names).items():
         if count > 1:

@@ -39,9 +39,6 @@ def outputs_of_fleet_model(folder: Path) -> list[Output]:
 def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
     """Write what a fleet knows.
 
-    Returns:
-        The files.
-
     Raises:
         RigError: if a rig has a camera of which the fleet knows nothing.
         FileError: if a file cannot be written.

@@ -41,10 +41,6 @@ class Shard:
 def shard_from(text: str | None, environment: Mapping[str, str]) -> Shard:
     """The shard of a text ``i/n`` or ``auto/n``, else that of the scheduler's array, else all.
 
-    Args:
-        text: of ``--shard``; with ``auto``, and without a text, the index is the scheduler's.
-        environment: with the scheduler's variables.
-
     Raises:
         CalibrationError: if it is neither, or the scheduler gave an index without a count.
     """

@@ -66,18 +66,7 @@ class Task:
 
 @dataclass(frozen=True)
 class CameraResult:
-    """The result of one camera.
-
-    Attributes:
-        camera: its name.
-        verdict: PASS, WARN or FAIL.
-        cannot_tell: whether it is WARN because the data determine too little.
-        probability_off: that it is off by more than the tolerance.
-        reasons: of the verdict, at most three.
-        T_camera_lidar: 16 numbers by rows.
-        covariance: 36 numbers by rows; None without an error bar.
-        actions: what to do, at most three sentences.
-    """
+    """The result of one camera, as its row holds it."""
 
     camera: str
     verdict: str

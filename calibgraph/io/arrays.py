@@ -26,12 +26,7 @@ _COLOURS = (3, 4)  # channels
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrame(Frame):
-    """A frame in memory; its paths are names.
-
-    Attributes:
-        cloud: (n, 4) x y z [m], intensity.
-        images: (height, width, 3) BGR by camera.
-    """
+    """A frame in memory; its paths are names."""
 
     cloud: NDArray[np.float32]
     images: Mapping[str, NDArray[np.uint8]]

@@ -27,10 +27,6 @@ def is_png(data: bytes) -> bool:
 def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
     """The image in PNG or JPEG data.
 
-    Args:
-        data: the bytes.
-        kind: OpenCV's flags; by default for (height, width, 3) uint8, BGR.
-
     Raises:
         ValueError: if they are damaged, incomplete, or of another format.
     """

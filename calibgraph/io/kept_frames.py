@@ -29,11 +29,6 @@ class KeptFrame(Frame):
     """A frame whose gray images, cloud and what derives of them are kept, unless others came since.
 
     None of them may be written to.
-
-    Attributes:
-        frame: that reads them.
-        kept: by number of the frame and what it is; of all frames of the dataset.
-        common: what all frames have in common; it is not dropped.
     """
 
     frame: Frame

@@ -152,11 +152,7 @@ def listed_coefficients(
 
 
 def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:
-    """The focal lengths and the principal point of a camera matrix.
-
-    Args:
-        K: (3, 3) [px], [fx 0 cx; 0 fy cy; 0 0 1].
-        where: the file or topic, and its key, for errors.
+    """The focal lengths and the principal point of a (3, 3) camera matrix [px].
 
     Raises:
         FileError: if it is no such matrix: zeros, skew, another scale, transposed.

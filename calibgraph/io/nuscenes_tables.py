@@ -85,13 +85,7 @@ class SampleData(_Record):
 
 @dataclass(frozen=True)
 class Instant:
-    """A sample, with its images and its scan.
-
-    Attributes:
-        stamp_us: of the sample.
-        scene: name of its scene.
-        taken: by channel.
-    """
+    """A sample, with its images and its scan by channel."""
 
     stamp_us: int
     scene: str

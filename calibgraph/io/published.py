@@ -13,14 +13,7 @@ from calibgraph.io.incomplete import RigRead
 
 @dataclass(frozen=True)
 class PublishedFormat:
-    """How a data set is read.
-
-    Attributes:
-        is_one: whether a path is a folder of it.
-        read_rig: its rig, of its own calibration.
-        frames: of a folder and of the rig's cameras, in order; some may lack images.
-        describe: what is worth a line in the log, empty if nothing is.
-    """
+    """How a data set is read; ``describe`` gives a line for the log, or an empty text."""
 
     is_one: Callable[[Path], bool]
     read_rig: Callable[[Path], RigRead]

@@ -48,12 +48,7 @@ class Overlays:
 
 @dataclass(frozen=True)
 class Scale:
-    """The colour scale of a picture.
-
-    Attributes:
-        gradient: colours from left to right, for CSS.
-        ticks: percent from the left, label.
-    """
+    """A gradient of CSS, and its ticks: percent from the left, label."""
 
     gradient: str
     ticks: tuple[tuple[float, str], ...]

@@ -29,9 +29,6 @@ def write_overlays(
 ) -> list[Path]:
     """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
 
-    Returns:
-        The paths.
-
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
@@ -41,9 +38,6 @@ def write_overlays(
 
 def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
     """Write ``guess_CAMERA.png`` for every camera of the guess.
-
-    Returns:
-        The paths.
 
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
@@ -106,13 +100,7 @@ def _dot_side(pixels: int, points: int) -> int:
 
 
 def write_image(path: Path, image: Image, *, command: str = "") -> None:
-    """Write a PNG atomically.
-
-    Args:
-        path: of the file.
-        image: (height, width, 3) BGR.
-        command: which marks the picture as its own; empty for no mark.
-    """
+    """Write a BGR image as PNG, atomically, with the mark of a command if it has one."""
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")

@@ -19,15 +19,7 @@ _DISTANCE_M = 10.0
 
 @dataclass(frozen=True)
 class WorkedPoint:
-    """One point from the LiDAR frame to the pixel, as text.
-
-    Attributes:
-        matrix: the rows of T_camera_lidar.
-        pose: translation and quaternion of T_camera_lidar.
-        inverse: those of the static transform of ROS TF, from lidar to camera_optical.
-        steps: the calculation.
-        origin: which point it is.
-    """
+    """One point from the LiDAR frame to the pixel, as text."""
 
     matrix: str
     pose: str

@@ -33,13 +33,7 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 
 class Token(BaseModel):
-    """A token that may call.
-
-    Attributes:
-        tenant: whose jobs it sees; admin tokens see all.
-        scope: what it may do.
-        sha256: of the token.
-    """
+    """A token that may call; it sees its tenant's jobs, with scope admin all."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -78,11 +72,7 @@ def load_tokens(path: Path) -> tuple[Token, ...]:
 
 
 def add_token(path: Path, tenant: str, scope: Scope) -> str:
-    """Make a token and add its hash to a file, which is made if it is not there.
-
-    Returns:
-        The token, which is kept nowhere.
-    """
+    """Make a token, which is kept nowhere, and add its hash to a file, which is made if missing."""
     known = load_tokens(path) if path.exists() else ()
     secret = secrets.token_urlsafe(32)
     token = {"tenant": tenant, "scope": scope, "sha256": _hash(secret)}

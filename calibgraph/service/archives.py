@@ -37,10 +37,7 @@ _TABLES = {b"PAR1": ".parquet"}
 
 
 def open_upload(path: Path, most_bytes: int) -> Path:
-    """The recording in an upload, by its first bytes; unpacked it has ``most_bytes`` at most.
-
-    Returns:
-        A folder or a bag beside it, in whose place it is.
+    """The recording in an upload, by its first bytes: a bag or the unpacked folder, in its place.
 
     Raises:
         FileError: if it is neither, or an archive holds something else, or too much.

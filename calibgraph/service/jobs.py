@@ -200,11 +200,7 @@ class JobTable:
         return self._change(_is(id, "queued", "running"), values) > 0
 
     def put_back(self, id: str | None = None) -> int:
-        """Let a running job, or all of them, wait again; those started too often fail.
-
-        Returns:
-            How many wait again.
-        """
+        """Let a running job, or all, wait again, and count them; those started too often fail."""
         which = jobs.c.state == "running" if id is None else _is(id, "running")
         text = f"its process or the server ended {MOST_STARTS} times while it ran"
         self._change(

@@ -28,12 +28,7 @@ _JPEG_QUALITY = 90
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Points of a cloud on an image.
-
-    Attributes:
-        pixels_px: (n, 2) column and row; (0, 0) is the centre of the top-left pixel.
-        colours: (n, 3) RGB by distance.
-    """
+    """Points in an image: (n, 2) pixels, and (n, 3) RGB colours by distance."""
 
     pixels_px: Array
     colours: Colours

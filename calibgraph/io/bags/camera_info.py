@@ -48,12 +48,7 @@ class CameraLens:
 
 
 def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
-    """The lens of a camera's images.
-
-    Args:
-        message: a CameraInfo.
-        where: its topic, for errors.
-        rectified: whether the images are rectified: by R, and of the camera matrix P.
+    """The lens of a camera's images as recorded, or as rectified by R to the matrix P.
 
     Raises:
         FileError: if the camera is not calibrated, or its lens model is unknown.

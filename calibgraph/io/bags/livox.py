@@ -25,13 +25,7 @@ _TAIL_BYTES = 8 + 4 + 1 + 3 + 4  # timebase to the number of points
 
 
 def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
-    """The PointCloud2 with the header and the points of a CustomMsg.
-
-    Args:
-        data: the serialized message.
-        types: message classes by name, of rosbags' type store.
-        ros1: whether it is serialized as in ROS 1, else as CDR, which aligns numbers.
-    """
+    """The PointCloud2 of a CustomMsg that is serialized as in ROS 1, or as CDR, which aligns."""
     big_endian = not ros1 and data[1] == 0
     order = ">" if big_endian else "<"
     body = np.frombuffer(data, np.uint8, offset=0 if ros1 else 4)

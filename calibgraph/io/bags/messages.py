@@ -37,14 +37,7 @@ _MOST_OPEN_BAGS = 8
 
 @dataclass(frozen=True)
 class Message:
-    """A message of a bag.
-
-    Attributes:
-        topic: its topic.
-        record_ns: when it was recorded [ns].
-        number: how many messages of the topic were recorded earlier in that nanosecond.
-        content: its fields, named as in ROS.
-    """
+    """A message; ``number`` counts those of its topic in the same nanosecond."""
 
     topic: str
     record_ns: int

@@ -44,12 +44,7 @@ class CameraEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PickEstimate:
-    """What all pairs give.
-
-    Attributes:
-        solve: of the cameras that are determined; None if there is none.
-        cameras: per camera of the rig.
-    """
+    """The joint solve, None if no camera is determined, and the estimate of each camera."""
 
     solve: JointSolve | None
     cameras: Mapping[str, CameraEstimate] = field(default_factory=dict)

@@ -52,9 +52,6 @@ def reference_rig(estimate: PickEstimate) -> Rig:
 def write_reference(folder: Path, estimate: PickEstimate, pairs: Sequence[Pair]) -> list[Path]:
     """Write ``reference.yaml``, with error bars, and the pairs as a table of correspondences.
 
-    Returns:
-        The paths.
-
     Raises:
         CalibrationError: if the pairs determine no camera.
         FileError: if a file of these names is there that is not of a session.

@@ -27,13 +27,7 @@ _ITERATIONS = 2000  # of samples of 4: with half of the pairs wrong, all but 1e-
 
 @dataclass(frozen=True, eq=False)
 class SolverPose:
-    """The extrinsic of one solver.
-
-    Attributes:
-        solver: its name.
-        T_camera_lidar: (4, 4).
-        median_px: median reprojection error of all pairs, with the lens.
-    """
+    """The (4, 4) extrinsic of a PnP solver, and the median error of all pairs, with the lens."""
 
     solver: str
     T_camera_lidar: Array
