@@ -26,15 +26,13 @@ from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
 from calibgraph.cli.former_options import with_present_options
-from calibgraph.cli.guess import guess
-from calibgraph.cli.init import init
-from calibgraph.cli.inspect import evaluate, perturb, report
+from calibgraph.cli.guess import guess, init
+from calibgraph.cli.inspect import evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.pick import pick
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
-from calibgraph.cli.view import view
 
 if TYPE_CHECKING:
     from calibgraph.outputs import Output

@@ -75,7 +75,7 @@ def check(
 
         print_json(audit_summary(audit))
     else:
-        from calibgraph.cli.audit_table import print_audit
+        from calibgraph.cli.audit_tables import print_audit
 
         print_audit(terminal(), audit, page)
     raise typer.Exit(_EXIT_CODES[audit.status])

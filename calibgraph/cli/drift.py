@@ -73,7 +73,7 @@ def drift(
 
         print_json(drift_summary(found))
     else:
-        from calibgraph.cli.drift_table import print_drift
+        from calibgraph.cli.audit_tables import print_drift
 
         print_drift(terminal(), found)
         print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")

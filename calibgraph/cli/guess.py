@@ -1,4 +1,4 @@
-"""The command guess: a rig to begin with, from words, files, or nothing."""
+"""The commands for a rig to begin with: guess, from words, files or nothing; init, to fill in."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import typer
 
 from calibgraph.cli import exchange
 from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.exchange import parse_names
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_plain, progress_bar, terminal
 
@@ -86,3 +87,30 @@ def guess(
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")
+
+
+def init(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="Folder with lidar/ and cameras/NAME/.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="Rig file to write. (default: DATASET/rig.yaml)"),
+    ] = None,
+    mount: MountOption = None,
+    forward: ForwardOption = "+x",
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Replace the file, and the values in it."),
+    ] = False,
+) -> None:
+    """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained."""
+    from calibgraph.guessing.template import write_rig_template
+    from calibgraph.outputs import require_outside_dataset
+
+    if out is not None:
+        require_outside_dataset(out, [dataset])
+    with checked_arguments():
+        words = parse_names("--mount", mount)
+        path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)
+    print_plain(terminal(), f"{path}: written; replace every FILL_IN, then run calibgraph doctor")

@@ -8,13 +8,14 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import httpx
 
-from calibgraph.client.answers import RemoteJob, ServerError, job_of, require_success
 from calibgraph.client.inputs import Source, form_of
+from calibgraph.errors import CalibrationError
 from calibgraph.progress import Progress, no_progress
 
 TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
@@ -23,6 +24,79 @@ TOKEN_VARIABLE = "CALIBGRAPH_TOKEN"
 _TIMEOUT = httpx.Timeout(60.0, read=120.0, write=120.0)
 _PATHS = {"calibration": "calibrations", "solve": "solves", "check": "checks"}
 _LINES = "application/x-ndjson"
+
+
+class ServerError(CalibrationError):
+    """A request that the server refused, or a server that does not answer.
+
+    Attributes:
+        status: of HTTP; None without an answer.
+        retry_after_s: when to try again; None if that is not known.
+    """
+
+    def __init__(
+        self, message: str, status: int | None = None, retry_after_s: float | None = None
+    ) -> None:
+        super().__init__(message)
+        self.status, self.retry_after_s = status, retry_after_s
+
+
+@dataclass(frozen=True)
+class RemoteJob:
+    """A job of a server.
+
+    Attributes:
+        id: of the job.
+        kind: calibration, solve or check.
+        state: queued, running, succeeded, failed or cancelled.
+        stage, done, total: how far it is, while it runs.
+        verdict: of the result; None as long as there is none.
+        cannot_tell: whether the data determine too little for another one; None if unknown.
+        error: why it failed, in one line.
+        name, note: that were given with it.
+    """
+
+    id: str
+    kind: str
+    state: str
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    verdict: str | None = None
+    cannot_tell: bool | None = None
+    error: str | None = None
+    name: str = ""
+    note: str = ""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether its state is final."""
+        return self.state not in ("queued", "running")
+
+
+def job_of(answer: Mapping[str, Any]) -> RemoteJob:
+    """The job in an answer."""
+    progress, error = answer.get("progress") or {}, answer.get("error") or {}
+    return RemoteJob(
+        id=answer["id"],
+        kind=answer["kind"],
+        state=answer["state"],
+        stage=progress.get("stage", ""),
+        done=progress.get("done", 0),
+        total=progress.get("total", 0),
+        verdict=answer.get("verdict"),
+        cannot_tell=answer.get("cannot_tell"),
+        error=error.get("detail"),
+        name=answer.get("name", ""),
+        note=answer.get("note", ""),
+    )
+
+
+def require_success(job: RemoteJob) -> RemoteJob:
+    """The job, if it has a result."""
+    if job.state == "succeeded":
+        return job
+    raise CalibrationError(job.error or f"the job was {job.state}")
 
 
 class Client:

@@ -1,4 +1,4 @@
-"""Point clouds of PCL: .pcd files, ascii, binary and compressed."""
+"""Point clouds of PCL: .pcd files, ascii, binary and compressed (LZF)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.io.lzf import MOST_RATIO, unpack_lzf
 from calibgraph.io.point_fields import (
     RawCloud,
     choose_fields,
@@ -23,6 +22,7 @@ from calibgraph.io.point_fields import (
     read_rows,
     too_long,
 )
+from factors.compiled import compiled
 
 _HEADER_BYTES = 65536
 _DATA = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
@@ -148,3 +148,47 @@ def _compressed_columns(
 _READERS = {
     b"ascii": _ascii_columns, b"binary": _binary_columns, b"binary_compressed": _compressed_columns,
 }  # fmt: skip
+
+
+MOST_RATIO = 88
+"""Three bytes stand for at most 264."""
+
+_LITERALS, _LONG = 32, 7  # controls below are literal bytes; lengths from here on have a byte more
+
+
+def unpack_lzf(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
+    """(size,) the unpacked bytes; None if the data are damaged or unpack to another size."""
+    out = np.empty(size, np.uint8)
+    return out if _unpack(data, out) == size else None
+
+
+@compiled(boundscheck=True)
+def _unpack(data: Any, out: Any) -> int:  # noqa: PLR0911
+    """Fill ``out``; the number of bytes written, -1 if the data refer beyond it or end early."""
+    at, end = 0, 0
+    while at < len(data):
+        control: Any = np.int64(data[at])
+        at += 1
+        if control < _LITERALS:
+            length = control + 1
+            if at + length > len(data) or end + length > len(out):
+                return -1
+            for k in range(length):
+                out[end + k] = data[at + k]
+            at += length
+        else:
+            length = control >> 5
+            if length == _LONG and at < len(data):
+                length += np.int64(data[at])
+                at += 1
+            if at >= len(data):
+                return -1
+            start = end - ((control & 31) << 8) - np.int64(data[at]) - 1
+            at += 1
+            length += 2
+            if start < 0 or end + length > len(out):
+                return -1
+            for k in range(length):
+                out[end + k] = out[start + k]
+        end += length
+    return end

@@ -18,9 +18,8 @@ from calibgraph.service import (
     routes_trackers,
 )
 from calibgraph.service.access import Gate, load_tokens
-from calibgraph.service.api_schema import add_schemas
 from calibgraph.service.metrics import Metrics
-from calibgraph.service.problems import ProblemDetails, add_problem_handlers
+from calibgraph.service.problems import ProblemDetails, add_problem_handlers, add_schemas
 from calibgraph.service.request_guard import LOCAL_NAMES, RequestGuard
 from calibgraph.service.requests import REQUESTS, SETTINGS_OF
 from calibgraph.service.settings import Settings

@@ -14,11 +14,10 @@ from starlette.concurrency import run_in_threadpool
 
 from calibgraph.service.access import Reader, Submitter
 from calibgraph.service.answers import JobAnswer, JobList, job_answer
-from calibgraph.service.api_schema import reference
 from calibgraph.service.job_events import progress_of, wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.problems import Problem, documented
+from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.requests import (
     ABOUT,
     ALLOWED,

@@ -16,9 +16,9 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service import pages
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.forms import form_of
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
+from calibgraph.service.pages import form_of
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job

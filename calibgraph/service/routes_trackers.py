@@ -15,9 +15,8 @@ from calibgraph.files import checked_model
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
 from calibgraph.service.answers import utc
-from calibgraph.service.api_schema import reference
 from calibgraph.service.jobs import new_id
-from calibgraph.service.problems import Problem, documented
+from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json

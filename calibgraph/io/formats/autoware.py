@@ -12,7 +12,7 @@ from pydantic import ConfigDict
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import commented_yaml
+from calibgraph.io.formats.documents import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport, frame_id
 from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw

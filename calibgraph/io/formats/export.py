@@ -10,7 +10,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
-from calibgraph.io.formats.comments import commented
+from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
 from calibgraph.io.formats.kitti_calib import kitti_statement, write_kitti
 from calibgraph.io.formats.koide import write_koide

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph.io.formats.comments import stated_json
+from calibgraph.io.formats.documents import stated_json
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
+from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.io.formats.comments import commented_xml
+from calibgraph.io.formats.documents import commented_xml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw

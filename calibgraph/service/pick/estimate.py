@@ -12,8 +12,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.service.pick.joint import JointSolve, solve_pairs
 from calibgraph.service.pick.leave_out import Influence, influences
 from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
-from calibgraph.service.pick.shape import Shape, shape_of
-from calibgraph.service.pick.solvers import MIN_PAIRS, SolverPose, poses_by_solver
+from calibgraph.service.pick.solvers import MIN_PAIRS, Shape, SolverPose, poses_by_solver, shape_of
 from calibgraph.trust.observability import weakest_direction
 
 PAIRS_TO_FIND_A_WRONG_ONE = 6
