@@ -175,7 +175,7 @@ def _end_with_parent(at_end: Callable[[], None]) -> None:
 
 @contextmanager
 def output_to(path: Path) -> Iterator[None]:
-    """Send all output into a file, that of compiled libraries too."""
+    """Send all output into a file, from compiled libraries too."""
     with path.open("ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)

@@ -80,7 +80,7 @@ def diagnose(
 
     Args:
         folders: dataset folders, KITTI odometry sequences or bags of one rig.
-        rig: the guess; that of the data if None.
+        rig: the guess; the data's own if None.
         frames: which frames to keep, see :meth:`calibgraph.Dataset.select`.
         bag: how ROS bags are read.
         pictures: folder for ``guess_CAMERA.png``: the guess on an image of each camera; written

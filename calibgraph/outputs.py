@@ -27,7 +27,7 @@ class Output:
     Attributes:
         path: of the file.
         by: the commands that write such files, in a message.
-        marks: of which the program's files hold one; without marks no file is replaced.
+        marks: the program's files hold one of them; without marks no file is replaced.
         suffixes: the endings that its name may have, if not any.
         marked: another file that holds the mark, for formats without a place for one.
     """

@@ -22,7 +22,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Add the wall time of the body to that of a stage."""
+        """Add the wall time of the body to a stage's."""
         start = time.perf_counter()
         try:
             yield

@@ -150,7 +150,7 @@ def find_stationary(data: Dataset, rig: Rig) -> Places:
 
 
 def _deadline(seconds: float | None) -> Callable[[], bool]:
-    """A function that returns whether so many seconds have passed since now."""
+    """A function that returns whether a time limit [s], counted from now, has passed."""
     if seconds is not None and not seconds > 0:
         raise ValueError(f"the time limit must be positive, found {seconds} s")
     end = math.inf if seconds is None else time.monotonic() + seconds

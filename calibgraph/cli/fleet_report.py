@@ -37,7 +37,7 @@ def fleet_report(
         ),
     ] = "",
 ) -> None:
-    """One page for a whole fleet: who stands apart, what changed, how cameras are spread."""
+    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread."""
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.rows import read_rows
 

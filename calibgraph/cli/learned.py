@@ -95,7 +95,7 @@ def train(
     ] = 500,
     device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.")] = "auto",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed, instead of that of the settings.")
+        int | None, typer.Option(min=0, help="Seed, instead of the settings' one.")
     ] = None,
     resume: Annotated[
         bool,

@@ -46,7 +46,7 @@ class MatchingOptions:
 
     @property
     def limit_s(self) -> float | None:
-        """The time limit; without one, that of the search. Networks may need hours on a CPU."""
+        """The time limit, by default the search's. Networks may need hours on a CPU."""
         default = SEARCH_LIMIT_S if self.matcher == "structure" else None
         return default if self.time_limit_s is None else self.time_limit_s
 

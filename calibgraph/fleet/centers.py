@@ -1,4 +1,4 @@
-"""The centres of a fleet as a factor graph: a camera's nominal pose, and those of its batches.
+"""The centres of a fleet as a factor graph: a camera's nominal pose, and its batches' poses.
 
 The variables are ``T_lidar_camera``. The vehicles of a batch are one factor: their information
 about the batch's centre adds up, 27 numbers per camera and batch, wherever the vehicles are held.

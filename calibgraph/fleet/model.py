@@ -57,7 +57,7 @@ class FleetModel:
 
     @cached_property
     def apart(self) -> NDArray[np.bool_]:
-        """(n,) rows that stand apart, of which one in a hundred is expected not to."""
+        """(n,) rows that are flagged; about one flag in a hundred is false."""
         return likely(self.moved, self.observations.measured)
 
 

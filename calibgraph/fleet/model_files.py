@@ -40,7 +40,7 @@ def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) 
     """Write what a fleet knows.
 
     Raises:
-        RigError: if a rig has a camera of which the fleet knows nothing.
+        RigError: if a rig has a camera that the fleet has not measured.
         FileError: if a file cannot be written.
     """
     priors = {

@@ -1,4 +1,4 @@
-"""The rows of a fleet as arrays: what each calibration measured, and of which vehicle."""
+"""The rows of a fleet as arrays: the measurement of each calibration, with its vehicle."""
 
 from __future__ import annotations
 

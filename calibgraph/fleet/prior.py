@@ -47,7 +47,7 @@ def prior_rig(rig: Rig, model: ModelFit, batch: str | None = None) -> Rig:
     account.
 
     Raises:
-        RigError: if the rig has a camera of which the fleet knows nothing.
+        RigError: if the rig has a camera that the fleet has not measured.
     """
     unknown = [name for name in rig.cameras if name not in model.mounts]
     if unknown:

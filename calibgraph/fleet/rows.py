@@ -144,7 +144,7 @@ class RowStore:
         )  # fmt: skip
 
     def publish(self, rows: pa.Table) -> None:
-        """Add rows; those of the same vehicle and recordings are replaced.
+        """Add rows; earlier rows of the same vehicle and recordings are replaced.
 
         Each bucket's file is replaced in one step: by a rename of a synced file, or on an object
         store by one put.
@@ -191,7 +191,7 @@ def job_keys(rows: pa.Table) -> Iterable[tuple[str, ...]]:
 
 
 def _encode(rows: pa.Table) -> bytes:
-    """Rows as a Parquet file, those of a job together."""
+    """Rows as a Parquet file, the rows of a job together."""
     metadata = {**(rows.schema.metadata or {}), "format": FLEET_FORMAT}
     sink = io.BytesIO()
     parquet.write_table(

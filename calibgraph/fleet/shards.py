@@ -39,7 +39,7 @@ class Shard:
 
 
 def shard_from(text: str | None, environment: Mapping[str, str]) -> Shard:
-    """The shard of a text ``i/n`` or ``auto/n``, else that of the scheduler's array, else all.
+    """The shard of a text ``i/n`` or ``auto/n``, else the scheduler's array's, else all.
 
     Raises:
         CalibrationError: if it is neither, or the scheduler gave an index without a count.

@@ -120,7 +120,7 @@ def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
-    """The local path of a URI; remote data are copied into a folder, up to so many bytes."""
+    """The local path of a URI; remote data of at most ``most_bytes`` are copied into a folder."""
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)

@@ -161,7 +161,7 @@ class _Parts(BaseModel):
 def _require_consistent(
     path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
 ) -> None:
-    """Check that the verdict is that of its checks, and all parts are of the same cameras."""
+    """Check that the verdict follows from its checks, and all parts are of the same cameras."""
     verdict = content.get("verdict", {})
     stated = {"the rig": verdict.get("status") if isinstance(verdict, dict) else verdict}
     derived = {"the rig": found.verdict.status}

@@ -61,7 +61,7 @@ def parts_of_table(table: Path) -> Iterator[Correspondences]:
     """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
 
     Of Parquet the bytes of one row group are in memory: about a million rows, by most writers. The
-    metadata is that of the first file of a folder, with the places that any of its files names.
+    metadata comes from the first file of a folder, with the places that any of its files names.
 
     Raises:
         FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are

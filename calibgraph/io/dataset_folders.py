@@ -17,7 +17,7 @@ from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Where a dataset folder keeps its files; those of one frame have the same stem."""
+    """Where a dataset folder keeps its files; the files of one frame have the same stem."""
 
     clouds: Path
     images: Mapping[str, Path]
@@ -68,7 +68,7 @@ def frames_of_folder(
 
 
 def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:
-    """The images of a camera by stem: of a folder, or those of a video that belong to clouds."""
+    """The images of a camera by stem: files of a folder, or pictures of a video with a cloud."""
     if source.is_file():
         return pictures_of_video(source, clouds)
     return files_by_stem(source, IMAGE_SUFFIXES)

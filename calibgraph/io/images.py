@@ -48,7 +48,7 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     except ValueError as error:
         raise _damaged(path, error) from error
     if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
-        raise FileError(path, "has 16 bits, of which only the lower 8 are used; write it with 8")
+        raise FileError(path, "has 16 bits and uses only the lower 8; write it with 8")
     return image
 
 

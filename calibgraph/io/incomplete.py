@@ -1,4 +1,4 @@
-"""Rigs of data sets of which a camera lacks a part: the others are read."""
+"""Rigs of data sets in which a camera lacks a part: the others are read."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """KITTI object folders: ``training`` with ``velodyne``, ``image_2`` and a ``calib`` file per frame.
 
-Its frames are of several drives, on days of different calibrations: those of one form a rig.
+Its frames are of several drives with different calibrations: one of these is the rig.
 """
 
 from __future__ import annotations

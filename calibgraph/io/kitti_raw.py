@@ -27,7 +27,7 @@ def is_kitti_raw(folder: Path) -> bool:
 
 
 def kitti_raw_folders(drive: Path) -> tuple[Path, dict[str, Path]]:
-    """The folder of the clouds, and those of the images by camera (image_00 .. image_03)."""
+    """The folder of the clouds, and the folders of the images by camera (image_00 .. image_03)."""
     images = {each.name: each / "data" for each in sorted(drive.glob("image_0[0-3]"))}
     return drive / _CLOUDS / "data", images
 

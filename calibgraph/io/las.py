@@ -39,7 +39,7 @@ def read_las(path: Path) -> RawCloud:
                 make_cloud(chunk.x, chunk.y, chunk.z, chunk.intensity)
                 for chunk in file.chunk_iterator(_CHUNK)
             ]
-    except Exception as error:  # laspy's own, those of its decoders, and numpy's
+    except Exception as error:  # laspy's own, its decoders', and numpy's
         raise FileError(path, f"cannot be read as LAS ({error}); is it complete?") from error
     points = np.concatenate(parts or [np.empty((0, 4), np.float32)])
     if len(points) != expected:

@@ -132,7 +132,7 @@ def fitted_coefficients(
             return kept + (0.0,) * (count - len(kept))
     raise FileError(
         path,
-        f"{len(values)} distortion coefficients, of which {len(kept)} count; the lens model "
+        f"{len(values)} distortion coefficients, {len(kept)} without zeros; the lens model "
         f"{model} here has {ORDERS[model]}",
     )
 

@@ -1,7 +1,7 @@
 """The tables of a nuScenes folder: records tied by tokens, read as far as they are needed.
 
 A sample_data (an image or a scan) is of one sample (an instant), has a calibrated_sensor (the pose
-of its sensor in the vehicle, ego) and an ego_pose (that of the vehicle, when it was taken).
+of its sensor in the vehicle, ego) and an ego_pose (the vehicle's pose when it was taken).
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def describe_no_scan(tables: Tables) -> str:
     scans = sum(each.get("calibrated_sensor_token") in of_lidar for each in records)
     if not scans:
         return f"has no scan of {LIDAR}"
-    return f"has {scans} scans of {LIDAR}, of which none is a key frame; only key frames are read"
+    return f"has {scans} scans of {LIDAR}, and none is a key frame; only key frames are read"
 
 
 def read_ego_poses(tables: Tables) -> dict[str, Array] | None:

@@ -25,8 +25,8 @@ FILL_IN = "FILL_IN"
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     """Read a rig from a rig file, a result, a dataset, a published data set or a bag.
 
-    A result gives the calibrated extrinsics, KITTI, nuScenes and Argoverse those of their own
-    calibration, a bag those of its /tf_static.
+    A result gives the calibrated extrinsics, KITTI, nuScenes and Argoverse their own
+    calibration, a bag its /tf_static.
 
     Args:
         path: a file or folder.

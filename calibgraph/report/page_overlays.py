@@ -179,7 +179,7 @@ def to_gradient(stops: Image) -> str:
 
 
 def _shrink(image: Image, max_width: int) -> Image:
-    """The image, at most so many pixels wide."""
+    """The image, scaled down to a width of at most ``width`` pixels."""
     factor = max_width / image.shape[1]
     if factor >= 1:
         return image

@@ -1,4 +1,4 @@
-"""Who may call: bearer tokens with scopes, of which only hashes are kept."""
+"""Who may call: bearer tokens with scopes; only their hashes are kept."""
 
 from __future__ import annotations
 

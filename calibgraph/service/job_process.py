@@ -98,7 +98,7 @@ def _found(task: JobTask, name: str) -> Path | None:
 
 
 def _room(task: JobTask, most_bytes: int) -> int:
-    """How much an input may take of the disk, half of which is left to others."""
+    """How much of the disk an input may take: half of the free space is left to others."""
     free = shutil.disk_usage(task.folder).free - task.free_bytes
     return max(0, min(most_bytes, free // 2))
 

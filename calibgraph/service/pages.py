@@ -114,7 +114,7 @@ def _camera_view(name: str, camera: Mapping[str, Any], rows: Sequence[_Row]) -> 
 
 
 def _numbers(camera: Mapping[str, Any], path: str, form: str) -> str:
-    """One number, or those of the axes; a dash where there is none."""
+    """One number, or one per axis; a dash where there is none."""
     value: Any = camera
     for key in path.split("."):
         value = value.get(key) if isinstance(value, Mapping) else None
@@ -158,7 +158,7 @@ TITLES: Mapping[JobKind, str] = {
 
 @dataclass(frozen=True)
 class Field:
-    """An input of a form; its type is that of HTML's inputs, or textarea."""
+    """An input of a form; its type is one of HTML's, or textarea."""
 
     name: str
     label: str

@@ -1,4 +1,4 @@
-"""Room for bodies that arrive, reserved before they are taken: no tenant takes that of another."""
+"""Room for bodies that arrive, reserved before they are taken: no tenant takes another's."""
 
 from __future__ import annotations
 

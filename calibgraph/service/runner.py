@@ -207,7 +207,7 @@ class Runner:
             if self._is_stopping:
                 return None
             log.warning("job %s: %s", record.id, error)
-            self._deaths[record.id] += 1  # those of the server are not the job's fault
+            self._deaths[record.id] += 1  # a killed server is not the job's fault
             if self._deaths[record.id] >= _MOST_DEATHS:
                 return JobOutcome(error_kind="worker died", error=str(error))
             return None

@@ -23,7 +23,7 @@ class CameraLens:
 
     Attributes:
         frame: the frame of the camera, z forward and y down, as the message names it.
-        content: the fields of :class:`calibgraph.Camera` apart from the extrinsic.
+        content: the fields of :class:`calibgraph.Camera` without the extrinsic.
         R_image_frame: (3, 3) from the frame to the axes of the image, which rectification turns.
         baseline_m: (3,) by P's fourth column, the origin of the first camera's frame in the axes of
             this image; zero for a camera that is no second one of a pair.
@@ -43,7 +43,7 @@ class CameraLens:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the axes of the image are not those of the frame."""
+        """Whether the axes of the image and of the frame differ."""
         return bool(np.abs(self.R_image_frame - np.eye(3)).max() > _SAME)
 
 
@@ -68,7 +68,7 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
 
 
 def stated_baseline(message: Any) -> Array:
-    """(3,) t of P = K [I t] [m]; zeros if it is that of no camera."""
+    """(3,) t of P = K [I t] [m]; zeros if P is no camera's."""
     P = np.reshape(_field(message, "P"), (3, 4))
     if not (np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
         return np.zeros(3)

@@ -30,7 +30,7 @@ class BagFrame:
         stamp_ns: of the cloud.
         cloud: its address.
         images: the address of each camera's image.
-        to_s: the median stamp of the images, in seconds after that of the cloud.
+        to_s: the median stamp of the images, in seconds after the cloud's.
     """
 
     number: int

@@ -51,7 +51,7 @@ def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
 
 
 def _cloud(types: Any, header: Any, points: Any, step: int, *, big_endian: bool) -> Any:
-    """A PointCloud2 of points of so many bytes."""
+    """A PointCloud2 of points of ``step`` bytes."""
     fields = [
         types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=code, count=1)
         for name, (code, offset) in _FIELDS.items()

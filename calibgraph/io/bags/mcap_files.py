@@ -1,7 +1,7 @@
 """MCAP files, through the library mcap: with a whole index, a part of one, or none.
 
 Recorders may leave out message indexes, chunk indexes, statistics, chunks or the profile, and may
-write channels of any encoding beside those of ROS.
+write channels of any encoding beside ROS's.
 """
 
 from __future__ import annotations

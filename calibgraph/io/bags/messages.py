@@ -37,7 +37,7 @@ _MOST_OPEN_BAGS = 8
 
 @dataclass(frozen=True)
 class Message:
-    """A message; ``number`` counts those of its topic in the same nanosecond."""
+    """A message; ``number`` counts earlier ones of its topic in the same nanosecond."""
 
     topic: str
     record_ns: int

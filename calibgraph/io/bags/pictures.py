@@ -106,9 +106,9 @@ def _pixels(message: Any, channels: int, kind: str, where: str) -> NDArray[Any]:
 
 
 def _of_two_planes(message: Any, conversion: int, colour_share: float, where: str) -> Image:
-    """The image of a gray plane and one of colour, of which every second row and column counts.
+    """The image of a gray plane and a colour plane of half its rows and columns.
 
-    The height is that of the image or, with some drivers, of both planes.
+    The stated height is the image's or, with some drivers, the height of both planes.
     """
     data, width = np.ascontiguousarray(message.data), message.width
     height, step = _plane_size(message, 1 + colour_share, where)

@@ -1,4 +1,4 @@
-"""The stamps of a bag's clouds and images: one pass over the messages, of which none is kept."""
+"""The stamps of a bag's clouds and images: one pass over the messages, none of which is kept."""
 
 from __future__ import annotations
 

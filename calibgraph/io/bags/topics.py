@@ -74,7 +74,7 @@ def choose_topics(
 
 
 def _why_no_camera(bag: Bag, infos: _Infos) -> str:
-    """Why no image topic is that of a camera, and what to do."""
+    """Why no image topic belongs to a camera, and what to do."""
     for topic in _image_topics(bag):
         if infos.beside(topic):  # so it is depth, by its encoding
             message = bag.first(topic)

@@ -35,7 +35,7 @@ def is_basalt(content: dict[str, Any]) -> bool:
 
 
 def read_basalt(content: dict[str, Any], path: Path) -> Part:
-    """The lenses cam0, cam1, ... and their frames in that of the IMU."""
+    """The lenses cam0, cam1, ... and their frames in the IMU's frame."""
     found = checked_model(_Calibration, content["value0"], path)
     try:
         lenses, links = {}, []

@@ -1,7 +1,7 @@
 """Files of named numbers: OpenCV FileStorage, camera_info, parameters of SLAM programs and others.
 
 A camera is any mapping that holds the numbers of a lens, at any depth. These transforms are read;
-p are coordinates of a point, those of cameras in optical axes (x right, y down, z forward):
+p are coordinates of a point, for cameras in optical axes (x right, y down, z forward):
 
 =================================  ===========================  ==================================
 keys                               program                      direction
@@ -92,7 +92,7 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
 
 
 def _camera_of(each: _Map, owner: str, path: Path, *, single: bool) -> str:
-    """The camera that a mapping is about: its own, or that of the whole file."""
+    """The camera that a mapping is about: its own, or the whole file's."""
     if each.target:
         return each.target
     return owner if single or not each.numbers.hold_a_lens else each.name or path.stem
@@ -181,7 +181,7 @@ class _Map:
 
 
 def _maps(content: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """The mappings in a content with the keys above them; those of a lens's groups are its own."""
+    """The mappings in a content with the keys above them; a lens keeps its groups."""
     if isinstance(content, dict):
         yield above, content
     children = content.items() if isinstance(content, dict) else enumerate(content)

@@ -38,7 +38,7 @@ _COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:
-    """Read a file; ``name`` is that of its camera if it has a single one, None for the file's own.
+    """Read a file; ``name`` replaces the file's own name of its camera if it has a single one.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.

@@ -144,7 +144,7 @@ def prepare_export(
 
 
 def _camera_frame(camera: Camera, given: str | None) -> str:
-    """That given, else that of the rig, else one by the camera's name."""
+    """The given frame, else the rig's, else one by the camera's name."""
     return (camera.frame_id or CAMERA_FRAME) if given is None else given
 
 

@@ -106,7 +106,7 @@ class RigParts:
         relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
         relative_sigma_cm: float = RELATIVE_SIGMA_CM,
     ) -> Rig:
-        """The rig, with further (4, 4) T_camera_lidar, which stand in for those of the files."""
+        """The rig, with further (4, 4) T_camera_lidar, which replace the files'."""
         T = {**self.T_camera_lidar, **(extrinsics or {})}
         sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
         content: dict[str, Any] = {
@@ -171,7 +171,7 @@ def read_rig_parts(
 def _read_all(
     files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
 ) -> list[Part]:
-    """The parts, of which one has a lens at least."""
+    """The parts; at least one has a lens."""
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
     lenses = sorted({name for part in read for name in part.lenses})
