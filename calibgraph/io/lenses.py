@@ -52,6 +52,17 @@ class CameraLens:
     intrinsics_px: Intrinsics
     distortion: tuple[float, ...]
 
+    def fields(self) -> dict[str, Any]:
+        """The fields of :class:`calibgraph.Camera` without the extrinsic."""
+        width_px, height_px = self.size_px or (None, None)
+        return {
+            "model": self.model,
+            "width_px": width_px,
+            "height_px": height_px,
+            "intrinsics_px": self.intrinsics_px,
+            "distortion": self.distortion,
+        }
+
 
 def lens_model(name: str, where: Path | str) -> LensModel:
     """The model here of a name in a file of others."""

@@ -11,8 +11,7 @@ from pydantic import AliasChoices, Field
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.formats.part import Part
-from calibgraph.io.lenses import CameraLens
-from calibgraph.model.rig import Finite, Intrinsics, Size
+from calibgraph.model.rig import Finite, Size
 
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
@@ -58,9 +57,8 @@ def is_camera_info(content: dict[str, Any]) -> bool:
 def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
     """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
     message = checked_model(_Message, content, path)
-    lens = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
-    size = (lens.content["width_px"], lens.content["height_px"])
-    intrinsics = checked_model(Intrinsics, lens.content["intrinsics_px"], path)
+    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     camera = name or path.stem
-    found = CameraLens(lens.content["model"], size, intrinsics, tuple(lens.content["distortion"]))
-    return Part(path, {camera: found}, frame_ids={camera: lens.frame} if lens.frame else {})
+    return Part(
+        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
+    )

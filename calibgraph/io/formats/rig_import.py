@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -279,11 +279,4 @@ def _camera(
             f"describe its mounting to calibgraph guess{notes}",
             camera=name,
         )
-    return {
-        "model": lens.model,
-        "width_px": size[0],
-        "height_px": size[1],
-        "intrinsics_px": lens.intrinsics_px,
-        "distortion": lens.distortion,
-        "T_camera_lidar": T_camera_lidar,
-    }
+    return {**replace(lens, size_px=size).fields(), "T_camera_lidar": T_camera_lidar}
