@@ -9,7 +9,7 @@ import typer
 
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
 from calibgraph.cli.options import JsonOption, TopicOption
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_json, print_plain, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
@@ -94,8 +94,6 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
 def _print_json(
     topics: list[tuple[str, str, int]], rig: Rig, notes: list[str], out: Path | None
 ) -> None:
-    from calibgraph.report.as_json import print_json
-
     keys = ("topic", "type", "messages")
     print_json(
         {

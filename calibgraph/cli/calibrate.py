@@ -11,7 +11,7 @@ import typer
 from calibgraph.cli import options, remote
 from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
@@ -155,8 +155,6 @@ def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -
     """Print the counts of a table of correspondences; exit 1 if a camera was not found."""
     missed = list(table.findings.missed)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json({"out": str(out), "matches": table.counts(), "missed": missed})
     else:
         counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
@@ -172,7 +170,7 @@ def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -
 def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
     """Print a result; exit 1 if it is FAIL."""
     if as_json:
-        from calibgraph.report.as_json import print_json, result_summary
+        from calibgraph.report.as_json import result_summary
 
         print_json(result_summary(result, written))
     else:

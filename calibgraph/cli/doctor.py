@@ -9,7 +9,7 @@ import typer
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 
 def doctor(
@@ -45,8 +45,6 @@ def doctor(
         guess = load_rig(rig) if rig else None
         found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(found.to_mapping())
     else:
         for finding in found.findings:

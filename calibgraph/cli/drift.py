@@ -10,7 +10,7 @@ import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_json, print_plain, terminal
 
 _EXIT_CODES = {"OK": 0, "CHANGED": 1, "CANNOT TELL": 3}
 
@@ -69,7 +69,6 @@ def drift(
         draw_drift(found, plot)
     if as_json:
         from calibgraph.audit import drift_summary
-        from calibgraph.report.as_json import print_json
 
         print_json(drift_summary(found))
     else:

@@ -11,7 +11,7 @@ from calibgraph.cli import exchange
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.exchange import parse_names
 from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 MountOption = Annotated[
     list[str] | None,
@@ -80,8 +80,6 @@ def guess(
         )
     found.save(out, first_line=yaml_mark("guess"))
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(found.to_mapping())
     exchange.print_doubts(found.rig, parts.notes)
     for line in found.lines:

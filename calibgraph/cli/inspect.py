@@ -10,7 +10,7 @@ import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
@@ -76,8 +76,6 @@ def evaluate(
     path = rig_file(estimate)
     errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(errors.to_mapping())
     else:
         from calibgraph.cli.tables import print_evaluation

@@ -9,7 +9,7 @@ import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import progress_bar, terminal
+from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 
 def weights(
@@ -26,8 +26,6 @@ def weights(
     if out is not None:
         checkpoint.save_safetensors(out)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(checkpoint.summary())
     else:
         from calibgraph.cli.tables import print_weights

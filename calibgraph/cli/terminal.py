@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,6 +35,13 @@ def terminal() -> Console:
 def print_plain(console: Console, text: str) -> None:
     """Print a line as it is: no markup, no colours, no line breaks of rich's own."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    from calibgraph.report import as_json
+
+    as_json.print_json(content)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from calibgraph.model.result_files import (
     CORRESPONDENCES_FILE,
     is_calibration_file,
 )
-from calibgraph.model.rig import Finite, Rig
+from calibgraph.model.rig import Finite, Rig, rigid_transform
 from calibgraph.model.verdict import Check, Doubt, Status, Verdict
 
 Array = NDArray[np.float64]
@@ -77,14 +77,6 @@ def _square(value: Any) -> Array:
     return found
 
 
-def _of_pose(value: Any) -> Array:
-    """A 4x4 matrix."""
-    found = _square(value)
-    if len(found) != 4:  # noqa: PLR2004 - homogeneous coordinates
-        raise ValueError(f"expected a 4x4 matrix, found {found.shape}")
-    return found
-
-
 def _covariance(value: Any) -> Array:
     """The covariance of one or more poses: symmetric, and of no negative variance."""
     found = _square(value)
@@ -108,7 +100,7 @@ def _covariance_of_one(value: Any) -> Array:
     return found
 
 
-Matrix4 = Annotated[Any, BeforeValidator(_of_pose)]
+Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
 Covariance = Annotated[Any, BeforeValidator(_covariance_of_one)]
 JointCovariance = Annotated[Any, BeforeValidator(_covariance)]
 

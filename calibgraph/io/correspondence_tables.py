@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -116,16 +116,19 @@ def _arrow_parts(path: Path) -> Iterator[pa.Table]:
                 yield pa.Table.from_batches([batch]).replace_schema_metadata(metadata)
 
 
-def read_arrow(path: Path) -> pa.Table:
-    """A whole Parquet or CSV file, with any columns."""
+def read_arrow(
+    path: Path, names: Sequence[str] = ("camera",), types: Mapping[str, str] | None = None
+) -> pa.Table:
+    """A whole Parquet or CSV file, with any columns; in CSV ``names`` are texts."""
     import pyarrow as pa
     from pyarrow import csv
 
     with arrow_reads(path):
         if path.suffix == ".csv":
-            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
-            return csv.read_csv(path, convert_options=strings)
-        with open_parquet(path) as file:
+            column_types = {**dict.fromkeys(names, pa.string()), **(types or {})}
+            options = csv.ConvertOptions(column_types=column_types)
+            return csv.read_csv(path, convert_options=options)
+        with open_parquet(path, names) as file:
             return file.read()
 
 
@@ -194,13 +197,18 @@ def require_short_names(column: pa.ChunkedArray) -> None:
             )
 
 
-def _from_plain_columns(table: pa.Table) -> Correspondences:
-    import pyarrow as pa
-
-    for name in table.column_names:
+def require_no_nulls(table: pa.Table, names: Iterable[str]) -> None:
+    """Check that columns have a value in every row."""
+    for name in names:
         if table[name].null_count:
             row = table[name].is_null().to_pylist().index(True)
             raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+
+
+def _from_plain_columns(table: pa.Table) -> Correspondences:
+    import pyarrow as pa
+
+    require_no_nulls(table, table.column_names)
 
     def stack(names: Sequence[str]) -> Array:
         return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)

@@ -23,10 +23,9 @@ from calibgraph.service.problems import Problem
 from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job
 from calibgraph.service.routes_service import require_docs
-from calibgraph.service.routes_trackers import find_tracker
+from calibgraph.service.routes_trackers import ask_tracker, find_tracker
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import submit
-from calibgraph.service.tracker_request import TrackerRequest
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -146,8 +145,7 @@ def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
 async def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
     """A tracker: its verdict, its alarms, its extrinsics over time."""
     record = await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    found: dict[str, Any] = await state.trackers.answer(id, caller.tenant, asked)
+    found: dict[str, Any] = await ask_tracker(state, caller, id, "state")
     columns, cameras = pages.camera_table(found["cameras"])
     return _page(
         request,

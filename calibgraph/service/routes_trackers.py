@@ -20,7 +20,7 @@ from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
-from calibgraph.service.tracker_request import ARROW, TrackerRequest
+from calibgraph.service.tracker_request import ARROW, Action, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.yaml_text import yaml_text
 
@@ -118,6 +118,15 @@ def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
     return record
 
 
+async def ask_tracker(
+    state: Service, caller: Caller, id: str, action: Action, body: bytes = b"", media: str = ""
+) -> Any:
+    """The answer of a tracker that the caller sees."""
+    await run_in_threadpool(find_tracker, state, caller, id)
+    request = TrackerRequest(action, str(state.folder.of_tracker(id)), body, media)
+    return await state.trackers.answer(id, caller.tenant, request)
+
+
 @router.post(
     "",
     status_code=201,
@@ -183,8 +192,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
     body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
-    asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
-    answer = await state.trackers.answer(id, caller.tenant, asked)
+    answer = await ask_tracker(state, caller, id, "frames", body, media)
     state.metrics.frames.inc(len(answer["updates"]))
     return JSONResponse(answer)
 
@@ -192,9 +200,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
 @router.get("/{id}/state", responses=documented(404, 422, 429))
 async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
     """The last estimate, with its error bars, verdicts and events."""
-    await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    return TrackerState(**await state.trackers.answer(id, caller.tenant, asked))
+    return TrackerState(**await ask_tracker(state, caller, id, "state"))
 
 
 @router.get(
@@ -204,9 +210,7 @@ async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerS
 )
 async def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
     """The extrinsics over time, with their error bars and events."""
-    await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
-    return Response(await state.trackers.answer(id, caller.tenant, asked), media_type="image/png")
+    return Response(await ask_tracker(state, caller, id, "plot"), media_type="image/png")
 
 
 @router.delete("/{id}", status_code=204, responses=documented(404, 422, 429))
