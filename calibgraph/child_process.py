@@ -4,8 +4,6 @@ It is kept from request to request, because loading the libraries takes longer t
 It is no process of ``multiprocessing``: workers of Dask may not have such children.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

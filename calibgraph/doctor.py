@@ -1,7 +1,5 @@
 """What can be seen of a dataset before anything is solved: what is there, and what to fix first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading and writing files safely: atomic writes, hashes, content to checked models."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Arrays for long-lived values, outside the heap."""
 
-from __future__ import annotations
-
 import math
 import mmap
 from typing import Any, TypeVar

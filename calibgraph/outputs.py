@@ -3,8 +3,6 @@
 Each kind of file holds a mark; a file without it is its user's.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

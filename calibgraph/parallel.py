@@ -1,7 +1,5 @@
 """Threads: as many as there are cores, and values that they make once."""
 
-from __future__ import annotations
-
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence

@@ -1,7 +1,5 @@
 """Progress callbacks, and the wall time of named stages."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ The paper matches once and solves once. A weight-free matcher sees only what is 
 coarse and is run again from every better estimate.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

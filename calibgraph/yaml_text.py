@@ -1,7 +1,5 @@
 """YAML as text: mappings in and out, and what no file of ours may hold refused in one line."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

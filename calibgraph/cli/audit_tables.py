@@ -1,7 +1,5 @@
 """An audit, and a comparison of results, as tables for a terminal, in degrees and centimetres."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rich.console import Console

@@ -1,7 +1,5 @@
 """The command that audits a deployed calibration: check."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The command doctor: what to fix in a dataset before it is calibrated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The command that compares results with each other: drift."""
 
-from __future__ import annotations
-
 from datetime import date
 from pathlib import Path
 from typing import Annotated

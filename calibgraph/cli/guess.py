@@ -1,7 +1,5 @@
 """The commands for a rig to begin with: guess, from words, files or nothing; init, to fill in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

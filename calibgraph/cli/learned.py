@@ -1,7 +1,5 @@
 """The commands of the learned matcher: what is in a file of weights, and training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

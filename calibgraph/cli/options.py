@@ -1,7 +1,5 @@
 """Arguments and options that commands share, and the options of the matchers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """A server's calibrations from Python, in blocking calls."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """What is sent: files as they are, dataset folders as archives without compression."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence

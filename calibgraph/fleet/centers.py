@@ -4,8 +4,6 @@ The variables are ``T_lidar_camera``. The vehicles of a batch are one factor: th
 about the batch's centre adds up, 27 numbers per camera and batch, wherever the vehicles are held.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gtsam

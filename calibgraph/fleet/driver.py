@@ -1,7 +1,5 @@
 """The loop of a run: keep an engine busy, try again what may succeed, hand on the outcomes."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Iterable

@@ -4,8 +4,6 @@ An engine takes a task and gives a future. Queues, placement and lost machines a
 business; limits, retries and rows are the same for all.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 from concurrent.futures import Future, ThreadPoolExecutor

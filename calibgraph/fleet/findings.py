@@ -4,8 +4,6 @@ All tests of a fleet are one family: what is reported was chosen by Benjamini an
 so of many reports one in a hundred is expected to be wrong, however many tests there were.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Manifests: which vehicles are calibrated, from which recordings, with which settings."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """What a fleet knows: the nominal pose of every camera, and every vehicle's deviation from it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The files of a fleet's model: shrunk estimates, nominal poses with spreads, priors as rigs."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The fleet on one page: compact arrays in the page, a table that draws what is in view."""
 
-from __future__ import annotations
-
 import base64
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the next vehicle of a model starts from: nominal poses and relative poses, with sigmas."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Outcomes to rows, and rows and logs to where they are kept."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import time

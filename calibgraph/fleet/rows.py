@@ -4,8 +4,6 @@ A vehicle's rows are in the file of its bucket, ``bucket=HH/rows.parquet``, whic
 whole: a reader finds every row once, whatever ends the writer.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import io

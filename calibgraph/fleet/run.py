@@ -1,7 +1,5 @@
 """A manifest from its rows to the rows of its results: ``run_fleet``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

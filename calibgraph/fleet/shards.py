@@ -1,7 +1,5 @@
 """Which part of a manifest a process does, where processes are started side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """PASS, WARN, FAIL or no result: where each camera of each vehicle stands."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

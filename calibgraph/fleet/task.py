@@ -1,7 +1,5 @@
 """What a worker gets and what it returns: a job with its limits, and the job's outcome."""
 
-from __future__ import annotations
-
 import traceback
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Addresses of files: local paths, or URIs of fsspec such as ``s3://bucket/drive``."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

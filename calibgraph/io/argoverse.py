@@ -3,8 +3,6 @@
 Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), corrected for motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

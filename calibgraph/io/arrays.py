@@ -1,7 +1,5 @@
 """Datasets of arrays: images and clouds of a program that has them in memory, without files."""
 
-from __future__ import annotations
-
 import hashlib
 import uuid
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ number every position mixes the columns, and it is zero, or smaller where the nu
 divisor. The order of the points does not matter.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Results from disk: the YAML file of a calibration, and the table beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Notes about a cloud: it has no intensity, or its columns were told by its content."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

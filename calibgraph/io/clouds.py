@@ -1,7 +1,5 @@
 """Point clouds from disk, as x y z intensity: .npy, .bin, .pcd, .ply, .las, .laz, .feather."""
 
-from __future__ import annotations
-
 import threading
 import tokenize
 import warnings

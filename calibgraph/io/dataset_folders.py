@@ -1,7 +1,5 @@
 """Dataset folders: the cloud and the images of every frame, by the format of the folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Images from PNG and JPEG data that is complete: OpenCV fills up what is damaged, unreported."""
 
-from __future__ import annotations
-
 import io
 import struct
 from typing import Any

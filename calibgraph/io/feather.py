@@ -1,7 +1,5 @@
 """Feather files: tables of Arrow."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

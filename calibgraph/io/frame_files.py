@@ -1,7 +1,5 @@
 """The files of frames: one cloud, and the images taken with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

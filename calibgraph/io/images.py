@@ -1,7 +1,5 @@
 """Images: PNG, JPEG, messages of bags and pictures of videos, complete and of the rig's size."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

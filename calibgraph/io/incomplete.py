@@ -1,7 +1,5 @@
 """Rigs of data sets in which a camera lacks a part: the others are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple

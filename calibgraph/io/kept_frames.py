@@ -1,7 +1,5 @@
 """Frames whose files are decoded once, though several parts of a calibration read them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """KITTI odometry sequence folders: ``calib.txt``, ``velodyne/``, ``image_2/``, ``image_3/``, ..."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Its frames are of several drives with different calibrations: one of these is the rig.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """KITTI raw drives, synchronised and rectified: ``DATE/DATE_drive_0005_sync``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Point clouds in .las and .laz files, by laspy."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lenses as others write them: their model by any of its names, K, and lists of coefficients."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

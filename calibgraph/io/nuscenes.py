@@ -1,7 +1,5 @@
 """nuScenes folders: the rig of calibrated_sensor, and the key frames of one vehicle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A sample_data (an image or a scan) is of one sample (an instant), has a calibrat
 of its sensor in the vehicle, ego) and an ego_pose (the vehicle's pose when it was taken).
 """
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Mapping

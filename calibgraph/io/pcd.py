@@ -1,7 +1,5 @@
 """Point clouds of PCL: .pcd files, ascii, binary and compressed (LZF)."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Point clouds in .ply files: the vertices, among elements of any kind."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Clouds as files hold them: named fields, and which of them are x, y, z and the intensity."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, islice

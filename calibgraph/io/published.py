@@ -1,7 +1,5 @@
 """Folders of published data sets that hold their own rig; each format is one entry here."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rigs from disk: rig files, results, dataset folders, published data sets, ROS bags."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Any object with the fields of the message serves: of rclpy, rospy, rosbags or a decoder of MCAP.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

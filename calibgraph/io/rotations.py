@@ -1,7 +1,5 @@
 """Quaternions and roll, pitch, yaw, as files of others have them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Videos of a camera beside the clouds: a picture is read by an address, as a file is."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Results as JSON on stdout, for programs: ``--json``."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

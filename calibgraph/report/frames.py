@@ -1,7 +1,5 @@
 """The frames of a result: the one whose images are shown, and where the files are now."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import replace

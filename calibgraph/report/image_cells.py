@@ -1,7 +1,5 @@
 """Correspondences by cells of the image: counts and mean residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

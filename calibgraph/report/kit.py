@@ -1,7 +1,5 @@
 """The kit of all pages: their frame, styles, scripts and macros."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template

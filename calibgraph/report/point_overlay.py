@@ -1,7 +1,5 @@
 """The cloud projected into an image, coloured by depth; and before-and-after PNG files of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """All files of a result in its folder: the calibration, its tables, pictures and the report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from calibgraph.io.dataset import Dataset

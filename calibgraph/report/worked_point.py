@@ -1,7 +1,5 @@
 """One point projected step by step, to show the conventions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Who may call: bearer tokens with scopes; only their hashes are kept."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import secrets

@@ -1,7 +1,5 @@
 """What the routes of jobs and trackers answer."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 from pydantic import BaseModel

@@ -1,7 +1,5 @@
 """The application: its routers, and what they share."""
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Uploads as datasets: an archive of a dataset folder, or a bag. Names are checked, never paths."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -4,8 +4,6 @@ The parser is httptools. Its callbacks show how far a request is, and one timer 
 connection runs until the next step.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from typing import Any

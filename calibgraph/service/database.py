@@ -1,7 +1,5 @@
 """The tables of the service: SQLite in the data folder, or another database by its URL."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The data folder: one server's, with a folder per job and per tracker."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets

@@ -1,7 +1,5 @@
 """Waiting, in the event loop, for what threads do to a job."""
 
-from __future__ import annotations
-
 import asyncio
 from collections import defaultdict
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a job's process gets and what it returns; and the names in a job's folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The table of jobs: nothing that was acknowledged is lost, whatever ends the server."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The content of the pages for people: jobs, results and trackers in words, and the forms."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Where jobs may read: URIs inside roots that the server's owner allows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote

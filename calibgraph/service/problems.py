@@ -1,7 +1,5 @@
 """Errors as answers: problem+json (RFC 9457), with one line of what to do; schemas for OpenAPI."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import secrets

@@ -1,7 +1,5 @@
 """What every request passes: the host it names, the page it comes from; strict headers back."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from urllib.parse import urlsplit

@@ -1,7 +1,5 @@
 """What jobs are asked for: the bodies of requests, checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """Room for bodies that arrive, reserved before they are taken: no tenant takes another's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

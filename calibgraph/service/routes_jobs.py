@@ -1,7 +1,5 @@
 """Routes of jobs: ask for one, follow it, cancel it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time

@@ -1,7 +1,5 @@
 """Pages for people: jobs with their verdicts, a job, trackers with their drift; sign in."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Routes of results: the summary, the report, the files, other programs' formats."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Routes of the service itself: is it alive, can it work, its numbers, its API in words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fastapi import APIRouter, Request, Response

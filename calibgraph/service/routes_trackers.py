@@ -1,7 +1,5 @@
 """Routes of trackers: one per rig, frames in, estimates out."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from typing import Annotated, Any

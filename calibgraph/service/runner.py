@@ -1,7 +1,5 @@
 """Runs the jobs of the table, each in a child process, and keeps the table in order."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import threading

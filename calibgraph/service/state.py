@@ -1,7 +1,5 @@
 """What the routes of a server share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """A request for a job: read, checked, put on disk, and only then acknowledged."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """What a process with trackers gets, and how it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

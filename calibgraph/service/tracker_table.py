@@ -1,7 +1,5 @@
 """The table of trackers: whose they are; their state is in their folders."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

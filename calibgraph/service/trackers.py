@@ -1,7 +1,5 @@
 """The processes that hold the trackers; each tracker is in one of them."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections import Counter, OrderedDict, deque

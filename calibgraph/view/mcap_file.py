@@ -1,7 +1,5 @@
 """An MCAP file of a result for Foxglove, with Foxglove's own message types."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What viewers show of a frame: the cloud, the images, and its points on them, before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

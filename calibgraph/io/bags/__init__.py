@@ -3,8 +3,6 @@
 The rest of the package reads a message as it reads a file: by the path that is its address.
 """
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """CameraInfo messages as lenses, of the images as recorded or of rectified ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

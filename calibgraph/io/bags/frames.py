@@ -1,7 +1,5 @@
 """The frames of a bag: each cloud with the image of every camera that is nearest by stamp."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ The message of livox_ros_driver, livox_ros_driver2 and livox_interfaces:
     CustomPoint: uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line
 """  # noqa: E501
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

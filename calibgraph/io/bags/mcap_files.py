@@ -4,8 +4,6 @@ Recorders may leave out message indexes, chunk indexes, statistics, chunks or th
 write channels of any encoding beside ROS's.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterator

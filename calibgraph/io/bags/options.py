@@ -1,7 +1,5 @@
 """What is read of a bag, and how its images are paired with its clouds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

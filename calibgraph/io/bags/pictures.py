@@ -1,7 +1,5 @@
 """Image and CompressedImage messages as BGR images of 8 bits."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

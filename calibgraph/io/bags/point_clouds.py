@@ -1,7 +1,5 @@
 """PointCloud2 messages: fields in any order, of any type and byte order, organised or not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

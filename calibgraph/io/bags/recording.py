@@ -1,7 +1,5 @@
 """What every kind of bag is to its readers: topics, and messages as bytes in order of recording."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """The rig of a bag: lenses from camera_info, the guess from tf_static."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The stamps of a bag's clouds and images: one pass over the messages, none of which is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bags by their files: which library reads one, and the folder of a ROS 2 bag as one recording."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePath

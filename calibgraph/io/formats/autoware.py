@@ -1,7 +1,5 @@
 """Autoware's sensor_kit_calibration.yaml: poses of camera_link, x forward, not optical."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

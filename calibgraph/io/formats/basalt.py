@@ -1,7 +1,5 @@
 """Basalt's calibration.json: lenses and T_imu_cam, which maps camera to IMU coordinates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

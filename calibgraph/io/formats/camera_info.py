@@ -1,7 +1,5 @@
 """A CameraInfo message as ``ros2 topic echo`` and ``rostopic echo`` print it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """COLMAP's cameras.txt: lenses by number; its pixel (0.5, 0.5) is the centre of the first one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

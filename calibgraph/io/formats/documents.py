@@ -1,7 +1,5 @@
 """Documents of the text formats: YAML, JSON and XML, read as mappings, written below comments."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable

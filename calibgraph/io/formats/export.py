@@ -1,7 +1,5 @@
 """Write a result or a rig in the format of another program."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final

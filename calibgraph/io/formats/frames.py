@@ -1,7 +1,5 @@
 """Frames in their parents, as in TF and URDF: where the cameras are, seen from the LiDAR."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kalibr's camchain YAML, with T_cam_lidar as further key of a camera."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI odometry's calib.txt: P0 to P3, and Tr from the LiDAR to the rectified cameras."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -11,8 +11,6 @@ perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified ima
 =======================  ==========================  ==============================================
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

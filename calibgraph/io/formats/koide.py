@@ -1,7 +1,5 @@
 """calib.json of koide3's direct_visual_lidar_calibration: one camera, T_lidar_camera."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

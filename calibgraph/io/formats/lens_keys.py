@@ -5,8 +5,6 @@ One table of keys serves OpenCV, camera_info files, Autoware.AI, camodocal (VINS
 a dot or slash do not count: ``Camera.fx``, ``cam_fx``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Lenses that a format cannot carry are refused, not rounded."""
 
-from __future__ import annotations
-
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 

@@ -1,7 +1,5 @@
 """Plain JSON and NumPy archives: both directions of the extrinsic, lenses, covariance."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

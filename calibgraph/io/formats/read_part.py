@@ -1,7 +1,5 @@
 """One file of another program, in the format that its name or content shows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

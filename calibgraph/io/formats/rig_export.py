@@ -1,7 +1,5 @@
 """A rig as the exporters take it: frames by name, covariances, and the statement of direction."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A rig from the files of other programs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Static transforms of ROS: publisher lines, a launch file, tf2's message."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """URDF: fixed joints to optical frames, and the links of a robot."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """What the page gets: the session, the estimate and the advice, as plain values."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict
 
 from calibgraph.model.calibration import degrees_and_centimetres

@@ -1,7 +1,5 @@
 """The application of `calibgraph pick`: one session, for the person at this machine."""
 
-from __future__ import annotations
-
 import socket
 
 import uvicorn

@@ -1,7 +1,5 @@
 """What picked pairs determine: PnP by several solvers, the joint solve, and what is weak."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ No loss and no gate: with a dozen pairs a robust loss hides a wrong one and make
 depend on it. A wrong pair is found by what leaving it out changes, and removed by its picker.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a result depends on: each pair's residual, and what leaving it out changes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

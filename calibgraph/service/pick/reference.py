@@ -1,7 +1,5 @@
 """What a session gives: the table of its pairs, and the reference with its error bars."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Routes of a session of picking, under ``/v1/pick``, and its page, ``/pick``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal

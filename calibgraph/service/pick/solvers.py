@@ -1,7 +1,5 @@
 """PnP by several solvers, and the shape of the points that they are given."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal

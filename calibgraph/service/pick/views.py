@@ -1,7 +1,5 @@
 """What the page shows of a frame: the points that a camera sees, and corners near a pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

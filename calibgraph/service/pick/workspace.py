@@ -1,7 +1,5 @@
 """A dataset, its session on disk, and the estimate of the pairs so far."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import lru_cache
