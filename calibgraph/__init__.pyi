@@ -39,9 +39,9 @@ from .io.camera_match_tables import load_camera_matches as load_camera_matches
 from .io.correspondence_tables import load_correspondences as load_correspondences
 from .io.dataset import Dataset as Dataset
 from .io.dataset import load_dataset as load_dataset
+from .io.formats.describe import describe_rig as describe_rig
 from .io.formats.export import export_calibration as export_calibration
 from .io.formats.rig_import import import_rig as import_rig
-from .io.formats.words import describe_rig as describe_rig
 from .io.frame import Frame as Frame
 from .io.rigs import load_rig as load_rig
 from .io.ros_messages import camera_from_message as camera_from_message

@@ -4,8 +4,6 @@ It is kept from request to request, because loading the libraries takes longer t
 It is no process of ``multiprocessing``: workers of Dask may not have such children.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -40,12 +38,7 @@ class ChildTimeoutError(Exception):
 
 
 class ChildProcess:
-    """A process that answers one request at a time; started when needed, and again after its end.
-
-    Args:
-        module: that it runs, with :func:`answer_requests`.
-        arguments: of its command line.
-    """
+    """A process of a module that answers one request at a time; started again after its end."""
 
     def __init__(self, module: str, arguments: Sequence[str] = ()) -> None:
         self._module, self._arguments = module, tuple(arguments)
@@ -54,11 +47,7 @@ class ChildProcess:
         self._is_closed = False
 
     def start(self) -> None:
-        """Start the process unless it runs, and wait until it is ready.
-
-        Raises:
-            ChildEndedError: if it cannot be started.
-        """
+        """Start the process unless it runs, and wait until it is ready."""
         try:
             self._start()
         except (OSError, EOFError) as error:
@@ -66,11 +55,6 @@ class ChildProcess:
 
     def ask(self, request: Any, timeout_s: float, on_note: Note | None = None) -> Any:
         """The answer of the process that :meth:`start` started.
-
-        Args:
-            request: that can be pickled.
-            timeout_s: longest time until the answer.
-            on_note: called with what comes before it.
 
         Raises:
             ChildEndedError: if the process ends first.
@@ -189,7 +173,7 @@ def _end_with_parent(at_end: Callable[[], None]) -> None:
 
 @contextmanager
 def output_to(path: Path) -> Iterator[None]:
-    """Send all output into a file, that of compiled libraries too."""
+    """Send all output into a file, from compiled libraries too."""
     with path.open("ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)

@@ -1,7 +1,5 @@
 """Examine a dataset before anything is solved: its content, and the problems to fix first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +12,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
-from calibgraph.io.formats.words import describe_rig
+from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.camera_pairs import overlapping_pairs
@@ -191,12 +189,7 @@ def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, 
 
 
 def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding]:
-    """Frames with the same cloud or image: they are not independent.
-
-    Args:
-        what: of which sources.
-        sources: a frame's name and its file or message.
-    """
+    """Frames with the same cloud or image: they are not independent."""
     hashes = map_on_cores(hash_source, [path for _, path in sources])
     first: dict[str, str] = {}
     repeated = [

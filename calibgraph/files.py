@@ -1,7 +1,5 @@
 """Reading and writing files safely: atomic writes, hashes, content to checked models."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
@@ -65,12 +63,7 @@ def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSE
 
 
 def require_place_for_file(path: Path, *suffixes: str) -> None:
-    """Check, before hours of work, that a file can be written.
-
-    Args:
-        path: the file.
-        suffixes: the endings that its name may have, if given: so that no other kind of file is
-            overwritten by mistake.
+    """Check, before hours of work, that a file with one of the suffixes can be written.
 
     Raises:
         FileError: if it is a folder, if a folder above it is a file or not writable, or if it ends
@@ -84,11 +77,7 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
 
 
 def require_place_for_folder(folder: Path) -> None:
-    """Check, before hours of work, that a folder exists or can be created.
-
-    Raises:
-        FileError: if it or a parent is a file, or not writable.
-    """
+    """Check, before hours of work, that a folder exists or can be created."""
     for part in (folder, *folder.parents):
         if part.exists() and not part.is_dir():
             raise FileError(part, "is a file, expected a folder to write into; choose another")
@@ -180,11 +169,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file.
-
-    Raises:
-        FileError: if it is missing, or not UTF-8.
-    """
+    """Read a text file."""
     try:
         return require_file(path).read_text("utf-8")
     except UnicodeDecodeError as error:
@@ -192,13 +177,7 @@ def read_text(path: Path) -> str:
 
 
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:
-    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line.
-
-    Args:
-        path: of the file.
-        content: the mapping.
-        first_line: a comment above it.
-    """
+    """Write a mapping as YAML, atomically; keys keep their order, number lists stay on one line."""
     text = yaml_text(content)
     write_text(path, f"{first_line}\n{text}" if first_line else text)
 

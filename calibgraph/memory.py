@@ -1,6 +1,4 @@
-"""Arrays for values that are kept for long, apart from the heap."""
-
-from __future__ import annotations
+"""Arrays for long-lived values, outside the heap."""
 
 import math
 import mmap
@@ -12,8 +10,8 @@ from numpy.typing import DTypeLike, NDArray
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
-def reserve(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """An array of zeros in pages of its own, of which only those written take memory.
+def mmap_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """An array of zeros in pages of its own; only written pages take memory.
 
     They return to the system with the array. On the heap, arrays that are kept would lie between
     the temporary ones of several threads, and hold these threads' memory.
@@ -23,8 +21,8 @@ def reserve(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     return np.frombuffer(pages, dtype, count).reshape(shape)
 
 
-def keep(values: NDArray[Scalar]) -> NDArray[Scalar]:
-    """A copy of an array in pages of its own, see :func:`reserve`."""
-    kept: NDArray[Scalar] = reserve(values.shape, values.dtype)
+def mmap_copy(values: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A copy of an array in pages of its own, see :func:`mmap_zeros`."""
+    kept: NDArray[Scalar] = mmap_zeros(values.shape, values.dtype)
     kept[...] = values
     return kept

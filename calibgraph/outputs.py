@@ -1,14 +1,12 @@
 """What a command may write: never over what it reads, nor over what the program did not write.
 
-Each format has a mark by which its files are recognised; a file without one is its user's.
+Each kind of file holds a mark; a file without it is its user's.
 """
-
-from __future__ import annotations
 
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +14,8 @@ from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_file
 
 _PNG_HEADER_BYTES = 33  # signature and IHDR
+_SEARCHED_BYTES = 2**20  # at the beginning, and at the end: Parquet has its metadata there
 _DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
-
-
-def is_never_ours(path: Path) -> bool:
-    """For files without a place for a mark: none that exists is replaced."""
-    return False
 
 
 @dataclass(frozen=True)
@@ -31,22 +25,36 @@ class Output:
     Attributes:
         path: of the file.
         by: the commands that write such files, in a message.
-        is_ours: whether a file that exists has the program's mark, so that it may be replaced.
+        marks: the program's files hold one of them; without marks no file is replaced.
         suffixes: the endings that its name may have, if not any.
+        marked: another file that holds the mark, for formats without a place for one.
     """
 
     path: Path
     by: str
-    is_ours: Callable[[Path], bool] = is_never_ours
+    marks: tuple[bytes, ...] = ()
     suffixes: tuple[str, ...] = ()
+    marked: Path | None = None
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether a file that exists was written by the program, so that it may be replaced."""
+        return any(is_marked(self.marked or self.path, mark) for mark in self.marks)
 
 
-def require_free(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:
+def is_marked(path: Path, mark: bytes) -> bool:
+    """Whether a file holds a mark near its beginning or its end."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if mark in file.read(_SEARCHED_BYTES):
+            return True
+        file.seek(max(0, path.stat().st_size - _SEARCHED_BYTES))
+        return mark in file.read()
+
+
+def require_writable(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:
     """Check, before hours of work, that files can be written without the loss of others.
-
-    Args:
-        outputs: the files to write.
-        read: the files that are read.
 
     Raises:
         FileError: if one of the outputs cannot be written, is read, or exists and is not ours.
@@ -59,7 +67,7 @@ def require_free(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:
             raise FileError(
                 path, "is read by this command, which would replace it; choose another --out"
             )
-        if os.path.lexists(path) and not output.is_ours(path):
+        if os.path.lexists(path) and not output.is_ours:
             raise FileError(
                 path,
                 f"was not written by calibgraph {output.by}, and would be replaced; move it, or "
@@ -67,17 +75,13 @@ def require_free(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:
             )
 
 
-def require_apart(path: Path, datasets: Iterable[Path]) -> None:
-    """Check that what is written does not lie among the images and clouds of a dataset.
+def require_outside_dataset(path: Path, datasets: Iterable[Path]) -> None:
+    """Check that a file or folder is not written among the images and clouds of a dataset.
 
     There it would be taken for one of them, and the dataset refused from then on.
 
-    Args:
-        path: of the file or folder that is written.
-        datasets: folders, or whatever else is read.
-
     Raises:
-        FileError: if it does.
+        FileError: if it is.
     """
     written = path.resolve()
     for folder in datasets:
@@ -94,34 +98,18 @@ def yaml_mark(command: str) -> str:
     return f"# Written by calibgraph {command}"
 
 
-def has_yaml_mark(command: str) -> Callable[[Path], bool]:
-    """Whether a YAML file was written by a command, by its first line."""
-    return starts_with(yaml_mark(command).encode() + b"\n")
+def marked_yaml(path: Path, command: str) -> Output:
+    """A YAML file with the mark of a command."""
+    return Output(path, command, (yaml_mark(command).encode() + b"\n",), (".yaml", ".yml"))
 
 
 def png_mark(command: str) -> bytes:
-    """The chunk of a PNG picture that names the command which wrote it."""
-    text = b"tEXtSoftware\0calibgraph " + command.encode()
-    return struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    """The text of a PNG picture that names the command which wrote it."""
+    return b"tEXtSoftware\0calibgraph " + command.encode()
 
 
 def with_png_mark(picture: bytes, command: str) -> bytes:
-    """A PNG picture with the mark of a command behind its header."""
-    return picture[:_PNG_HEADER_BYTES] + png_mark(command) + picture[_PNG_HEADER_BYTES:]
-
-
-def has_png_mark(command: str) -> Callable[[Path], bool]:
-    """Whether a PNG picture was written by a command."""
-    return starts_with(png_mark(command), _PNG_HEADER_BYTES)
-
-
-def starts_with(mark: bytes, behind: int = 0) -> Callable[[Path], bool]:
-    """Whether a file starts with these bytes, behind so many others."""
-
-    def is_marked(path: Path) -> bool:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return file.read(behind + len(mark))[behind:] == mark
-
-    return is_marked
+    """A PNG picture with the mark of a command in a chunk behind its header."""
+    text = png_mark(command)
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    return picture[:_PNG_HEADER_BYTES] + chunk + picture[_PNG_HEADER_BYTES:]

@@ -1,7 +1,5 @@
 """What cameras see in common, added to the last round's solution."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from calibgraph.errors import CalibrationError

@@ -1,7 +1,5 @@
 """Threads: as many as there are cores, and values that they make once."""
 
-from __future__ import annotations
-
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -54,7 +52,7 @@ def map_on_cores(function: Callable[..., Result], *arguments: Sequence[Any]) -> 
     return [*_kept_pool().map(function, *arguments)]
 
 
-class Once(Generic[Key, Value]):
+class KeyedCache(Generic[Key, Value]):
     """Values by key, each made by the first thread that needs it; the one used last comes last."""
 
     def __init__(self) -> None:

@@ -9,8 +9,6 @@ groups of windows constrain a camera, but not a single frame), so T_hat is the e
 starts from. With ``cmrnext`` and with tables of correspondences, Stage 1 is the paper's.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Progress callbacks, and the wall time of named stages."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,18 +13,14 @@ def no_progress(task: str, done: int, total: int) -> None:
 
 
 class Stopwatch:
-    """Wall time of named stages: ``with watch("stage"): ...``.
-
-    Attributes:
-        seconds: by stage.
-    """
+    """Wall time of named stages: ``with watch("stage"): ...``."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Add the wall time of the body to that of a stage."""
+        """Add the wall time of the body to a stage's."""
         start = time.perf_counter()
         try:
             yield

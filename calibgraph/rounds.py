@@ -4,8 +4,6 @@ The paper matches once and solves once. A weight-free matcher sees only what is 
 coarse and is run again from every better estimate.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -150,7 +148,7 @@ def find_stationary(data: Dataset, rig: Rig) -> Places:
 
 
 def _deadline(seconds: float | None) -> Callable[[], bool]:
-    """A function that returns whether so many seconds have passed since now."""
+    """A function that returns whether a time limit [s], counted from now, has passed."""
     if seconds is not None and not seconds > 0:
         raise ValueError(f"the time limit must be positive, found {seconds} s")
     end = math.inf if seconds is None else time.monotonic() + seconds
@@ -169,9 +167,6 @@ def _solve(
 
     A camera with too few correspondences is placed by what it sees in common with another; if that
     does not place it either, it is excluded, and the others are calibrated.
-
-    Raises:
-        CorrespondenceError: if that is so of all cameras.
     """
     try:
         return solve_joint(*matched, config, terms)

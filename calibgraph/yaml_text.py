@@ -1,7 +1,5 @@
 """YAML as text: mappings in and out, and what no file of ours may hold refused in one line."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -28,11 +26,7 @@ def parse_yaml(text: str, path: Path | str) -> dict[str, Any]:
 
 
 def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
-    """The mappings in the text of a YAML file, between lines ``---``; without empty ones.
-
-    Raises:
-        FileError: as of :func:`parse_yaml`.
-    """
+    """The mappings in the text of a YAML file, between lines ``---``; without empty ones."""
     separators = sum(map(text.count, _SEPARATORS))
     if separators > MAX_YAML_VALUES:
         why = f"holds some {separators} values, expected up to {MAX_YAML_VALUES}; is it a table?"
@@ -130,11 +124,7 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
 
 
 class UnusualInt(int):
-    """A whole number that other programs may take for another one, or for a text.
-
-    Attributes:
-        text: as it is written: ``0x10``, ``0b10``, ``010`` (8 to YAML 1.1), ``1_000``.
-    """
+    """A whole number that other programs may take for another one, or for a text."""
 
     text = ""
 

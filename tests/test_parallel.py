@@ -4,12 +4,12 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from calibgraph.parallel import Once, count_cores
+from calibgraph.parallel import KeyedCache, count_cores
 
 
 def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
     made: list[int] = []
-    once: Once[str, int] = Once()
+    once: KeyedCache[str, int] = KeyedCache()
     barrier = threading.Barrier(4)
 
     def make() -> int:
@@ -27,7 +27,7 @@ def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
 
 
 def test_values_used_longest_ago_are_dropped_first() -> None:
-    once: Once[str, int] = Once()
+    once: KeyedCache[str, int] = KeyedCache()
     for name, size in (("a", 3), ("b", 3), ("c", 3)):
         once.get(name, lambda size=size: size)
     once.get("a", lambda: 0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.dataset import Dataset, load_dataset
-from calibgraph.io.kitti import CALIBRATION_NAME, load_kitti_rig
+from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
 from calibgraph.io.rigs import REFERENCE_FILE, load_rig
 from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Config, PresetName
@@ -177,7 +177,7 @@ class Recorded:
         folder = self.folders[0]
         if (folder / CALIBRATION_NAME).is_file():
             return {
-                "K^-1 P[:,3] (right)": load_kitti_rig(folder),
+                "K^-1 P[:,3] (right)": read_kitti_rig(folder).rig,
                 "P[0,3]/fx only": rig_shifted_along_x(folder),
             }
         if not (folder / REFERENCE_FILE).is_file():
@@ -220,7 +220,7 @@ class Recorded:
 
 def rig_shifted_along_x(sequence: Path) -> Rig:
     """A KITTI rig as some tools read it: shifted by P[0, 3] / fx along x, about 5 mm off."""
-    rig = load_kitti_rig(sequence)
+    rig = read_kitti_rig(sequence).rig
     lines = (sequence / CALIBRATION_NAME).read_text("utf-8").splitlines()
     values = dict(line.split(":", 1) for line in lines if ":" in line)
     T_camera_lidar = {}

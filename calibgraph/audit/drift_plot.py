@@ -10,15 +10,12 @@ import numpy as np
 
 from calibgraph.audit.drift_result import CameraDrift, Drift
 from calibgraph.files import write_atomically
-from calibgraph.outputs import Output
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_MARK = "calibgraph drift"
-_HEAD_BYTES = 500
 _DPI = 100
 _ROW_IN, _FRAME_IN, _RESULT_IN = 2.2, 1.2, 0.55
 _NARROWEST_IN, _WIDEST_IN = 9.0, 30.0
@@ -33,19 +30,6 @@ _TURNED_DEG = 30.0  # names below the panels
 _APART = 0.16  # of two axes of one result, in results
 
 
-def output_of_drift_plot(path: Path) -> Output:
-    """The picture, which may replace an earlier one."""
-    return Output(path, "drift", _is_ours, (".png",))
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether a picture is of this command, by the text in its head."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MARK.encode() in file.read(_HEAD_BYTES)
-
-
 def draw_drift(drift: Drift, path: Path) -> None:
     """Draw the deviations with their sigmas and the tolerance; PNG, atomically.
 
@@ -57,7 +41,9 @@ def draw_drift(drift: Drift, path: Path) -> None:
         warnings.filterwarnings("ignore", "Glyph", UserWarning)
         write_atomically(
             path,
-            lambda part: figure.savefig(part, format="png", dpi=_DPI, metadata={"Software": _MARK}),
+            lambda part: figure.savefig(
+                part, format="png", dpi=_DPI, metadata={"Software": "calibgraph drift"}
+            ),
         )
 
 

@@ -12,14 +12,11 @@ from calibgraph.audit.page_camera import camera_sections
 from calibgraph.audit.result import Audit, twist_cells
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
-from calibgraph.model.result_files import has_page_mark
 from calibgraph.model.summary import Reason
-from calibgraph.outputs import Output
 from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import depth_scale
 
-_BY = "check"
-_MARK = f'<meta name="generator" content="calibgraph {_BY}">'.encode()
+MARK = b'<meta name="generator" content="calibgraph check">'
 
 _CALIBRATE = (
     "Do not use it any longer. Fasten what is loose, and calibrate again: calibgraph calibrate. If "
@@ -30,11 +27,6 @@ _RECORD = (
     "Record again, and check that: 30 frames or more, at different places, with walls, poles and "
     "vehicles near and far, and all over the image. The reasons name what is missing."
 )
-
-
-def output_of_audit_report(path: Path) -> Output:
-    """The page, which may replace an earlier one."""
-    return Output(path, _BY, has_page_mark(_MARK), (".html", ".htm"))
 
 
 def write_audit_report(audit: Audit, path: Path | str) -> Path:

@@ -26,15 +26,13 @@ from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
 from calibgraph.cli.former_options import with_present_options
-from calibgraph.cli.guess import guess
-from calibgraph.cli.init import init
-from calibgraph.cli.inspect import evaluate, perturb, report
+from calibgraph.cli.guess import guess, init
+from calibgraph.cli.inspect import evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.pick import pick
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
-from calibgraph.cli.view import view
 
 if TYPE_CHECKING:
     from calibgraph.outputs import Output
@@ -95,13 +93,13 @@ COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
     report: outputs.page,
     view: outputs.recordings,
     evaluate: outputs.nothing,
-    perturb: outputs.guess,
-    bag: outputs.rig_of_bag,
+    perturb: outputs.rig_of("perturb"),
+    bag: outputs.rig_of("bag"),
     doctor: outputs.pictures,
     init: outputs.nothing,
-    guess: outputs.rig_guess,
+    guess: outputs.rig_of("guess"),
     export: outputs.exported,
-    import_: outputs.imported,
+    import_: outputs.rig_of("import"),
     simulate: outputs.nothing,
     weights: outputs.weights,
     train: outputs.training,
@@ -158,11 +156,7 @@ def main() -> None:
 
 
 def _require_utf8(arguments: list[str]) -> None:
-    """Check the arguments: results hold the paths of their input, as text.
-
-    Raises:
-        CalibrationError: if one is not UTF-8.
-    """
+    """Check the arguments: results hold the paths of their input, as text."""
     from calibgraph.errors import CalibrationError
 
     for argument in arguments:

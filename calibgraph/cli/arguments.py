@@ -32,14 +32,7 @@ def checked_arguments() -> Iterator[None]:
 def dataset_from(
     folders: list[Path], rig: Path | None, frames: str | None, bag: BagOptions | None = None
 ) -> Dataset:
-    """The dataset in these folders; of bags, a line each is printed.
-
-    Args:
-        folders: of one rig.
-        rig: file of the initial guess; the dataset's own if None.
-        frames: positions, ``A:B:STEP``; all if None.
-        bag: how ROS bags are read.
-    """
+    """The dataset in these folders; of bags, a line each is printed."""
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
@@ -52,10 +45,6 @@ def dataset_from(
 
 def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | None:
     """How bags are read; None if no option is given.
-
-    Args:
-        topic: ``NAME=/TOPIC``, each.
-        options: the fields of :class:`calibgraph.BagOptions`; None if not given.
 
     Raises:
         CalibrationError: if a value is out of range, or a topic has no name.
@@ -93,9 +82,6 @@ def matcher_from(
         seed: of everything random.
         all_frames: match all frames, as when the user has selected them.
         options: of cmrnext, and the search_deg and search_m of structure; None if not given.
-
-    Raises:
-        ValueError: if an option is for another matcher.
     """
     given = {key: value for key, value in options.items() if value is not None}
     search = {key: _parse_range(key, given.pop(key)) for key in _SEARCH_OPTIONS if key in given}
@@ -147,11 +133,7 @@ def _flag(name: str) -> str:
 
 
 def config_from(config: Path | None, preset_name: str | None, **given: float | None) -> Config:
-    """The settings of a file or of a preset; options that are given replace theirs.
-
-    Raises:
-        ValueError: if both a file and a preset are given.
-    """
+    """The settings of a file or of a preset; options that are given replace theirs."""
     from calibgraph.model.config import load_config, preset
 
     if config is not None and preset_name is not None:
@@ -165,11 +147,7 @@ def config_from(config: Path | None, preset_name: str | None, **given: float | N
 
 
 def terms_from(name: str) -> Terms:
-    """The terms of the objective of that name.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """The terms of the objective of that name."""
     from calibgraph.model.config import TERMS
 
     for terms in TERMS:
@@ -179,11 +157,7 @@ def terms_from(name: str) -> Terms:
 
 
 def require_service() -> None:
-    """Check that the server's packages are there.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that the server's packages are there."""
     from calibgraph.errors import CalibrationError
 
     try:

@@ -9,7 +9,7 @@ import typer
 
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
 from calibgraph.cli.options import JsonOption, TopicOption
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_json, print_plain, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
@@ -41,7 +41,7 @@ def bag(
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static."""
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
-    from calibgraph.io.formats.words import describe_rig
+    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
 
@@ -68,11 +68,7 @@ def bag(
 
 
 def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
-    """The sigmas of relative poses, [rad] and [m].
-
-    Raises:
-        ValueError: if only one is given.
-    """
+    """The sigmas of relative poses, [rad] and [m]."""
     from math import radians
 
     if tie_deg is None and tie_m is None:
@@ -83,11 +79,7 @@ def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] |
 
 
 def _topics(path: Path) -> list[tuple[str, str, int]]:
-    """Name, type and number of messages of each topic.
-
-    Raises:
-        FileError: if the path is no bag.
-    """
+    """Name, type and number of messages of each topic."""
     from calibgraph.errors import FileError
     from calibgraph.io.bags.messages import Bag
     from calibgraph.io.bags.storage import is_bag
@@ -102,8 +94,6 @@ def _topics(path: Path) -> list[tuple[str, str, int]]:
 def _print_json(
     topics: list[tuple[str, str, int]], rig: Rig, notes: list[str], out: Path | None
 ) -> None:
-    from calibgraph.report.as_json import print_json
-
     keys = ("topic", "type", "messages")
     print_json(
         {

@@ -8,27 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import remote
+from calibgraph.cli import options, remote
 from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
-from calibgraph.cli.options import (
-    BootstrapOption,
-    CameraMatchesOption,
-    CommonCmOption,
-    CommonDegOption,
-    ConfigOption,
-    ConfigSeedOption,
-    DatasetArgument,
-    JsonOption,
-    OutOption,
-    PresetOption,
-    RigArgument,
-    SeedOption,
-    TermsOption,
-    ToleratedCmOption,
-    ToleratedDegOption,
-)
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
@@ -38,17 +21,17 @@ if TYPE_CHECKING:
 
 @with_matching_options
 def calibrate(
-    dataset: DatasetArgument,
+    dataset: options.DatasetArgument,
     matching: MatchingOptions,
-    config: ConfigOption = None,
-    preset: PresetOption = None,
-    terms: TermsOption = "full",
-    out: OutOption = Path("calibration"),
-    seed: ConfigSeedOption = None,
-    bootstrap: BootstrapOption = None,
-    tolerance_deg: ToleratedDegOption = None,
-    tolerance_cm: ToleratedCmOption = None,
-    as_json: JsonOption = False,
+    config: options.ConfigOption = None,
+    preset: options.PresetOption = None,
+    terms: options.TermsOption = "full",
+    out: options.OutOption = Path("calibration"),
+    seed: options.ConfigSeedOption = None,
+    bootstrap: options.BootstrapOption = None,
+    tolerance_deg: options.ToleratedDegOption = None,
+    tolerance_cm: options.ToleratedCmOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
     from calibgraph.pipeline import calibrate
@@ -79,13 +62,13 @@ def calibrate(
 
 @with_matching_options
 def match(
-    dataset: DatasetArgument,
+    dataset: options.DatasetArgument,
     matching: MatchingOptions,
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
     ] = Path("correspondences.parquet"),
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 0,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Find correspondences and write them as a table; exit 1 if a camera was not found."""
     from calibgraph.model.result_files import MATCH, WRITTEN_KEY
@@ -105,7 +88,7 @@ def match(
 
 
 def solve(
-    rig: RigArgument,
+    rig: options.RigArgument,
     correspondences: Annotated[
         Path,
         typer.Argument(
@@ -113,18 +96,18 @@ def solve(
             help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
         ),
     ],
-    terms: TermsOption = "full",
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    out: OutOption = Path("calibration"),
-    camera_matches: CameraMatchesOption = None,
-    seed: ConfigSeedOption = None,
-    bootstrap: BootstrapOption = None,
-    tolerance_deg: ToleratedDegOption = None,
-    tolerance_cm: ToleratedCmOption = None,
-    common_deg: CommonDegOption = None,
-    common_cm: CommonCmOption = None,
-    as_json: JsonOption = False,
+    terms: options.TermsOption = "full",
+    preset: options.PresetOption = None,
+    config: options.ConfigOption = None,
+    out: options.OutOption = Path("calibration"),
+    camera_matches: options.CameraMatchesOption = None,
+    seed: options.ConfigSeedOption = None,
+    bootstrap: options.BootstrapOption = None,
+    tolerance_deg: options.ToleratedDegOption = None,
+    tolerance_cm: options.ToleratedCmOption = None,
+    common_deg: options.CommonDegOption = None,
+    common_cm: options.CommonCmOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256
@@ -172,8 +155,6 @@ def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -
     """Print the counts of a table of correspondences; exit 1 if a camera was not found."""
     missed = list(table.findings.missed)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json({"out": str(out), "matches": table.counts(), "missed": missed})
     else:
         counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
@@ -189,7 +170,7 @@ def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -
 def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
     """Print a result; exit 1 if it is FAIL."""
     if as_json:
-        from calibgraph.report.as_json import print_json, result_summary
+        from calibgraph.report.as_json import result_summary
 
         print_json(result_summary(result, written))
     else:

@@ -1,7 +1,5 @@
 """The command that audits a deployed calibration: check."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +9,7 @@ import typer
 from calibgraph.cli import remote
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
-from calibgraph.cli.terminal import progress_bar, terminal
+from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CANNOT TELL": 3}
 
@@ -71,11 +69,10 @@ def check(
         write_audit_report(audit, page)
     if as_json:
         from calibgraph.audit import audit_summary
-        from calibgraph.report.as_json import print_json
 
         print_json(audit_summary(audit))
     else:
-        from calibgraph.cli.audit_table import print_audit
+        from calibgraph.cli.audit_tables import print_audit
 
         print_audit(terminal(), audit, page)
     raise typer.Exit(_EXIT_CODES[audit.status])

@@ -1,53 +1,41 @@
 """The command doctor: what to fix in a dataset before it is calibrated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
-from calibgraph.cli.options import (
-    DatasetArgument,
-    EverySecondsOption,
-    FramesOption,
-    JsonOption,
-    MotionOption,
-    RigOption,
-    StampsOption,
-    ToleranceOption,
-    TopicOption,
-)
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 
 def doctor(
-    dataset: DatasetArgument,
-    rig: RigOption = None,
-    frames: FramesOption = None,
+    dataset: options.DatasetArgument,
+    rig: options.RigOption = None,
+    frames: options.FramesOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR", help="Folder for guess_CAMERA.png: the guess on an image of each camera."
         ),
     ] = None,
-    topic: TopicOption = None,
-    every_s: EverySecondsOption = None,
-    tolerance_s: ToleranceOption = None,
-    stamps: StampsOption = None,
-    motion: MotionOption = None,
-    as_json: JsonOption = False,
+    topic: options.TopicOption = None,
+    every_s: options.EverySecondsOption = None,
+    tolerance_s: options.ToleranceOption = None,
+    stamps: options.StampsOption = None,
+    motion: options.MotionOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
     from calibgraph.doctor import diagnose
     from calibgraph.files import require_place_for_folder
     from calibgraph.io.rigs import load_rig
-    from calibgraph.outputs import require_apart
+    from calibgraph.outputs import require_outside_dataset
 
     if out is not None:
         require_place_for_folder(out)
-        require_apart(out, dataset)
+        require_outside_dataset(out, dataset)
     bag = bag_options_from(
         topic, every_s=every_s, tolerance_s=tolerance_s, stamps=stamps, motion=motion
     )
@@ -55,8 +43,6 @@ def doctor(
         guess = load_rig(rig) if rig else None
         found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(found.to_mapping())
     else:
         for finding in found.findings:

@@ -1,7 +1,5 @@
 """The command that compares results with each other: drift."""
 
-from __future__ import annotations
-
 from datetime import date
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +8,7 @@ import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_json, print_plain, terminal
 
 _EXIT_CODES = {"OK": 0, "CHANGED": 1, "CANNOT TELL": 3}
 
@@ -69,11 +67,10 @@ def drift(
         draw_drift(found, plot)
     if as_json:
         from calibgraph.audit import drift_summary
-        from calibgraph.report.as_json import print_json
 
         print_json(drift_summary(found))
     else:
-        from calibgraph.cli.drift_table import print_drift
+        from calibgraph.cli.audit_tables import print_drift
 
         print_drift(terminal(), found)
         print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")
@@ -81,11 +78,7 @@ def drift(
 
 
 def _parse_days(text: str) -> list[float]:
-    """Days of dates or numbers, separated by commas.
-
-    Raises:
-        ValueError: if one is neither.
-    """
+    """Days of dates or numbers, separated by commas."""
     return [_parse_day(part.strip()) for part in text.split(",")]
 
 

@@ -138,11 +138,7 @@ def export(
 
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
-    """The (4, 4) of six numbers.
-
-    Raises:
-        ValueError: if they are not six, or an angle is in degrees.
-    """
+    """The (4, 4) of six numbers."""
     from calibgraph.io.rotations import pose_of_angles
 
     try:
@@ -175,8 +171,8 @@ def import_(
     ] = 0.005,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
+    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
-    from calibgraph.io.formats.words import describe_rig
     from calibgraph.outputs import yaml_mark
 
     named = [parse_file(text) for text in files]
@@ -218,11 +214,7 @@ def parse_file(text: str) -> tuple[str, Path]:
 
 
 def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
-    """The pairs of a repeated option A=B.
-
-    Raises:
-        ValueError: if there is no ``=``, or one A twice.
-    """
+    """The pairs of a repeated option A=B."""
     for text in texts or ():
         if "=" not in text:
             raise ValueError(f"{option} {text!r}: give two names with = between them")
@@ -234,11 +226,7 @@ def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height.
-
-    Raises:
-        ValueError: if they are not.
-    """
+    """Width and height."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise ValueError(f"--size {text!r}: give WIDTHxHEIGHT, as 1920x1200")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.fleet.run import Summary
@@ -110,8 +110,6 @@ def _interrupt_on_sigterm() -> Iterator[None]:
 
 def _print(summary: Summary, out: str, *, as_json: bool) -> None:
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json({"out": out, **asdict(summary)})
         return
     counts = [f"{summary.verdicts.get(name, 0)} {name}" for name in ("PASS", "WARN", "FAIL")]

@@ -37,7 +37,7 @@ def fleet_report(
         ),
     ] = "",
 ) -> None:
-    """One page for a whole fleet: who stands apart, what changed, how cameras are spread."""
+    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread."""
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.rows import read_rows
 
@@ -64,13 +64,13 @@ def fleet_model(
 
     Writes fleet_model.json, estimates.parquet and, with --rig, prior_MODEL.yaml and one per batch.
     """
-    from calibgraph.fleet.knowledge import write_knowledge
     from calibgraph.fleet.model import fit_fleet
+    from calibgraph.fleet.model_files import write_fleet_model
     from calibgraph.fleet.observations import newest_rows, observe
     from calibgraph.fleet.rows import read_rows
 
     fleet = fit_fleet(observe(newest_rows(read_rows(rows))))
-    written = write_knowledge(fleet, out, _rigs(rig or [], fleet))
+    written = write_fleet_model(fleet, out, _rigs(rig or [], fleet))
     _print(fleet)
     print_plain(terminal(), f"wrote {', '.join(str(path) for path in written[:2])}"
                 + (f" and {len(written) - 2} priors" if len(written) > 2 else ""))  # noqa: PLR2004  # fmt: skip

@@ -1,7 +1,5 @@
 """Former spellings of options: accepted for one release, and not shown in the help."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 

@@ -1,26 +1,15 @@
-"""The command guess: a rig to begin with, from words, files, or nothing."""
-
-from __future__ import annotations
+"""The commands for a rig to begin with: guess, from words, files or nothing; init, to fill in."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calibgraph.cli import exchange
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.exchange import (
-    CameraFrameOption,
-    FilesArgument,
-    LidarFrameOption,
-    RenameOption,
-    SizeOption,
-    parse_file,
-    parse_names,
-    parse_size,
-    print_doubts,
-)
+from calibgraph.cli.exchange import parse_names
 from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 MountOption = Annotated[
     list[str] | None,
@@ -38,7 +27,7 @@ ForwardOption = Annotated[
 
 
 def guess(
-    files: FilesArgument,
+    files: exchange.FilesArgument,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
     mount: MountOption = None,
     dataset: Annotated[
@@ -56,10 +45,10 @@ def guess(
         ),
     ] = None,
     forward: ForwardOption = "+x",
-    rename: RenameOption = None,
-    lidar_frame: LidarFrameOption = None,
-    camera_frame: CameraFrameOption = None,
-    size: SizeOption = None,
+    rename: exchange.RenameOption = None,
+    lidar_frame: exchange.LidarFrameOption = None,
+    camera_frame: exchange.CameraFrameOption = None,
+    size: exchange.SizeOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -68,31 +57,56 @@ def guess(
     from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.outputs import yaml_mark
 
-    named = [parse_file(text) for text in files]
+    named = [exchange.parse_file(text) for text in files]
     with checked_arguments(), progress_bar("reading") as progress:
         parts = read_rig_parts(
             [path for _, path in named],
             names={path: name for name, path in named if name},
-            rename=parse_names("--rename", rename),
+            rename=exchange.parse_names("--rename", rename),
             lidar_frame=lidar_frame,
-            camera_frames=parse_names("--camera-frame", camera_frame),
+            camera_frames=exchange.parse_names("--camera-frame", camera_frame),
         )
         found = guess_rig(
             parts,
-            mountings=parse_names("--mount", mount),
+            mountings=exchange.parse_names("--mount", mount),
             data=dataset or None,
             search=search or (),
             forward=forward,
-            size_px=None if size is None else parse_size(size),
+            size_px=None if size is None else exchange.parse_size(size),
             seed=seed,
             progress=progress,
         )
     found.save(out, first_line=yaml_mark("guess"))
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(found.to_mapping())
-    print_doubts(found.rig, parts.notes)
+    exchange.print_doubts(found.rig, parts.notes)
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")
+
+
+def init(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="Folder with lidar/ and cameras/NAME/.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="Rig file to write. (default: DATASET/rig.yaml)"),
+    ] = None,
+    mount: MountOption = None,
+    forward: ForwardOption = "+x",
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Replace the file, and the values in it."),
+    ] = False,
+) -> None:
+    """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained."""
+    from calibgraph.guessing.template import write_rig_template
+    from calibgraph.outputs import require_outside_dataset
+
+    if out is not None:
+        require_outside_dataset(out, [dataset])
+    with checked_arguments():
+        words = parse_names("--mount", mount)
+        path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)
+    print_plain(terminal(), f"{path}: written; replace every FILL_IN, then run calibgraph doctor")

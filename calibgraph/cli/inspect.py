@@ -1,43 +1,60 @@
-"""The commands about a result or a rig: report, evaluate, perturb."""
+"""The commands about a result or a rig: report, view, evaluate, perturb."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+
+if TYPE_CHECKING:
+    from calibgraph.model.calibration import Calibration
+
+ResultArgument = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Result: its folder, or its calibration.yaml.")
+]
+MovedOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--dataset",
+        metavar="DATASET",
+        help="Where the images and clouds are now, if they have moved; repeat it for several "
+        "folders, in the order in which they were calibrated.",
+    ),
+]
+
+
+def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
+    """A result, with its frames where they are now."""
+    from calibgraph.io.calibrations import load_calibration
+    from calibgraph.io.dataset import load_dataset
+    from calibgraph.report import relocate_frames
+
+    loaded = load_calibration(result)
+    if not dataset:
+        return loaded
+    with checked_arguments():
+        return relocate_frames(loaded, load_dataset(dataset, loaded.rig))
 
 
 def report(
-    result: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Result: its folder, or its calibration.yaml.")
-    ],
+    result: ResultArgument,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Page to write. (default: DIR/report.html)"),
     ] = None,
-    dataset: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DATASET",
-            help="Where the images and clouds are now, if they have moved; repeat it for several "
-            "folders, in the order in which they were calibrated.",
-        ),
-    ] = None,
+    dataset: MovedOption = None,
 ) -> None:
     """Write a result as one HTML page that opens without a network."""
-    from calibgraph.io.calibrations import load_calibration
-    from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report import relocate_frames, write_report
+    from calibgraph.report import write_report
 
-    loaded = load_calibration(result)
-    if dataset:
-        loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
+    loaded = _load_result(result, dataset)
     folder = result if result.is_dir() else result.parent
     path = write_report(loaded, out or folder / REPORT_FILE)
     print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
@@ -59,8 +76,6 @@ def evaluate(
     path = rig_file(estimate)
     errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(errors.to_mapping())
     else:
         from calibgraph.cli.tables import print_evaluation
@@ -100,3 +115,33 @@ def perturb(
         )
     displaced.save(out, first_line=yaml_mark("perturb"))
     print_plain(terminal(), f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
+
+
+def view(
+    result: ResultArgument,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Recording for Foxglove.")
+    ] = None,
+    dataset: MovedOption = None,
+) -> None:
+    """Write a result for viewers: clouds, images and projected points, before and after."""
+    from calibgraph.errors import CalibrationError
+    from calibgraph.view.mcap_file import write_mcap
+    from calibgraph.view.rerun_file import write_rerun
+
+    if rerun is None and mcap is None:
+        raise CalibrationError("nothing to write; give --rerun FILE.rrd, --mcap FILE.mcap or both")
+    loaded = _load_result(result, dataset)
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
+    written = []
+    with progress_bar("reading") as progress:
+        if rerun is not None:
+            written.append(write_rerun(loaded, rerun, progress=progress))
+        if mcap is not None:
+            written.append(write_mcap(loaded, mcap, progress=progress))
+    for path in written:
+        print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")

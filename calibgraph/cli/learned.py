@@ -1,7 +1,5 @@
 """The commands of the learned matcher: what is in a file of weights, and training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +7,7 @@ import typer
 
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import progress_bar, terminal
+from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 
 def weights(
@@ -26,8 +24,6 @@ def weights(
     if out is not None:
         checkpoint.save_safetensors(out)
     if as_json:
-        from calibgraph.report.as_json import print_json
-
         print_json(checkpoint.summary())
     else:
         from calibgraph.cli.tables import print_weights
@@ -95,7 +91,7 @@ def train(
     ] = 500,
     device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.")] = "auto",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed, instead of that of the settings.")
+        int | None, typer.Option(min=0, help="Seed, instead of the settings' one.")
     ] = None,
     resume: Annotated[
         bool,

@@ -9,27 +9,8 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, dataset_from, matcher_from
-from calibgraph.cli.options import (
-    BatchOption,
-    DeviceOption,
-    EstimateOption,
-    EverySecondsOption,
-    FramesOption,
-    HalfOption,
-    IterationsOption,
-    MatcherOption,
-    MotionOption,
-    OcclusionOption,
-    RigOption,
-    SearchDegOption,
-    SearchMetresOption,
-    StampsOption,
-    TimeLimitOption,
-    ToleranceOption,
-    TopicOption,
-    WeightsOption,
-)
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
@@ -44,28 +25,28 @@ _OF_BAGS = ("topic", "every_s", "tolerance_s", "stamps", "motion")
 class MatchingOptions:
     """Which frames are matched from which guess, and how; a field per option."""
 
-    rig: RigOption = None
-    matcher: MatcherOption = "structure"
-    frames: FramesOption = None
-    time_limit_s: TimeLimitOption = None
-    search_deg: SearchDegOption = None
-    search_m: SearchMetresOption = None
-    weights: WeightsOption = None
-    estimate: EstimateOption = None
-    device: DeviceOption = None
-    iterations: IterationsOption = None
-    half_resolution: HalfOption = None
-    occlusion_filter: OcclusionOption = None
-    batch: BatchOption = None
-    topic: TopicOption = None
-    every_s: EverySecondsOption = None
-    tolerance_s: ToleranceOption = None
-    stamps: StampsOption = None
-    motion: MotionOption = None
+    rig: options.RigOption = None
+    matcher: options.MatcherOption = "structure"
+    frames: options.FramesOption = None
+    time_limit_s: options.TimeLimitOption = None
+    search_deg: options.SearchDegOption = None
+    search_m: options.SearchMetresOption = None
+    weights: options.WeightsOption = None
+    estimate: options.EstimateOption = None
+    device: options.DeviceOption = None
+    iterations: options.IterationsOption = None
+    half_resolution: options.HalfOption = None
+    occlusion_filter: options.OcclusionOption = None
+    batch: options.BatchOption = None
+    topic: options.TopicOption = None
+    every_s: options.EverySecondsOption = None
+    tolerance_s: options.ToleranceOption = None
+    stamps: options.StampsOption = None
+    motion: options.MotionOption = None
 
     @property
     def limit_s(self) -> float | None:
-        """The time limit; without one, that of the search. Networks may need hours on a CPU."""
+        """The time limit, by default the search's. Networks may need hours on a CPU."""
         default = SEARCH_LIMIT_S if self.matcher == "structure" else None
         return default if self.time_limit_s is None else self.time_limit_s
 
@@ -83,14 +64,10 @@ class MatchingOptions:
 
 
 def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``.
-
-    Args:
-        command: a function for typer, one of whose parameters has this name.
-    """
+    """A command with :class:`MatchingOptions`, in the place of its parameter ``matching``."""
     hints = get_type_hints(MatchingOptions, include_extras=True)
     names = [field.name for field in fields(MatchingOptions)]
-    options = [
+    added = [
         inspect.Parameter(
             field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default,
             annotation=hints[field.name],
@@ -106,7 +83,7 @@ def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        parameters += options if parameter.name == "matching" else [keyword]
+        parameters += added if parameter.name == "matching" else [keyword]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in parameters}
     return run

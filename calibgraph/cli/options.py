@@ -1,6 +1,4 @@
-"""Arguments and options that commands share, and those of the matchers."""
-
-from __future__ import annotations
+"""Arguments and options that commands share, and the options of the matchers."""
 
 from pathlib import Path
 from typing import Annotated

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
 
-TABLE_SUFFIXES = (".parquet", ".csv")
+TABLE_SUFFIXES, PAGE_SUFFIXES = (".parquet", ".csv"), (".html", ".htm")
 WRITTEN = ("out", "rerun", "mcap", "plot", "page")
 """The options that name what a command writes."""
 
@@ -27,64 +27,56 @@ def result(given: Given) -> list[Output]:
 
 def table(given: Given) -> list[Output]:
     """A table of correspondences; a CSV file has no place for a mark."""
-    from calibgraph.model.result_files import is_table_of_match
+    from calibgraph.model.result_files import MATCH, table_mark
     from calibgraph.outputs import Output
 
-    return [Output(given["out"], "match", is_table_of_match, TABLE_SUFFIXES)]
+    return [Output(given["out"], "match", (table_mark(MATCH),), TABLE_SUFFIXES)]
 
 
 def page(given: Given) -> list[Output]:
     """The page of a report, in the folder of the result if it is not named."""
-    from calibgraph.model.result_files import REPORT_FILE, is_report
+    from calibgraph.model.result_files import PAGE_MARK, REPORT_FILE
     from calibgraph.outputs import Output
 
     folder = given["result"] if given["result"].is_dir() else given["result"].parent
-    return [Output(given["out"] or folder / REPORT_FILE, "report", is_report, (".html", ".htm"))]
+    return [Output(given["out"] or folder / REPORT_FILE, "report", (PAGE_MARK,), PAGE_SUFFIXES)]
 
 
 def recordings(given: Given) -> list[Output]:
     """A result for viewers."""
-    from calibgraph.view.mcap_file import output_of_mcap
-    from calibgraph.view.rerun_file import output_of_rerun
+    from calibgraph.view.mcap_file import PROFILE
+    from calibgraph.view.rerun_file import APPLICATION
 
-    makers = {"rerun": output_of_rerun, "mcap": output_of_mcap}
-    return [make(given[name]) for name, make in makers.items() if given[name] is not None]
+    rerun = _if_wanted(given["rerun"], "view", APPLICATION.encode(), (".rrd",))
+    return rerun + _if_wanted(given["mcap"], "view", PROFILE.encode(), (".mcap",))
 
 
 def plot_of_drift(given: Given) -> list[Output]:
     """The picture of a comparison, if it is wanted."""
-    from calibgraph.audit.drift_plot import output_of_drift_plot
+    from calibgraph.outputs import png_mark
 
-    return [] if given["plot"] is None else [output_of_drift_plot(given["plot"])]
+    return _if_wanted(given["plot"], "drift", png_mark("drift"), (".png",))
 
 
 def page_of_audit(given: Given) -> list[Output]:
     """The page of an audit, if it is wanted."""
-    if given["page"] is None:
-        return []
-    from calibgraph.audit.page import output_of_audit_report
+    from calibgraph.audit.page import MARK
 
-    return [output_of_audit_report(given["page"])]
+    return _if_wanted(given["page"], "check", MARK, PAGE_SUFFIXES)
 
 
 def fleet_page(given: Given) -> list[Output]:
     """The page of a fleet."""
-    from calibgraph.model.result_files import is_report
-    from calibgraph.outputs import Output
+    from calibgraph.model.result_files import PAGE_MARK
 
-    return [Output(given["out"], "fleet-report", is_report, (".html", ".htm"))]
+    return _if_wanted(given["out"], "fleet-report", PAGE_MARK, PAGE_SUFFIXES)
 
 
 def fleet_model(given: Given) -> list[Output]:
-    """What a fleet knows, in the folder of ``--out``."""
-    from calibgraph.fleet.knowledge import outputs_of_knowledge
+    """The files of a fleet's model, in the folder of ``--out``."""
+    from calibgraph.fleet.model_files import outputs_of_fleet_model
 
-    return outputs_of_knowledge(given["out"])
-
-
-def guess(given: Given) -> list[Output]:
-    """A displaced rig."""
-    return [_marked_yaml(given["out"], "perturb")]
+    return outputs_of_fleet_model(given["out"])
 
 
 def exported(given: Given) -> list[Output]:
@@ -94,51 +86,43 @@ def exported(given: Given) -> list[Output]:
     return outputs_of_export(given["out"], given["format"])
 
 
-def imported(given: Given) -> list[Output]:
-    """A rig from files of others."""
-    return [_marked_yaml(given["out"], "import")]
+def rig_of(command: str) -> Callable[[Given], list[Output]]:
+    """The rig file of a command, if it is wanted."""
 
+    def outputs(given: Given) -> list[Output]:
+        from calibgraph.outputs import marked_yaml
 
-def rig_guess(given: Given) -> list[Output]:
-    """A rig to begin with."""
-    return [_marked_yaml(given["out"], "guess")]
+        return [] if given["out"] is None else [marked_yaml(given["out"], command)]
 
-
-def rig_of_bag(given: Given) -> list[Output]:
-    """A rig from a bag, if it is wanted."""
-    return [] if given["out"] is None else [_marked_yaml(given["out"], "bag")]
+    return outputs
 
 
 def pictures(given: Given) -> list[Output]:
     """The guess on images."""
-    from calibgraph.outputs import Output, has_png_mark
+    from calibgraph.outputs import Output, png_mark
 
     folder = given["out"]
     found = [] if folder is None else sorted(folder.glob("guess_*.png"))
-    return [Output(path, "doctor", has_png_mark("doctor")) for path in found]
+    return [Output(path, "doctor", (png_mark("doctor"),)) for path in found]
 
 
 def weights(given: Given) -> list[Output]:
     """Converted weights, if they are wanted."""
-    from calibgraph.outputs import Output
+    from calibgraph.matching.cmrnext import CONVERTED
 
-    def is_ours(path: Path) -> bool:
-        from calibgraph.matching.cmrnext import is_converted
-
-        return is_converted(path)
-
-    out = given["out"]
-    return [] if out is None else [Output(out, "weights", is_ours, (".safetensors",))]
+    return _if_wanted(given["out"], "weights", CONVERTED.encode(), (".safetensors",))
 
 
 def training(given: Given) -> list[Output]:
     """Settings beside the weights, which the library refuses to replace but with ``--resume``."""
+    from calibgraph.outputs import marked_yaml
+
     path = given["out"].with_suffix(".settings.yaml")
-    return [] if given["resume"] else [_marked_yaml(path, "train")]
+    return [] if given["resume"] else [marked_yaml(path, "train")]
 
 
 def picked(given: Given) -> list[Output]:
-    """The session of picking and what it gives, in the folder of ``--out``."""
+    """The session of picking and its files, in the folder of ``--out``."""
     from calibgraph.service.pick.reference import outputs_of_pick
 
     return outputs_of_pick(given["out"])
@@ -162,12 +146,14 @@ def keep_files(
 
     @wraps(command)
     def run(**given: Any) -> None:
-        from calibgraph.outputs import require_apart, require_free
+        from calibgraph.outputs import require_outside_dataset, require_writable
 
         files, read = outputs(given), [given[name] for name in given if name not in WRITTEN]
-        require_free(files, [path for each in read for path in _files_at(each)])
+        require_writable(files, [path for each in read for path in _files_at(each)])
         for output in files:
-            require_apart(output.path, (path for each in read for path in _folders_at(each)))
+            require_outside_dataset(
+                output.path, (path for each in read for path in _folders_at(each))
+            )
         command(**given)
 
     return run
@@ -204,7 +190,9 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _marked_yaml(path: Path, command: str) -> Output:
-    from calibgraph.outputs import Output, has_yaml_mark
+def _if_wanted(
+    path: Path | None, command: str, mark: bytes, suffixes: tuple[str, ...]
+) -> list[Output]:
+    from calibgraph.outputs import Output
 
-    return Output(path, command, has_yaml_mark(command), (".yaml", ".yml"))
+    return [] if path is None else [Output(path, command, (mark,), suffixes)]

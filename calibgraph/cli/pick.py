@@ -1,7 +1,5 @@
 """The command that opens a page to pick a reference on: pick."""
 
-from __future__ import annotations
-
 import webbrowser
 from pathlib import Path
 from typing import Annotated

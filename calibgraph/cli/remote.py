@@ -28,11 +28,7 @@ Inputs = Mapping[str, Sequence[Path]]
 
 
 def require_known(command: str | None) -> None:
-    """Check that a command can be carried out by a server.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that a command can be carried out by a server."""
     from calibgraph.errors import CalibrationError
 
     if SERVER.get() is not None and command not in COMMANDS:
@@ -119,11 +115,7 @@ def calibrate(
 
 
 def _search_of(matching: MatchingOptions) -> dict[str, Any]:
-    """The settings of the search; what a server does not offer is refused.
-
-    Raises:
-        CalibrationError: if an option is given that it does not have.
-    """
+    """The settings of the search; what a server does not offer is refused."""
     from calibgraph.cli.matching_options import MatchingOptions
     from calibgraph.errors import CalibrationError
 

@@ -1,7 +1,5 @@
 """The commands of the service: serve, token."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -158,11 +156,7 @@ def token(
 
 
 def _one_of(known: tuple[Word, ...], option: str, word: str) -> Word:
-    """The word that an option gives.
-
-    Raises:
-        CalibrationError: if it is not known.
-    """
+    """The word that an option gives."""
     for each in known:
         if word == each:
             return each

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,14 +37,18 @@ def print_plain(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
+def print_json(content: dict[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    from calibgraph.report import as_json
+
+    as_json.print_json(content)
+
+
 @contextmanager
 def progress_bar(first: str = "starting") -> Iterator[Progress]:
     """Progress on stderr: a bar that is removed in the end, or lines if stderr is no terminal.
 
     Warnings that the work logs are printed, a line each.
-
-    Args:
-        first: description until the callback is called for the first time.
     """
     console = terminal()
     if not console.is_terminal:
@@ -72,12 +76,7 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
 def progress_lines(
     print_line: Callable[[str], None], clock: Callable[[], float] = time.monotonic
 ) -> Progress:
-    """A progress callback that prints a line per stage, and not more often than is readable.
-
-    Args:
-        print_line: takes a line: the seconds so far, the stage, and the steps that are done.
-        clock: the time [s].
-    """
+    """A progress callback that prints a line per stage, and not more often than is readable."""
     start = printed = clock()
 
     def progress(what: str, done: int, total: int) -> None:

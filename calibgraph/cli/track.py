@@ -7,15 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, config_from, matcher_from
-from calibgraph.cli.options import (
-    ConfigOption,
-    ConfigSeedOption,
-    DeviceOption,
-    PresetOption,
-    RigArgument,
-    WeightsOption,
-)
 from calibgraph.cli.terminal import print_plain, terminal
 
 if TYPE_CHECKING:
@@ -23,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: RigArgument,
+    rig: options.RigArgument,
     source: Annotated[
         list[Path],
         typer.Argument(
@@ -48,11 +41,11 @@ def track(
         str | None,
         typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
     ] = None,
-    config: ConfigOption = None,
-    preset: PresetOption = None,
-    seed: ConfigSeedOption = None,
-    weights: WeightsOption = None,
-    device: DeviceOption = None,
+    config: options.ConfigOption = None,
+    preset: options.PresetOption = None,
+    seed: options.ConfigSeedOption = None,
+    weights: options.WeightsOption = None,
+    device: options.DeviceOption = None,
 ) -> None:
     """Keep all cameras calibrated while driving: one frame in, one line of JSON out.
 
@@ -90,11 +83,7 @@ def _tracking_matcher(
     seed: int,
     device: str | None,
 ) -> Matcher | None:
-    """The matcher for the frames of datasets; None for a source of correspondences.
-
-    Raises:
-        ValueError: if options need a matcher and there is none.
-    """
+    """The matcher for the frames of datasets; None for a source of correspondences."""
     if name:
         return matcher_from(name, weights, seed=seed, device=device)
     for option, value in (("--weights", weights), ("--device", device)):

@@ -1,7 +1,5 @@
 """Calibrations by a server, from Python; needs the extra ``client``."""
 
-from calibgraph.client.answers import RemoteJob, ServerError
-from calibgraph.client.asynchronous import AsyncClient
-from calibgraph.client.client import Client
+from calibgraph.client.client import Client, RemoteJob, ServerError
 
-__all__ = ["AsyncClient", "Client", "RemoteJob", "ServerError"]
+__all__ = ["Client", "RemoteJob", "ServerError"]

@@ -1,7 +1,5 @@
 """What is sent: files as they are, dataset folders as archives without compression."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,15 +30,7 @@ def is_uri(source: Source) -> bool:
 def form_of(
     inputs: Mapping[str, Sequence[Source]], texts: Mapping[str, str]
 ) -> Iterator[list[Field]]:
-    """The parts of a form; its files are open in the body.
-
-    Args:
-        inputs: by name: ``rig``, ``correspondences``, ``recording``.
-        texts: by name: ``settings`` as JSON, ``name``, ``note``.
-
-    Raises:
-        FileError: if one cannot be read.
-    """
+    """The parts of a form; its files are open in the body."""
     with ExitStack() as stack:
         fields: list[Field] = [(name, (None, text)) for name, text in texts.items()]
         for name, sources in inputs.items():
@@ -73,11 +63,7 @@ def _archive(folder: Path) -> Iterator[IO[bytes]]:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files of a dataset folder, a KITTI sequence or a ROS 2 bag.
-
-    Raises:
-        FileError: if there are none.
-    """
+    """The files of a dataset folder, a KITTI sequence or a ROS 2 bag."""
     layout = folder_layout(folder)
     found = [folder / name for name in _BESIDE if (folder / name).is_file()]
     for part in (layout.clouds, *layout.images.values()):

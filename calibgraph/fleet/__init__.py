@@ -1,1 +1,1 @@
-"""Many vehicles: what their calibrations have in common, and which of them stand apart."""
+"""Many vehicles: what their calibrations have in common, and which of them deviate."""

@@ -1,10 +1,8 @@
-"""The centres of a fleet as a factor graph: a camera's nominal pose, and those of its batches.
+"""The centres of a fleet as a factor graph: a camera's nominal pose, and its batches' poses.
 
 The variables are ``T_lidar_camera``. The vehicles of a batch are one factor: their information
 about the batch's centre adds up, 27 numbers per camera and batch, wherever the vehicles are held.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -59,13 +57,7 @@ def measured_batches(
 def solve_centers(
     start: Centers, measured: tuple[NDArray[np.intp], Array, Array], spread: Array
 ) -> Centers:
-    """The optimum of the graph, with its marginal covariances.
-
-    Args:
-        start: where it starts.
-        measured: as of :func:`measured_batches`.
-        spread: (b, 6, 6) covariance of each batch's deviation from the nominal pose.
-    """
+    """The optimum of the graph, with its marginal covariances."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(_NOMINAL, to_T_lidar_camera(start.nominal))
     for batch, (T, between) in enumerate(zip(start.batches, spread, strict=True), start=1):

@@ -1,7 +1,5 @@
 """A process of its own for jobs, see :mod:`calibgraph.child_process`."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 import time

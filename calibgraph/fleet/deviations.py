@@ -6,8 +6,6 @@ fleet needs follows from both posteriors: the shrunk deviations with their error
 each was moved, the information about the centre, and the second moments from which EM learns S.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The loop of a run: keep an engine busy, try again what may succeed, hand on the outcomes."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -24,15 +22,7 @@ LONGEST_WITHOUT_WORKERS_S = 120.0
 
 @dataclass(frozen=True)
 class Try:
-    """A job that is to be tried.
-
-    Attributes:
-        job: of the manifest.
-        input_hash: of its input; empty if it could not be read.
-        known: the outcome, if it is known without a try.
-        number: of the try, from 0.
-        log: of the tries before.
-    """
+    """A job to be tried, unless its outcome is known without a try; tries count from 0."""
 
     job: Job
     input_hash: str
@@ -42,13 +32,7 @@ class Try:
 
 
 class Driver:
-    """Runs jobs on an engine and publishes their outcomes.
-
-    Args:
-        engine: where they run.
-        publisher: of the rows.
-        limits: of each job.
-    """
+    """Runs jobs on an engine and publishes their outcomes."""
 
     def __init__(self, engine: Engine, publisher: Publisher, limits: Limits) -> None:
         self._engine, self._publisher, self._limits = engine, publisher, limits
@@ -58,10 +42,7 @@ class Driver:
         self._last_worker_s = time.monotonic()
 
     def run(self, tries: Iterable[Try], report: Progress) -> int:
-        """Run all, and publish what is done even if this is interrupted.
-
-        Returns:
-            How many tries were made beyond the first of each job.
+        """Run all, and publish what is done even if this is interrupted; count the retries.
 
         Raises:
             CalibrationError: if workers have another version of this package, or there are none.

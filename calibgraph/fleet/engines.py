@@ -4,8 +4,6 @@ An engine takes a task and gives a future. Queues, placement and lost machines a
 business; limits, retries and rows are the same for all.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,11 +17,7 @@ from calibgraph.parallel import count_cores
 
 
 class Engine(Protocol):
-    """Runs tasks.
-
-    Attributes:
-        slots: tasks that run at once; a few more may be submitted.
-    """
+    """Runs tasks, ``slots`` of them at once; a few more may be submitted."""
 
     slots: int
 
@@ -38,11 +32,7 @@ class Engine(Protocol):
 
 
 class ProcessEngine:
-    """Child processes of this one.
-
-    Args:
-        slots: how many; one per core if None.
-    """
+    """Child processes of this one: one per core if ``slots`` is None."""
 
     def __init__(self, slots: int | None = None) -> None:
         self.slots = slots or count_cores()
@@ -78,13 +68,7 @@ class ProcessEngine:
 
 
 class RayEngine:
-    """Tasks of a Ray cluster.
-
-    Args:
-        address: of the cluster; a local one if empty.
-        slots: tasks at once; the cluster's cores if None.
-        memory_bytes: that a task reserves on its machine.
-    """
+    """Tasks of a Ray cluster, or of a local one; each reserves ``memory_bytes``."""
 
     def __init__(
         self, address: str = "", slots: int | None = None, memory_bytes: int | None = None
@@ -132,12 +116,7 @@ class RayEngine:
 
 
 class DaskEngine:
-    """Tasks of a Dask cluster.
-
-    Args:
-        address: of the scheduler; a local cluster of one-threaded processes if empty.
-        slots: tasks at once; the cluster's threads if None.
-    """
+    """Tasks of a Dask cluster, or of a local one of one-threaded processes."""
 
     def __init__(self, address: str = "", slots: int | None = None) -> None:
         distributed = _require("distributed", "dask")
@@ -181,12 +160,7 @@ class DaskEngine:
 
 
 def open_engine(name: str, slots: int | None = None, memory_bytes: int | None = None) -> Engine:
-    """The engine of a name.
-
-    Args:
-        name: ``processes``; ``ray`` or ``dask``, with ``:ADDRESS`` for a cluster that runs.
-        slots: jobs at once.
-        memory_bytes: limit per job.
+    """The engine of a name: ``processes``, ``ray`` or ``dask``, with ``:ADDRESS`` of a cluster.
 
     Raises:
         CalibrationError: if there is none, its package is missing, or its cluster is not there.

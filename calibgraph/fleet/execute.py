@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.task import CameraResult, ErrorKind, Outcome, Task
+from calibgraph.fleet.task import CameraResult, Outcome, Task, describe_failure
 from calibgraph.fleet.uris import fetch
 from calibgraph.model.calibration import package_versions
 
@@ -18,32 +17,14 @@ if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
 
 
-class _FetchError(Exception):
-    """A remote recording could not be copied: perhaps it can be the next time."""
-
-
 def execute(task: Task, folder: Path) -> Outcome:
-    """Run a job; what is wrong with its data or its machine is part of the outcome.
-
-    Args:
-        task: the job and its limits.
-        folder: for copies of what is remote; its name is in no message.
-    """
+    """Run a job; what is wrong with its data or its machine is part of the outcome."""
     places = dict[str, str]()
     try:
         cameras = _results(_calibrate(task, _fetcher(task, folder, places)))
         return Outcome(cameras=cameras, versions=versions_text())
-    except MemoryError as error:
-        kind: ErrorKind = "out of memory"
-        why = f" ({error})" if str(error) else ""
-        text = f"not enough memory{why}; give fewer frames, or a larger --memory-gb"
-    except (CalibrationError, ValueError) as error:
-        kind, text = "bad input", str(error)
-    except (_FetchError, OSError) as error:
-        kind, text = "io", str(error)
     except Exception as error:
-        traceback.print_exc()
-        kind, text = "internal error", f"{type(error).__name__}: {error}"
+        kind, text = describe_failure(error)
     for place, uri in places.items():
         text = text.replace(place, uri)
     return Outcome(error_kind=kind, error=str(CalibrationError(text)), versions=versions_text())
@@ -69,8 +50,8 @@ def _fetcher(task: Task, folder: Path, places: dict[str, str]) -> Callable[[str]
             path = fetch(uri, target, task.limits.fetch_bytes)
         except CalibrationError:
             raise
-        except Exception as error:  # of any store's client
-            raise _FetchError(f"{uri}: cannot be fetched ({error})") from error
+        except Exception as error:  # of any store's client: the next time it may work
+            raise OSError(f"{uri}: cannot be fetched ({error})") from error
         places[str(path)] = uri
         return path
 

@@ -4,8 +4,6 @@ All tests of a fleet are one family: what is reported was chosen by Benjamini an
 so of many reports one in a hundred is expected to be wrong, however many tests there were.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ Array = NDArray[np.float64]
 Kind = Literal["mount", "batch", "date", "drift"]
 
 _MIN_ON_A_SIDE = 3
-"""Vehicles before and after a date: with fewer it is these vehicles that stand apart."""
+"""Vehicles before and after a date: with fewer, single vehicles would decide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +167,7 @@ def _p_value(change: Array, covariance: Array) -> float:
 
 
 def moved_lidars(fleet: FleetModel) -> list[str]:
-    """Vehicles of which the LiDAR was moved, not the cameras.
-
-    All cameras stand apart, and the poses between them do not.
-    """
+    """Vehicles whose LiDAR moved: all cameras deviate, and the poses between them do not."""
     of, found = fleet.observations, []
     for name, model in fleet.models.items():
         rows = (of.model == name) & of.measured & np.isin(of.camera, list(model.mounts))

@@ -99,7 +99,7 @@ class Mount:
         return measured_batches(self.centers.batches, information, weighted)
 
     def of_all(self, rows: Observations, pooled: Pooled) -> Mount:
-        """The same mount with other rows; batches of which nothing is known are as the model."""
+        """The same mount with other rows; unmeasured batches have the model's nominal pose."""
         known = np.searchsorted(self.batches, rows.batch).clip(max=len(self.batches) - 1)
         batch = np.where(np.array(self.batches)[known] == rows.batch, known, len(self.batches))
         new = self.centers.nominal_covariance + pooled.batch * self.spread
@@ -158,11 +158,7 @@ def moments_of(posterior: Posterior, moments: Array, spread: Array) -> Moments:
 
 
 def fit_mounts(observations: Observations) -> tuple[list[Mount], Pooled]:
-    """The mounts of one model's cameras that enough vehicles measured.
-
-    Args:
-        observations: of one model.
-    """
+    """The mounts of one model's cameras that enough vehicles measured."""
     usable = observations.select(observations.measured)
     names, counts = np.unique(usable.camera, return_counts=True)
     mounts = [start_mount(usable.select(usable.camera == name))

@@ -1,7 +1,5 @@
 """Manifests: which vehicles are calibrated, from which recordings, with which settings."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter
@@ -92,11 +90,7 @@ class Job:
         return is_table(self.recordings[0])
 
     def input_hash(self) -> str:
-        """SHA-256 of the rig, the settings and the recordings.
-
-        Raises:
-            FileNotFoundError: if one is not there.
-        """
+        """SHA-256 of the rig, the settings and the recordings."""
         parts = [fingerprint(uri) for uri in (*self.recordings, *([self.rig] if self.rig else []))]
         text = json.dumps([self.settings.model_dump(), len(self.recordings), *parts])
         return hashlib.sha256(text.encode()).hexdigest()
@@ -104,13 +98,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The jobs of a manifest.
-
-    Attributes:
-        uri: where it is from.
-        jobs: one per row.
-        others: the further columns, which the rows of the results carry, by row of the manifest.
-    """
+    """The jobs of a manifest, and its further columns, which the rows of results carry."""
 
     uri: str
     jobs: tuple[Job, ...]
@@ -118,14 +106,7 @@ class Manifest:
 
 
 def load_manifest(uri: str) -> Manifest:
-    """Read a manifest: Parquet, CSV or YAML.
-
-    Args:
-        uri: of a file. Relative paths in it start at its folder.
-
-    Raises:
-        FileError: if it is missing, or a row of it is wrong.
-    """
+    """Read a manifest: Parquet, CSV or YAML; relative paths in it start at its folder."""
     table = _read(uri)
     for name, count in Counter(table.column_names).items():
         if count > 1:

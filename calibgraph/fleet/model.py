@@ -1,7 +1,5 @@
 """What a fleet knows: the nominal pose of every camera, and every vehicle's deviation from it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,7 +55,7 @@ class FleetModel:
 
     @cached_property
     def apart(self) -> NDArray[np.bool_]:
-        """(n,) rows that stand apart, of which one in a hundred is expected not to."""
+        """(n,) rows that are flagged; about one flag in a hundred is false."""
         return likely(self.moved, self.observations.measured)
 
 

@@ -1,4 +1,4 @@
-"""The rows of a fleet as arrays: what each calibration measured, and of which vehicle."""
+"""The rows of a fleet as arrays: the measurement of each calibration, with its vehicle."""
 
 from __future__ import annotations
 
@@ -119,11 +119,6 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 def relative_observations(of: Observations, camera: str, reference: str) -> Observations:
     """The poses between two cameras, of the vehicles that have both.
 
-    Args:
-        of: the observations of one model.
-        camera: b.
-        reference: a.
-
     Returns:
         With T_b_a in place of T_camera_lidar, and its covariance in the axes of b. The errors of
         both cameras are taken as independent: a row holds no covariance between cameras.
@@ -146,11 +141,7 @@ def words(rows: pa.Table, name: str) -> Words:
 
 
 def days(rows: pa.Table) -> Array:
-    """(n,) the column ``date`` in days since 1970; NaN where there is none.
-
-    Raises:
-        CalibrationError: if it holds what is no date.
-    """
+    """(n,) the column ``date`` in days since 1970; NaN where there is none."""
     if "date" not in rows.column_names:
         return np.full(len(rows), np.nan)
     try:

@@ -1,7 +1,5 @@
 """The fleet on one page: compact arrays in the page, a table that draws what is in view."""
 
-from __future__ import annotations
-
 import base64
 from collections import Counter
 from pathlib import Path
@@ -15,7 +13,7 @@ from calibgraph.files import write_text
 from calibgraph.fleet.findings import find_changes
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import Words, newest_rows, observe
-from calibgraph.fleet.standing import STATES, Standing, stand
+from calibgraph.fleet.status import STATES, FleetStatus, assess_status
 from calibgraph.report.kit import load_template
 
 Array = NDArray[np.float64]
@@ -48,9 +46,9 @@ def write_fleet_report(
     newest = newest_rows(rows)
     fleet = fit_fleet(observe(newest))
     earlier = newest_rows(rows, days_ago=_WEEK) if before is None else newest_rows(before)
-    standing = stand(newest, fleet, earlier)
+    status = assess_status(newest, fleet, earlier)
     template = load_template("page.html.j2", "calibgraph.fleet")
-    content, last = payload(fleet, standing, link), _last_day(fleet.observations.day)
+    content, last = payload(fleet, status, link), _last_day(fleet.observations.day)
     write_text(
         path, template.render(content=content, vehicles=len(content["vehicles"]), newest=last)
     )
@@ -63,7 +61,7 @@ def _last_day(days: Array) -> str:
     return str(np.datetime64(int(known.max()), "D")) if len(known) else ""
 
 
-def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
+def payload(fleet: FleetModel, status: FleetStatus, link: str) -> dict[str, Any]:
     """What the page's script reads: names once, numbers as little-endian arrays in base64."""
     of = fleet.observations
     order = np.lexsort([of.camera, of.vehicle])
@@ -72,7 +70,7 @@ def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
     cameras, camera = np.unique(of.camera[order], return_inverse=True)
     models, model = _names(of.model[first])
     batches, batch = _names(of.batch[first])
-    reasons, reason = _count_reasons([standing.reasons[index] for index in order])
+    reasons, reason = _count_reasons([status.reasons[index] for index in order])
     sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
     return {
         "states": STATES, "link": link, "cameras": cameras.tolist(), "models": models,
@@ -81,8 +79,8 @@ def payload(fleet: FleetModel, standing: Standing, link: str) -> dict[str, Any]:
         "model": _pack(model, "<u2"), "batch": _pack(batch, "<u2"),
         "day": _pack(np.nan_to_num(of.day[first], nan=-1), "<i4"),
         "vehicle": _pack(vehicle, "<u4"), "camera": _pack(camera, "<u2"),
-        "state": _pack(standing.state[order], "<u1"),
-        "changed": _pack(standing.changed[order], "<u1"),
+        "state": _pack(status.state[order], "<u1"),
+        "changed": _pack(status.changed[order], "<u1"),
         "reason": _pack(reason, "<u2"),
         **{name: _pack(_scaled(np.where(of.measured[:, None], values, np.nan)[order]), "<i2")
            for name, values in (("deviation", fleet.deviation), ("sigma", sigma))},

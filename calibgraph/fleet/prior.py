@@ -1,7 +1,5 @@
 """What the next vehicle of a model starts from: nominal poses and relative poses, with sigmas."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,17 +19,9 @@ _LEAST_SIGMA = 1e-5  # of a relative pose in a rig file
 def expected_pose(mount: Mount, pooled: Pooled, batch: str | None = None) -> tuple[Array, Array]:
     """Where a further vehicle's camera is, unless it is moved in its mount.
 
-    Args:
-        mount: of the camera.
-        pooled: what the model's cameras share.
-        batch: of the vehicle; None for one of a batch that is not known.
-
     Returns:
         (4, 4) T_camera_lidar; (6, 6) covariance of xi in T_camera_lidar = exp(xi) that, which
         holds the spread of vehicles and batches and the uncertainty of the nominal pose.
-
-    Raises:
-        ValueError: if the batch has no vehicle.
     """
     centers = mount.centers
     if batch is None:
@@ -54,13 +44,8 @@ def prior_rig(rig: Rig, model: ModelFit, batch: str | None = None) -> Rig:
     relative poses share the deviation of the first camera, which the solve does not take into
     account.
 
-    Args:
-        rig: any of the model's, for its lenses; its own relative poses are left out.
-        model: of the fleet.
-        batch: of the vehicle; None for one of a batch that is not known.
-
     Raises:
-        RigError: if the rig has a camera of which the fleet knows nothing.
+        RigError: if the rig has a camera that the fleet has not measured.
     """
     unknown = [name for name in rig.cameras if name not in model.mounts]
     if unknown:

@@ -1,7 +1,5 @@
 """Outcomes to rows, and rows and logs to where they are kept."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import time
@@ -22,13 +20,7 @@ _WAIT_S = 5.0
 
 
 class Publisher:
-    """Publishes outcomes, some at a time.
-
-    Args:
-        store: of the rows.
-        others: the manifest's further columns, by its rows.
-        logs: whether to keep what jobs print.
-    """
+    """Publishes outcomes, some at a time."""
 
     def __init__(self, store: RowStore, others: pa.Table, *, logs: bool) -> None:
         self._store, self._others, self._logs = store, others, logs

@@ -4,8 +4,6 @@ A vehicle's rows are in the file of its bucket, ``bucket=HH/rows.parquet``, whic
 whole: a reader finds every row once, whatever ends the writer.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import io
@@ -108,9 +106,6 @@ class RowStore:
     Writers of one bucket on local disks wait for each other; on an object store, which has no
     locks, the last one of two at the same moment wins.
 
-    Args:
-        uri: of a folder, local or of fsspec.
-
     Raises:
         CalibrationError: if it is empty, or nothing can be written there.
     """
@@ -147,7 +142,7 @@ class RowStore:
         )  # fmt: skip
 
     def publish(self, rows: pa.Table) -> None:
-        """Add rows; those of the same vehicle and recordings are replaced.
+        """Add rows; earlier rows of the same vehicle and recordings are replaced.
 
         Each bucket's file is replaced in one step: by a rename of a synced file, or on an object
         store by one put.
@@ -194,7 +189,7 @@ def job_keys(rows: pa.Table) -> Iterable[tuple[str, ...]]:
 
 
 def _encode(rows: pa.Table) -> bytes:
-    """Rows as a Parquet file, those of a job together."""
+    """Rows as a Parquet file, the rows of a job together."""
     metadata = {**(rows.schema.metadata or {}), "format": FLEET_FORMAT}
     sink = io.BytesIO()
     parquet.write_table(

@@ -1,7 +1,5 @@
 """A manifest from its rows to the rows of its results: ``run_fleet``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -121,11 +119,7 @@ def _states(store: RowStore, jobs: Sequence[Job]) -> Iterator[dict[str, str]]:
 def _first_tries(
     manifest: Manifest, jobs: Sequence[Job], report: Progress, *, allow_missing: bool
 ) -> list[Try]:
-    """The jobs by bucket, with the hashes of their inputs.
-
-    Raises:
-        FileError: if inputs are missing, and may not be.
-    """
+    """The jobs by bucket, with the hashes of their inputs."""
     ordered = sorted(jobs, key=lambda job: (job.bucket, job.row))
     tries = []
     with ThreadPoolExecutor(_READERS) as pool:

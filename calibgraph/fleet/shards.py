@@ -1,7 +1,5 @@
 """Which part of a manifest a process does, where processes are started side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,10 +17,6 @@ _ARRAYS = (
 @dataclass(frozen=True)
 class Shard:
     """The buckets ``b`` with ``b % count == index``: no two shards write one file.
-
-    Attributes:
-        index: from 0.
-        count: of shards.
 
     Raises:
         CalibrationError: if the index is not below the count, or there are more than 256.
@@ -43,11 +37,7 @@ class Shard:
 
 
 def shard_from(text: str | None, environment: Mapping[str, str]) -> Shard:
-    """The shard of a text ``i/n`` or ``auto/n``, else that of the scheduler's array, else all.
-
-    Args:
-        text: of ``--shard``; with ``auto``, and without a text, the index is the scheduler's.
-        environment: with the scheduler's variables.
+    """The shard of a text ``i/n`` or ``auto/n``, else the scheduler's array's, else all.
 
     Raises:
         CalibrationError: if it is neither, or the scheduler gave an index without a count.

@@ -1,17 +1,31 @@
 """What a worker gets and what it returns: a job with its limits, and the job's outcome."""
 
-from __future__ import annotations
-
+import traceback
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
+from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
 
 ErrorKind = Literal[
     "bad input", "io", "out of memory", "timeout", "worker died", "internal error"
 ]  # fmt: skip
+
+
+def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
+    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"
+    if isinstance(error, (CalibrationError, ValueError)):
+        return "bad input", str(error)
+    traceback.print_exception(error)
+    if isinstance(error, OSError):
+        return "io", str(error)
+    return "internal error", f"{type(error).__name__}: {error}"
+
 
 RETRIES: dict[ErrorKind, int] = {
     "bad input": 0,
@@ -41,13 +55,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """One try of a job.
-
-    Attributes:
-        job: of the manifest.
-        limits: of the try.
-        release: of this package in the process that made the task.
-    """
+    """One try of a job, made by this release of the package."""
 
     job: Job
     limits: Limits
@@ -56,18 +64,7 @@ class Task:
 
 @dataclass(frozen=True)
 class CameraResult:
-    """The result of one camera.
-
-    Attributes:
-        camera: its name.
-        verdict: PASS, WARN or FAIL.
-        cannot_tell: whether it is WARN because the data determine too little.
-        probability_off: that it is off by more than the tolerance.
-        reasons: of the verdict, at most three.
-        T_camera_lidar: 16 numbers by rows.
-        covariance: 36 numbers by rows; None without an error bar.
-        actions: what to do, at most three sentences.
-    """
+    """The result of one camera, as its row holds it."""
 
     camera: str
     verdict: str
@@ -81,16 +78,7 @@ class CameraResult:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a try ended.
-
-    Attributes:
-        cameras: the results, none if it failed.
-        error_kind: None if it did not fail.
-        error: the failure, in one line.
-        seconds: wall time.
-        versions: of the packages in the process that ran it, as JSON; empty if it died.
-        log: what the job printed.
-    """
+    """How a try ended; without versions its process died."""
 
     cameras: tuple[CameraResult, ...] = ()
     error_kind: ErrorKind | None = None

@@ -1,7 +1,5 @@
 """Addresses of files: local paths, or URIs of fsspec such as ``s3://bucket/drive``."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator
@@ -89,9 +87,6 @@ def fingerprint(uri: str) -> str:
 
     Of the contents of local files; of the ETag, size and time of remote ones, which needs one
     listing and no byte of them.
-
-    Raises:
-        FileNotFoundError: if nothing is there.
     """
     filesystem, path = locate(uri)
     digest = hashlib.sha256()
@@ -123,16 +118,7 @@ def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
-    """The local path of a URI; what is remote is copied into a folder.
-
-    Args:
-        uri: of a file or folder.
-        folder: for the copy, which keeps the name.
-        most_bytes: that are copied.
-
-    Raises:
-        FileError: if there are more bytes than these.
-    """
+    """The local path of a URI; remote data of at most ``most_bytes`` are copied into a folder."""
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)

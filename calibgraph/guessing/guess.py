@@ -15,8 +15,8 @@ from calibgraph.errors import CalibrationError, RigError
 from calibgraph.guessing.heading_search import FoundCamera, search_headings
 from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
 from calibgraph.io.dataset import load_dataset
+from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
-from calibgraph.io.formats.words import describe_rig
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig

@@ -3,8 +3,6 @@
 Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), corrected for motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,11 +42,7 @@ def is_argoverse(folder: Path) -> bool:
 
 
 def read_argoverse_rig(log: Path) -> RigRead:
-    """The rig of a log: T_camera_lidar of the vehicle's frame; its images are undistorted.
-
-    Raises:
-        FileError: if a table is missing or malformed.
-    """
+    """The rig of a log: T_camera_lidar of the vehicle's frame; its images are undistorted."""
     poses = _by_name(log / _POSES, (*_QUATERNION, *_PLACE))
     lenses = _by_name(log / _LENSES, (*_LENS, *_SIZE))
     names = sorted(each.name for each in (log / _CAMERAS).glob("*/"))
@@ -72,11 +66,7 @@ def _camera(
 
 
 def argoverse_frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The sweeps that have an image of every camera, in order of time.
-
-    Raises:
-        FileError, DatasetError: if files are missing, or no sweep has all images.
-    """
+    """The sweeps that have an image of every camera, in order of time."""
     sweeps = _stamped(log / _LIDAR, (".feather",))
     stamps = np.array(list(sweeps))
     images = {name: _stamped(log / _CAMERAS / name, IMAGE_SUFFIXES) for name in cameras}
@@ -95,11 +85,7 @@ def argoverse_frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
 
 
 def describe_motion(log: Path) -> str:
-    """How far the vehicle moves between sweeps and their images, in a line; empty without poses.
-
-    Raises:
-        FileError: if a table is malformed.
-    """
+    """How far the vehicle moves between sweeps and their images, in a line; empty without poses."""
     if not (log / _TRAJECTORY).is_file():
         return ""
     cameras = [each.name for each in (log / _CAMERAS).glob("*/")]

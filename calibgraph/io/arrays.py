@@ -1,7 +1,5 @@
 """Datasets of arrays: images and clouds of a program that has them in memory, without files."""
 
-from __future__ import annotations
-
 import hashlib
 import uuid
 from collections.abc import Mapping, Sequence
@@ -26,12 +24,7 @@ _COLOURS = (3, 4)  # channels
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrame(Frame):
-    """A frame in memory; its paths are names.
-
-    Attributes:
-        cloud: (n, 4) x y z [m], intensity.
-        images: (height, width, 3) BGR by camera.
-    """
+    """A frame in memory; its paths are names."""
 
     cloud: NDArray[np.float32]
     images: Mapping[str, NDArray[np.uint8]]

@@ -7,8 +7,6 @@ number every position mixes the columns, and it is zero, or smaller where the nu
 divisor. The order of the points does not matter.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,11 +94,7 @@ def _layout_of(path: Path, data: bytes) -> _Layout | None:
 
 
 def _count_columns(path: Path, values: NDArray[Any]) -> int | None:
-    """The smallest number of columns that tells as much as any; None if none is significant.
-
-    Raises:
-        FileError: if all x come first, then all y.
-    """
+    """The smallest number of columns that tells as much as any; None if none is significant."""
     blocks = values[: len(values) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
     values = blocks[:: max(1, len(blocks) // _MOST_BLOCKS)].ravel()
     ordered = np.sort(values[np.isfinite(values)])

@@ -1,7 +1,5 @@
 """Results from disk: the YAML file of a calibration, and the table beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -25,7 +23,7 @@ from calibgraph.model.result_files import (
     CORRESPONDENCES_FILE,
     is_calibration_file,
 )
-from calibgraph.model.rig import Finite, Rig
+from calibgraph.model.rig import Finite, Rig, rigid_transform
 from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
 
 Array = NDArray[np.float64]
@@ -67,11 +65,7 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def _square(value: Any) -> Array:
-    """A square matrix of finite numbers as an array.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """A square matrix of finite numbers as an array."""
     try:
         found = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -83,24 +77,8 @@ def _square(value: Any) -> Array:
     return found
 
 
-def _of_pose(value: Any) -> Array:
-    """A 4x4 matrix.
-
-    Raises:
-        ValueError: if it is not.
-    """
-    found = _square(value)
-    if len(found) != 4:  # noqa: PLR2004 - homogeneous coordinates
-        raise ValueError(f"expected a 4x4 matrix, found {found.shape}")
-    return found
-
-
 def _covariance(value: Any) -> Array:
-    """A covariance of one or more poses: symmetric, without a negative variance in any direction.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """The covariance of one or more poses: symmetric, and of no negative variance."""
     found = _square(value)
     if len(found) % _POSE:
         raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
@@ -115,18 +93,14 @@ def _covariance(value: Any) -> Array:
 
 
 def _covariance_of_one(value: Any) -> Array:
-    """A (6, 6) covariance.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """A (6, 6) covariance."""
     found = _covariance(value)
     if len(found) != _POSE:
         raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
     return found
 
 
-Matrix4 = Annotated[Any, BeforeValidator(_of_pose)]
+Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
 Covariance = Annotated[Any, BeforeValidator(_covariance_of_one)]
 JointCovariance = Annotated[Any, BeforeValidator(_covariance)]
 
@@ -182,11 +156,7 @@ class _Parts(BaseModel):
 def _require_consistent(
     path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
 ) -> None:
-    """Check that the verdict is that of its checks, and all parts are of the same cameras.
-
-    Raises:
-        FileError: if not: the file was edited.
-    """
+    """Check that the verdict follows from its checks, and all parts are of the same cameras."""
     verdict = content.get("verdict", {})
     stated = {"the rig": verdict.get("status") if isinstance(verdict, dict) else verdict}
     derived = {"the rig": found.verdict.status}
@@ -229,17 +199,7 @@ assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields
 def _table(
     result: Path, name: str, content: Mapping[str, Any], load: Callable[[Path], Table]
 ) -> Table | None:
-    """A table of the result, if there is one.
-
-    Args:
-        result: path of the result's file.
-        name: of the table's file beside it.
-        content: of the result, with the table's hash; results of earlier versions have none.
-        load: reads the table.
-
-    Raises:
-        FileError: if it is another table than that of the result.
-    """
+    """A table of the result, if there is one."""
     path = result.with_name(name)
     if not path.is_file():
         return None
@@ -269,9 +229,6 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
 
     Returns:
         None if the file is no result.
-
-    Raises:
-        FileError: if it is a malformed one.
     """
     if not is_calibration_file(path):
         return None

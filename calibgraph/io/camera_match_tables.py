@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.io.correspondence_tables import arrow_reads, open_parquet, require_short_names
+from calibgraph.io.correspondence_tables import read_arrow, require_no_nulls, require_short_names
 from calibgraph.model.camera_matches import (
     COLUMNS,
     FORMAT,
@@ -34,7 +34,8 @@ def load_camera_matches(path: Path | str) -> CameraMatches:
         FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
     """
     path = require_file(Path(path))
-    table = _read(path)
+    types = {"frame": "int64"} | dict.fromkeys((*NUMBERS, *PLANES), "float64")
+    table = read_arrow(path, NAMES, types)
     if (missing := [name for name in COLUMNS if name not in table.column_names]) or len(
         table.column_names
     ) > len(COLUMNS):
@@ -49,25 +50,9 @@ def load_camera_matches(path: Path | str) -> CameraMatches:
         raise FileError(path, f"holds a wrong value: {error}") from error
 
 
-def _read(path: Path) -> pa.Table:
-    import pyarrow as pa
-    from pyarrow import csv
-
-    with arrow_reads(path):
-        if path.suffix == ".csv":
-            types = dict.fromkeys(NAMES, pa.string()) | {"frame": pa.int64()}
-            types |= dict.fromkeys((*NUMBERS, *PLANES), pa.float64())
-            return csv.read_csv(path, convert_options=csv.ConvertOptions(column_types=types))
-        with open_parquet(path, NAMES) as file:
-            return file.read()
-
-
 def _from_arrow(table: pa.Table) -> CameraMatches:
     metadata = table.schema.metadata or {}
-    for name in (*NAMES, "frame", *NUMBERS):
-        if table[name].null_count:
-            row = table[name].is_null().to_pylist().index(True)
-            raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+    require_no_nulls(table, (*NAMES, "frame", *NUMBERS))
     for name in NAMES:
         require_short_names(table[name])
     names = [table[name].to_pylist() for name in NAMES]

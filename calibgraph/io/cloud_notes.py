@@ -1,7 +1,5 @@
 """Notes about a cloud: it has no intensity, or its columns were told by its content."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,11 +16,7 @@ _COST = "the error bars become about twice as wide without; record it, or name i
 
 
 def read_cloud_notes(path: Path) -> list[str]:
-    """Notes about a file, or about a message in a bag; none if it cannot be read.
-
-    Args:
-        path: of the cloud, or its address.
-    """
+    """Notes about a file, or about a message in a bag; none if it cannot be read."""
     try:
         if path.suffix == MESSAGE_SUFFIX:
             fields = tuple(each.name for each in read_message(path)[1].fields)
@@ -36,12 +30,7 @@ def read_cloud_notes(path: Path) -> list[str]:
 
 
 def describe_cloud(where: str, cloud: RawCloud) -> Iterator[str]:
-    """Notes about a cloud.
-
-    Args:
-        where: its name.
-        cloud: its returns.
-    """
+    """Notes about a cloud."""
     if cloud.told:
         yield f"{where}: {cloud.told}"
     intensity = cloud.points[:, 3]

@@ -1,7 +1,5 @@
 """Point clouds from disk, as x y z intensity: .npy, .bin, .pcd, .ply, .las, .laz, .feather."""
 
-from __future__ import annotations
-
 import threading
 import tokenize
 import warnings
@@ -65,11 +63,7 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
 
 
 def read_cloud(path: Path) -> RawCloud:
-    """All points of a file, and the names of its fields.
-
-    Raises:
-        FileError: if the file is missing, truncated, or of another format.
-    """
+    """All points of a file, and the names of its fields."""
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
@@ -78,15 +72,7 @@ def read_cloud(path: Path) -> RawCloud:
 
 
 def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.float32]:
-    """The rows of a cloud (n, 4) with a return.
-
-    Args:
-        cloud: with NaN or zeros in x, y and z where there is none.
-        path: of the cloud, or its name.
-
-    Raises:
-        FileError: if there is no point, or one is not finite.
-    """
+    """The rows of a cloud (n, 4) with a return."""
     xyz, (x, y, z) = cloud[:, :3], cloud[:, :3].T
     measured = ~(np.isnan(x) & np.isnan(y) & np.isnan(z))
     if not measured.any():
@@ -132,15 +118,7 @@ def _read_npy(path: Path) -> RawCloud:
 
 
 def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
-    """The cloud in an array, (n, 3) or (n, 4+) or of named fields.
-
-    Args:
-        array: of any type of number.
-        path: of the array, or its name.
-
-    Raises:
-        FileError: if it has another shape or type.
-    """
+    """The cloud in an array, (n, 3) or (n, 4+) or of named fields."""
     if array.dtype.names:
         numbers = [name for name in array.dtype.names if array.dtype[name].kind in "fiu"]
         return raw_cloud(path, numbers, lambda name: array[name].ravel())

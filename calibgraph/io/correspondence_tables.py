@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -48,11 +48,7 @@ def load_correspondences(path: Path | str) -> Correspondences:
 
 
 def table_files(table: Path) -> list[Path]:
-    """The files of a table: itself, or the Parquet files of a folder, by name.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """The files of a table: itself, or the Parquet files of a folder, by name."""
     if not table.is_dir():
         return [require_file(table)]
     paths = sorted(table.rglob("*.parquet"))
@@ -65,10 +61,7 @@ def parts_of_table(table: Path) -> Iterator[Correspondences]:
     """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
 
     Of Parquet the bytes of one row group are in memory: about a million rows, by most writers. The
-    metadata is that of the first file of a folder, with the places that any of its files names.
-
-    Args:
-        table: its file, or a folder of Parquet files.
+    metadata comes from the first file of a folder, with the places that any of its files names.
 
     Raises:
         FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
@@ -123,30 +116,24 @@ def _arrow_parts(path: Path) -> Iterator[pa.Table]:
                 yield pa.Table.from_batches([batch]).replace_schema_metadata(metadata)
 
 
-def read_arrow(path: Path) -> pa.Table:
-    """A whole Parquet or CSV file, with any columns.
-
-    Raises:
-        FileError: if it cannot be read.
-    """
+def read_arrow(
+    path: Path, names: Sequence[str] = ("camera",), types: Mapping[str, str] | None = None
+) -> pa.Table:
+    """A whole Parquet or CSV file, with any columns; in CSV ``names`` are texts."""
     import pyarrow as pa
     from pyarrow import csv
 
     with arrow_reads(path):
         if path.suffix == ".csv":
-            strings = csv.ConvertOptions(column_types={"camera": pa.string()})
-            return csv.read_csv(path, convert_options=strings)
-        with open_parquet(path) as file:
+            column_types = {**dict.fromkeys(names, pa.string()), **(types or {})}
+            options = csv.ConvertOptions(column_types=column_types)
+            return csv.read_csv(path, convert_options=options)
+        with open_parquet(path, names) as file:
             return file.read()
 
 
 def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
-    """A Parquet file, whose pages are compared with their checksums, if it has them.
-
-    Args:
-        path: of the file.
-        names: columns of names: each is in memory once, however many rows have it.
-    """
+    """A Parquet file, its checksums verified; each value of the columns ``names`` is held once."""
     from pyarrow import parquet
 
     checked = partial(parquet.ParquetFile, path, page_checksum_verification=True)
@@ -170,21 +157,13 @@ def arrow_reads(path: Path) -> Iterator[None]:
 
 
 def require_rows(path: Path, rows: int) -> None:
-    """Check that a file has rows.
-
-    Raises:
-        FileError: if not.
-    """
+    """Check that a file has rows."""
     if not rows:
         raise FileError(path, "holds no rows; write the correspondences into it")
 
 
 def from_arrow(table: pa.Table) -> Correspondences:
-    """Build correspondences from an Arrow table that has the file format's columns.
-
-    Raises:
-        CorrespondenceError: if a column, a value or the metadata is wrong.
-    """
+    """Build correspondences from an Arrow table that has the file format's columns."""
     import pyarrow as pa
 
     check_schema(table.schema)
@@ -218,13 +197,18 @@ def require_short_names(column: pa.ChunkedArray) -> None:
             )
 
 
-def _from_plain_columns(table: pa.Table) -> Correspondences:
-    import pyarrow as pa
-
-    for name in table.column_names:
+def require_no_nulls(table: pa.Table, names: Iterable[str]) -> None:
+    """Check that columns have a value in every row."""
+    for name in names:
         if table[name].null_count:
             row = table[name].is_null().to_pylist().index(True)
             raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
+
+
+def _from_plain_columns(table: pa.Table) -> Correspondences:
+    import pyarrow as pa
+
+    require_no_nulls(table, table.column_names)
 
     def stack(names: Sequence[str]) -> Array:
         return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)

@@ -21,7 +21,7 @@ from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.cloud_notes import read_cloud_notes
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
-from calibgraph.io.formats.words import describe_rig
+from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.incomplete import RigRead
 from calibgraph.io.published import published_format
@@ -69,9 +69,6 @@ class Dataset:
 
         Args:
             frames: ``start:stop:step`` as in Python, or positions separated by commas.
-
-        Raises:
-            ValueError: if the text is neither, or selects nothing.
         """
         try:
             kept = [self.frames[i] for i in _indices(frames, len(self.frames))]
@@ -134,11 +131,7 @@ def load_dataset(
 
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
-    """The rig of all sources, which may differ in their extrinsics, and notes on it.
-
-    Raises:
-        FileError, DatasetError: if a rig is missing, or the rigs differ.
-    """
+    """The rig of all sources, which may differ in their extrinsics, and notes on it."""
     read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
     first = read[0].rig
     for path, other in zip(paths, read, strict=True):
@@ -188,11 +181,7 @@ def _next_index(data: Dataset) -> int:
 
 
 def _complete(data: Dataset) -> Dataset:
-    """The dataset, of whose frames that are not selected only complete ones are kept.
-
-    Raises:
-        DatasetError: if a selected frame lacks an image.
-    """
+    """The dataset, of whose frames that are not selected only complete ones are kept."""
     cameras = data.rig.cameras.keys()
     for frame in data.frames:
         for name in cameras - frame.image_paths.keys():

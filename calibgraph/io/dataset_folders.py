@@ -1,7 +1,5 @@
 """Dataset folders: the cloud and the images of every frame, by the format of the folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io import kitti
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.published import published_format
 from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
@@ -17,12 +15,7 @@ from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Where a dataset folder keeps its files; those of one frame have the same stem.
-
-    Attributes:
-        clouds: the folder of the clouds.
-        images: per camera, the folder of its images, or its video.
-    """
+    """Where a dataset folder keeps its files; the files of one frame have the same stem."""
 
     clouds: Path
     images: Mapping[str, Path]
@@ -56,9 +49,6 @@ def frames_of_folder(
         folder: a dataset folder, a KITTI odometry sequence, or one of a published data set.
         cameras: the rig's.
         complete: whether every cloud must have an image of every camera, and every image a cloud.
-
-    Raises:
-        FileError, DatasetError: if a folder is missing or empty, or frames do not pair up.
     """
     published = published_format(folder)
     if published is not None:
@@ -72,25 +62,18 @@ def frames_of_folder(
     images = {name: _images(_image_folder(folder, layout, name), list(clouds)) for name in cameras}
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
-    return [
-        FrameFiles(stem, cloud, {n: images[n][stem] for n in cameras if stem in images[n]})
-        for stem, cloud in clouds.items()
-    ]
+    return frames_by_stem(clouds, images)
 
 
 def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:
-    """The images of a camera by stem: of a folder, or those of a video that belong to clouds."""
+    """The images of a camera by stem: files of a folder, or pictures of a video with a cloud."""
     if source.is_file():
         return pictures_of_video(source, clouds)
     return files_by_stem(source, IMAGE_SUFFIXES)
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
-    """The folder of a camera's images.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """The folder of a camera's images."""
     if camera not in layout.images:
         raise FileError(
             folder,

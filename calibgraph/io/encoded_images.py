@@ -1,7 +1,5 @@
 """Images from PNG and JPEG data that is complete: OpenCV fills up what is damaged, unreported."""
 
-from __future__ import annotations
-
 import io
 import struct
 from typing import Any
@@ -27,10 +25,6 @@ def is_png(data: bytes) -> bool:
 def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
     """The image in PNG or JPEG data.
 
-    Args:
-        data: the bytes.
-        kind: OpenCV's flags; by default for (height, width, 3) uint8, BGR.
-
     Raises:
         ValueError: if they are damaged, incomplete, or of another format.
     """
@@ -50,9 +44,6 @@ def _pixels_alone(png: bytes) -> bytes:
     """A verified PNG without what does not change its pixels.
 
     libpng prints warnings about profiles and gammas, which OpenCV ignores.
-
-    Raises:
-        ValueError: if its end is damaged, which is not verified.
     """
     kept, place = [png[: len(_PNG_MARK)]], len(_PNG_MARK)
     while kept[-1][4:8] != b"IEND":

@@ -1,7 +1,5 @@
 """Feather files: tables of Arrow."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,25 +13,13 @@ from calibgraph.files import require_file
 
 
 def feather_columns(path: Path) -> tuple[str, ...]:
-    """The names of all columns of a file.
-
-    Raises:
-        FileError: if it cannot be read.
-    """
+    """The names of all columns of a file."""
     with _damage_named(path):
         return tuple(_read_table(path).column_names)
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Columns of a file, as arrays of one length.
-
-    Args:
-        path: of the file.
-        columns: that it must have.
-
-    Raises:
-        FileError: if it cannot be read, a column is missing, or a value is.
-    """
+    """Columns of a file, as arrays of one length."""
     with _damage_named(path):
         table = _read_table(path)
         for name in columns:

@@ -1,7 +1,5 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -128,11 +126,7 @@ class MovingFrame(Frame):
 
 
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
-    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was.
-
-    Raises:
-        FileError, DatasetError: if it cannot be read.
-    """
+    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
     motion = entry.get(_MOTION)
     return load_cloud(entry["cloud"], None if motion is None else ScanMotion.of_entry(motion))
 

@@ -1,8 +1,6 @@
 """The files of frames: one cloud, and the images taken with it."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +12,7 @@ _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame.
-
-    Attributes:
-        stem: their common stem, or the stamp of the cloud.
-        cloud: the cloud's file.
-        images: per camera that has one, the image's file.
-    """
+    """The files of one frame, which share their stem."""
 
     stem: str
     cloud: Path
@@ -28,11 +20,7 @@ class FrameFiles:
 
 
 def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """Files of a folder with one of the suffixes, by stem, in order.
-
-    Raises:
-        FileError: if there is no such folder or file, or two have the same stem.
-    """
+    """Files of a folder with one of the suffixes, by stem, in order."""
     kinds = ", ".join(suffixes)
     if not folder.is_dir():
         beside = ", ".join(sorted(path.name for path in folder.parent.glob("*/"))) or "none"
@@ -51,3 +39,13 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     if not files:
         raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
     return files
+
+
+def frames_by_stem(
+    clouds: Mapping[str, Path], images: Mapping[str, Mapping[str, Path]]
+) -> list[FrameFiles]:
+    """A frame per cloud, with the images of each camera that have its stem."""
+    return [
+        FrameFiles(stem, cloud, {name: of[stem] for name, of in images.items() if stem in of})
+        for stem, cloud in clouds.items()
+    ]

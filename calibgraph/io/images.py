@@ -1,7 +1,5 @@
 """Images: PNG, JPEG, messages of bags and pictures of videos, complete and of the rig's size."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
@@ -28,10 +26,6 @@ _UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
 def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """Decode an image, after its header's size was checked against the rig's.
 
-    Args:
-        path: a file, or the address of a message in a bag or of a picture in a video.
-        camera: the camera that took it.
-
     Returns:
         (height, width, 3) uint8, BGR.
 
@@ -52,7 +46,7 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     except ValueError as error:
         raise _damaged(path, error) from error
     if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
-        raise FileError(path, "has 16 bits, of which only the lower 8 are used; write it with 8")
+        raise FileError(path, "has 16 bits and uses only the lower 8; write it with 8")
     return image
 
 
@@ -67,11 +61,7 @@ def _require_size(path: Path, found: tuple[int, int], camera: Camera) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the header.
-
-    Raises:
-        FileError: if the image is missing, or its header damaged.
-    """
+    """Width and height in pixels, from the header."""
     return _read(path)[1].size
 
 

@@ -1,6 +1,4 @@
-"""Rigs of data sets of which a camera lacks a part: the others are read."""
-
-from __future__ import annotations
+"""Rigs of data sets in which a camera lacks a part: the others are read."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,12 +14,7 @@ class IncompleteCamera(FileError):
 
 
 class RigRead(NamedTuple):
-    """A rig of a data set.
-
-    Attributes:
-        rig: of its complete cameras.
-        notes: what was left out, added or taken from elsewhere, a line each.
-    """
+    """The complete cameras of a data set, and what was left out or assumed, a line each."""
 
     rig: Rig
     notes: tuple[str, ...] = ()
@@ -30,17 +23,7 @@ class RigRead(NamedTuple):
 def rig_of_complete(
     lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
 ) -> RigRead:
-    """The rig of the cameras that have all parts.
-
-    Args:
-        lidar: name of the LiDAR.
-        names: of the cameras.
-        read: one by its name; raises IncompleteCamera.
-        path: of the data set, for errors.
-
-    Raises:
-        FileError: if a camera is malformed, or none is complete.
-    """
+    """The rig of the cameras that have all parts."""
     cameras: dict[str, Camera] = {}
     missing: dict[str, IncompleteCamera] = {}
     for name in names:

@@ -1,7 +1,5 @@
 """Frames whose files are decoded once, though several parts of a calibration read them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -12,9 +10,9 @@ from numpy.typing import NDArray
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Derived, Frame
 from calibgraph.io.motion import ScanMotion
-from calibgraph.memory import keep
+from calibgraph.memory import mmap_copy
 from calibgraph.model.rig import Camera
-from calibgraph.parallel import Once
+from calibgraph.parallel import KeyedCache
 
 Gray = NDArray[np.uint8]
 Cloud = NDArray[np.float32]
@@ -29,16 +27,11 @@ class KeptFrame(Frame):
     """A frame whose gray images, cloud and what derives of them are kept, unless others came since.
 
     None of them may be written to.
-
-    Attributes:
-        frame: that reads them.
-        kept: by number of the frame and what it is; of all frames of the dataset.
-        common: what all frames have in common; it is not dropped.
     """
 
     frame: Frame
-    kept: Once[tuple[int, Hashable], Any]
-    common: Once[Hashable, Any]
+    kept: KeyedCache[tuple[int, Hashable], Any]
+    common: KeyedCache[Hashable, Any]
 
     @property
     def motion(self) -> ScanMotion | None:
@@ -52,7 +45,7 @@ class KeptFrame(Frame):
 
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""
-        return self.derive("cloud", lambda: keep(self.frame.load_cloud()))
+        return self.derive("cloud", lambda: mmap_copy(self.frame.load_cloud()))
 
     def load_image(self, name: str, camera: Camera) -> Gray:
         """(height, width, 3) image, BGR; not kept."""
@@ -60,7 +53,7 @@ class KeptFrame(Frame):
 
     def load_gray(self, name: str, camera: Camera) -> Gray:
         """(height, width) the same image, gray."""
-        return self.derive(("gray", name), lambda: keep(self.frame.load_gray(name, camera)))
+        return self.derive(("gray", name), lambda: mmap_copy(self.frame.load_gray(name, camera)))
 
     def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
         """What follows from its files and the key, made once."""
@@ -89,8 +82,8 @@ def keep_frames(data: Dataset) -> Dataset:
     """
     if any(isinstance(frame, KeptFrame) for frame in data.frames):
         return data
-    kept: Once[tuple[int, Hashable], Any] = Once()
-    common: Once[Hashable, Any] = Once()
+    kept: KeyedCache[tuple[int, Hashable], Any] = KeyedCache()
+    common: KeyedCache[Hashable, Any] = KeyedCache()
     frames = (
         KeptFrame(
             each.index, each.name, each.cloud_path, each.image_paths,

@@ -1,7 +1,6 @@
 """KITTI odometry sequence folders: ``calib.txt``, ``velodyne/``, ``image_2/``, ``image_3/``, ..."""
 
-from __future__ import annotations
-
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from calibgraph.files import checked_model, read_text, require_file
 from calibgraph.io.images import image_size
 from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.lenses import intrinsics_of_matrix
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
@@ -25,38 +24,27 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
     return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
 
 
-def load_kitti_rig(sequence: Path) -> Rig:
-    """The rig of a KITTI odometry sequence; see :func:`read_kitti_rig`."""
-    return read_kitti_rig(sequence).rig
-
-
 def read_kitti_rig(sequence: Path) -> RigRead:
     """The rig of a KITTI odometry sequence, from its own calibration.
 
     Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
     translate(K^-1 P_k[:, 3]) Tr.
-
-    Args:
-        sequence: its folder.
-
-    Raises:
-        FileError: if ``calib.txt`` is malformed or there is no image.
     """
     path = require_file(sequence / CALIBRATION_NAME)
-    matrices = _read_matrices(path)
+    lines = NumberLines(path)
     folders = camera_folders(sequence)
     if not folders:
         raise FileError(sequence, "has no image folder (image_0 .. image_3)")
-    if "Tr" not in matrices:
-        raise FileError(path, "line 'Tr' is missing")
-    T_rectified_lidar = np.vstack([matrices["Tr"], [0.0, 0.0, 0.0, 1.0]])
+    T_rectified_lidar = np.vstack([lines.array("Tr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
 
     def read(name: str) -> Camera:
         line = f"P{name[-1]}"
-        if line not in matrices:
+        if line not in lines:
             raise IncompleteCamera(path, f"line {line!r} is missing")
         size = first_image_size(folders[name])
-        return camera_of_projection(matrices[line], T_rectified_lidar, size, f"{path}: {line}")
+        return camera_of_projection(
+            lines.array(line, 3, 4), T_rectified_lidar, size, f"{path}: {line}"
+        )
 
     return rig_of_complete(CLOUD_FOLDER, folders, read, sequence)
 
@@ -71,14 +59,9 @@ def camera_of_projection(
         T_rectified_lidar: (4, 4) to that frame.
         size_px: width and height.
         where: the file and its line, for errors.
-
-    Raises:
-        FileError: if P is no such matrix, or the transform is none.
     """
     K = P[:, :3]
     intrinsics = intrinsics_of_matrix(K, where)
-    if not np.isfinite(P).all():
-        raise FileError(where, f"is no projection matrix of a camera: {P.tolist()}")
     shift = np.eye(4)
     shift[:3, 3] = np.linalg.solve(K, P[:, 3])
     content = {
@@ -90,27 +73,39 @@ def camera_of_projection(
     return checked_model(Camera, content, f"{where} and the LiDAR's pose")
 
 
-def _read_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
-    matrices = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        name, _, values = line.partition(":")
-        if not values.strip():
-            continue
-        if name.strip() in matrices:
-            raise FileError(path, f"line {number}: {name.strip()} is given twice; keep one")
+class NumberLines:
+    """The lines ``KEY: numbers`` of a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._words: dict[str, list[str]] = {}
+        for number, line in enumerate(read_text(path).splitlines(), start=1):
+            key, _, words = line.partition(":")
+            if key.strip() in self._words:
+                raise FileError(path, f"line {number}: {key.strip()} is given twice; keep one")
+            if words.strip():
+                self._words[key.strip()] = words.split()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._words
+
+    def array(self, key: str, *shape: int) -> Array:
+        """The finite numbers of a line, in this shape."""
+        if key not in self:
+            raise FileError(self.path, f"line {key!r} is missing")
+        count = math.prod(shape)
         try:
-            matrices[name.strip()] = np.array(values.split(), dtype=np.float64).reshape(3, 4)
-        except ValueError as error:
-            raise FileError(path, f"line {number}: expected 12 numbers after {name!r}") from error
-    return matrices
+            found = np.array(self._words[key], dtype=np.float64)
+        except ValueError:
+            found = np.empty(0)
+        if len(found) != count or not np.isfinite(found).all():
+            text = f"line {key!r} has {len(found)} numbers, expected {count} finite ones"
+            raise FileError(self.path, text)
+        return found.reshape(shape)
 
 
 def first_image_size(folder: Path) -> tuple[int, int]:
-    """Width and height of the first image of a folder.
-
-    Raises:
-        FileError: if there is none.
-    """
+    """Width and height of the first image of a folder."""
     images = sorted(folder.glob("*.png"))
     if not images:
         raise IncompleteCamera(folder, "holds no .png image")

@@ -1,9 +1,7 @@
 """KITTI object folders: ``training`` with ``velodyne``, ``image_2`` and a ``calib`` file per frame.
 
-Its frames are of several drives, on days of different calibrations: those of one form a rig.
+Its frames are of several drives with different calibrations: one of these is the rig.
 """
-
-from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
@@ -15,16 +13,21 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
-from calibgraph.io.kitti import CALIBRATION_NAME, CLOUD_FOLDER, camera_folders, camera_of_projection
+from calibgraph.io.kitti import (
+    CALIBRATION_NAME,
+    CLOUD_FOLDER,
+    NumberLines,
+    camera_folders,
+    camera_of_projection,
+)
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
 
 _CALIBRATIONS = "calib"
-_ROWS = {"P": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 
 
 def is_kitti_object(folder: Path) -> bool:
@@ -38,41 +41,31 @@ def read_kitti_object_rig(folder: Path) -> RigRead:
 
     Camera k projects by P_k R0_rect Tr_velo_to_cam, so T_camera_lidar is
     translate(K^-1 P_k[:, 3]) R0_rect Tr_velo_to_cam.
-
-    Raises:
-        FileError: if a file is missing or malformed.
     """
     stem = _stems(folder)[0]
     path = folder / _CALIBRATIONS / f"{stem}.txt"
-    lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
+    lines = NumberLines(path)
     T, rectify = np.eye(4), np.eye(4)
-    T[:3] = _matrix(path, lines, "Tr_velo_to_cam")
-    rectify[:3, :3] = _matrix(path, lines, "R0_rect")
+    T[:3] = lines.array("Tr_velo_to_cam", 3, 4)
+    rectify[:3, :3] = lines.array("R0_rect", 3, 3)
     folders = camera_folders(folder)
     if not folders:
         raise FileError(folder, "has no image folder (image_0 .. image_3)")
 
     def read(name: str) -> Camera:
-        return _camera(path, lines, _image(folders[name], stem), rectify @ T)
+        return _camera(lines, _image(folders[name], stem), rectify @ T)
 
     return rig_of_complete(CLOUD_FOLDER, folders, read, folder)
 
 
 def kitti_object_frames(folder: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The frames of the calibration that most have, in order.
-
-    Raises:
-        FileError: if a file is missing.
-    """
+    """The frames of the calibration that most have, in order."""
     clouds = files_by_stem(folder / CLOUD_FOLDER, (".bin",))
     folders = camera_folders(folder)
     images = {
         name: files_by_stem(folders.get(name, folder / name), IMAGE_SUFFIXES) for name in cameras
     }
-    return [
-        FrameFiles(stem, clouds[stem], {n: images[n][stem] for n in cameras if stem in images[n]})
-        for stem in _stems(folder)
-    ]
+    return frames_by_stem({stem: clouds[stem] for stem in _stems(folder)}, images)
 
 
 def describe_calibrations(folder: Path) -> str:
@@ -114,19 +107,10 @@ def _image(folder: Path, stem: str) -> Path:
     return next((path for path in found if path.is_file()), found[0])
 
 
-def _camera(path: Path, lines: dict[str, str], image: Path, T_rectified_lidar: Array) -> Camera:
+def _camera(lines: NumberLines, image: Path, T_rectified_lidar: Array) -> Camera:
     name = f"P{image.parent.name[-1]}"
     if name not in lines:
-        raise IncompleteCamera(path, f"line {name!r} is missing")
-    P = _matrix(path, lines, name)
-    return camera_of_projection(P, T_rectified_lidar, image_size(image), f"{path}: {name}")
-
-
-def _matrix(path: Path, lines: dict[str, str], name: str) -> Array:
-    shape = _ROWS[name.rstrip("0123") if name.startswith("P") else name]
-    try:
-        return np.array(lines[name].split(), dtype=np.float64).reshape(shape)
-    except KeyError:
-        raise FileError(path, f"line {name!r} is missing") from None
-    except ValueError as error:
-        raise FileError(path, f"line {name!r}: expected {np.prod(shape)} numbers") from error
+        raise IncompleteCamera(lines.path, f"line {name!r} is missing")
+    where = f"{lines.path}: {name}"
+    P = lines.array(name, 3, 4)
+    return camera_of_projection(P, T_rectified_lidar, image_size(image), where)

@@ -1,20 +1,16 @@
 """KITTI raw drives, synchronised and rectified: ``DATE/DATE_drive_0005_sync``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
-from calibgraph.io.kitti import camera_of_projection, first_image_size
+from calibgraph.io.kitti import NumberLines, camera_of_projection, first_image_size
 from calibgraph.model.rig import Camera
 
 Array = NDArray[np.float64]
@@ -29,27 +25,20 @@ def is_kitti_raw(folder: Path) -> bool:
 
 
 def kitti_raw_folders(drive: Path) -> tuple[Path, dict[str, Path]]:
-    """The folder of the clouds, and those of the images by camera (image_00 .. image_03)."""
+    """The folder of the clouds, and the folders of the images by camera (image_00 .. image_03)."""
     images = {each.name: each / "data" for each in sorted(drive.glob("image_0[0-3]"))}
     return drive / _CLOUDS / "data", images
 
 
 def kitti_raw_frames(drive: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The frames of a drive, in order.
-
-    Raises:
-        FileError: if a folder is missing or empty.
-    """
+    """The frames of a drive, in order."""
     scans, folders = kitti_raw_folders(drive)
     clouds = files_by_stem(scans, (".bin",))
     images = {
         name: files_by_stem(folders.get(name, drive / name / "data"), IMAGE_SUFFIXES)
         for name in cameras
     }
-    return [
-        FrameFiles(stem, cloud, {n: images[n][stem] for n in cameras if stem in images[n]})
-        for stem, cloud in clouds.items()
-    ]
+    return frames_by_stem(clouds, images)
 
 
 def read_kitti_raw_rig(drive: Path) -> RigRead:
@@ -57,15 +46,12 @@ def read_kitti_raw_rig(drive: Path) -> RigRead:
 
     Camera k projects by P_rect_0k R_rect_00 [R | T], so T_camera_lidar is
     translate(K^-1 P[:, 3]) R_rect_00 [R | T].
-
-    Raises:
-        FileError: if a file is missing or malformed, or images are not rectified.
     """
     cameras, lidar = (_read(drive, name) for name in (_CAMERAS, _LIDAR))
     T_camera0_lidar, rectify = np.eye(4), np.eye(4)
-    T_camera0_lidar[:3, :3] = _value(lidar, "R", (3, 3))
-    T_camera0_lidar[:3, 3] = _value(lidar, "T", (3,))
-    rectify[:3, :3] = _value(cameras, "R_rect_00", (3, 3))
+    T_camera0_lidar[:3, :3] = lidar.array("R", 3, 3)
+    T_camera0_lidar[:3, 3] = lidar.array("T", 3)
+    rectify[:3, :3] = cameras.array("R_rect_00", 3, 3)
     folders = kitti_raw_folders(drive)[1]
     if not folders:
         raise FileError(drive, "has no image folder (image_00 .. image_03)")
@@ -75,50 +61,27 @@ def read_kitti_raw_rig(drive: Path) -> RigRead:
     )
 
 
-def _camera(calibration: _Values, name: str, folder: Path, T_rectified_lidar: Array) -> Camera:
+def _camera(calibration: NumberLines, name: str, folder: Path, T_rectified_lidar: Array) -> Camera:
     number = name.removeprefix("image_")
     for line in (f"S_rect_{number}", f"P_rect_{number}"):
         if line not in calibration:
             raise IncompleteCamera(calibration.path, f"line {line!r} is missing")
     size = first_image_size(folder)
-    rectified = tuple(_value(calibration, f"S_rect_{number}", (2,)).astype(int))
+    rectified = tuple(calibration.array(f"S_rect_{number}", 2).astype(int))
     if size != rectified:
         raise FileError(
             folder, f"images are {size[0]}x{size[1]} px, rectified ones {rectified[0]}x"
             f"{rectified[1]} px; take the _sync drive, not the _extract one"
         )  # fmt: skip
-    P = _value(calibration, f"P_rect_{number}", (3, 4))
+    P = calibration.array(f"P_rect_{number}", 3, 4)
     where = f"{calibration.path}: P_rect_{number}"
     return camera_of_projection(P, T_rectified_lidar, size, where)
 
 
-class _Values(dict[str, list[float]]):
-    """The numbers of each line of a file."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path = path
-        for line in read_text(path).splitlines():
-            name, _, values = line.partition(":")
-            self[name.strip()] = []  # of a date
-            with suppress(ValueError):
-                self[name.strip()] = [float(value) for value in values.split()]
-
-
-def _read(drive: Path, name: str) -> _Values:
+def _read(drive: Path, name: str) -> NumberLines:
     for folder in (drive, drive.parent):
         if (folder / name).is_file():
-            return _Values(folder / name)
+            return NumberLines(folder / name)
     raise FileError(
         drive.parent / name, "no such file; put the calibration of the drive's date there"
     )
-
-
-def _value(values: _Values, name: str, shape: tuple[int, ...]) -> Array:
-    found = values.get(name, [])
-    if len(found) != np.prod(shape) or not np.isfinite(found).all():
-        raise FileError(
-            values.path,
-            f"line {name!r} has {len(found)} numbers, expected {np.prod(shape)} finite ones",
-        )
-    return np.reshape(np.array(found), shape)

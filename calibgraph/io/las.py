@@ -1,7 +1,5 @@
 """Point clouds in .las and .laz files, by laspy."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
@@ -39,7 +37,7 @@ def read_las(path: Path) -> RawCloud:
                 make_cloud(chunk.x, chunk.y, chunk.z, chunk.intensity)
                 for chunk in file.chunk_iterator(_CHUNK)
             ]
-    except Exception as error:  # laspy's own, those of its decoders, and numpy's
+    except Exception as error:  # laspy's own, its decoders', and numpy's
         raise FileError(path, f"cannot be read as LAS ({error}); is it complete?") from error
     points = np.concatenate(parts or [np.empty((0, 4), np.float32)])
     if len(points) != expected:
@@ -48,11 +46,7 @@ def read_las(path: Path) -> RawCloud:
 
 
 def _require_header(path: Path) -> None:
-    """Check what a header claims: laspy would read billions of records that are not there.
-
-    Raises:
-        FileError: if it is none, or the file is too short for what it claims.
-    """
+    """Check what a header claims: laspy would read billions of records that are not there."""
     with path.open("rb") as file:
         head = file.read(_WITH_END_RECORDS)
         size = file.seek(0, 2)

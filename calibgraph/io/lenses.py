@@ -1,7 +1,5 @@
 """Lenses as others write them: their model by any of its names, K, and lists of coefficients."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,13 +50,20 @@ class CameraLens:
     intrinsics_px: Intrinsics
     distortion: tuple[float, ...]
 
+    def fields(self) -> dict[str, Any]:
+        """The fields of :class:`calibgraph.Camera` without the extrinsic."""
+        width_px, height_px = self.size_px or (None, None)
+        return {
+            "model": self.model,
+            "width_px": width_px,
+            "height_px": height_px,
+            "intrinsics_px": self.intrinsics_px,
+            "distortion": self.distortion,
+        }
+
 
 def lens_model(name: str, where: Path | str) -> LensModel:
-    """The model here of a name in a file of others.
-
-    Raises:
-        FileError: if calibgraph has no such lens.
-    """
+    """The model here of a name in a file of others."""
     found = find_lens_model(name)
     if found is None:
         raise FileError(
@@ -74,9 +79,6 @@ def stated_model(content: Mapping[str, Any], where: Path | str) -> LensModel | N
 
     A pinhole with the distortion of a fisheye is a fisheye, as in Kalibr; an omnidirectional lens
     may have the distortion of a pinhole.
-
-    Raises:
-        FileError: if a name is none of ours, or two keys contradict each other.
     """
     named = {str(key): _model_name(str(key), value) for key, value in content.items()}
     kept = {key: name for key, name in named.items() if name}
@@ -139,7 +141,7 @@ def fitted_coefficients(
             return kept + (0.0,) * (count - len(kept))
     raise FileError(
         path,
-        f"{len(values)} distortion coefficients, of which {len(kept)} count; the lens model "
+        f"{len(values)} distortion coefficients, {len(kept)} without zeros; the lens model "
         f"{model} here has {ORDERS[model]}",
     )
 
@@ -147,11 +149,7 @@ def fitted_coefficients(
 def listed_coefficients(
     values: Sequence[float], model: LensModel, path: Path | str
 ) -> tuple[float, ...]:
-    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does.
-
-    Raises:
-        FileError: if there are more or fewer than the model has.
-    """
+    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does."""
     fewest = min((count for count in COEFFICIENTS[model] if count), default=0)
     if 0 < len(values) < fewest:
         raise FileError(
@@ -163,11 +161,7 @@ def listed_coefficients(
 
 
 def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:
-    """The focal lengths and the principal point of a camera matrix.
-
-    Args:
-        K: (3, 3) [px], [fx 0 cx; 0 fy cy; 0 0 1].
-        where: the file or topic, and its key, for errors.
+    """The focal lengths and the principal point of a (3, 3) camera matrix [px].
 
     Raises:
         FileError: if it is no such matrix: zeros, skew, another scale, transposed.

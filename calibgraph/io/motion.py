@@ -35,12 +35,7 @@ class ScanMotion:
     to_s: float
 
     def correct(self, points_m: NDArray[np.floating], times_s: Array) -> Array:
-        """(n, 3) where points would have been seen at the instant.
-
-        Args:
-            points_m: (n, 3) in the LiDAR frame, each when it was taken.
-            times_s: (n,) when that was, in seconds after the stamp.
-        """
+        """(n, 3) where points, taken at times [s] after the stamp, would be seen at the instant."""
         w, v = np.array(self.twist_per_s[:3]), np.array(self.twist_per_s[3:])
         points = points_m.astype(np.float64)
         first, second, third = _integrals(times_s - self.to_s, float(np.linalg.norm(w)))

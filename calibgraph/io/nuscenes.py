@@ -1,7 +1,5 @@
 """nuScenes folders: the rig of calibrated_sensor, and the key frames of one vehicle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,11 +35,7 @@ def is_nuscenes(path: Path | str) -> bool:
 
 
 def read_nuscenes_rig(path: Path) -> RigRead:
-    """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted.
-
-    Raises:
-        FileError, DatasetError: if a table is malformed, or the scenes are of several rigs.
-    """
+    """The rig of a nuScenes folder or scene: T_camera_lidar through ego; images are undistorted."""
     tables = read_tables(path)
     instants = [each for each in tables.instants if LIDAR in each.taken]
     if not instants:
@@ -74,11 +68,7 @@ def _camera(tables: Tables, taken: SampleData, T_ego_lidar: Array, where: Path) 
 
 
 def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> None:
-    """Check that all scenes have the same sensors at the same poses.
-
-    Raises:
-        DatasetError: with the scenes of each rig.
-    """
+    """Check that all scenes have the same sensors at the same poses."""
     for name in (LIDAR, *tables.cameras):
         scenes: dict[str, dict[str, None]] = {}  # by what the sensor's record holds
         for each in instants:
@@ -94,11 +84,7 @@ def _require_one_rig(path: Path, tables: Tables, instants: list[Instant]) -> Non
 
 
 def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
-    """The samples, in order of time; their stems are their stamps.
-
-    Raises:
-        FileError: if a table is malformed, or there is no scan.
-    """
+    """The samples, in order of time; their stems are their stamps."""
     tables = read_tables(path)
     root = tables.folder.parent
     frames = [
@@ -116,11 +102,7 @@ def nuscenes_frames(path: Path, cameras: Sequence[str]) -> list[FrameFiles]:
 
 
 def describe_motion(path: Path) -> str:
-    """How far the vehicle moves between scans and images, in a line; empty without ego_pose.
-
-    Raises:
-        FileError: if a table is malformed.
-    """
+    """How far the vehicle moves between scans and images, in a line; empty without ego_pose."""
     tables = read_tables(path)
     poses = read_ego_poses(tables)
     if not poses:

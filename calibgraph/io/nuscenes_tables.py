@@ -1,10 +1,8 @@
 """The tables of a nuScenes folder: records tied by tokens, read as far as they are needed.
 
 A sample_data (an image or a scan) is of one sample (an instant), has a calibrated_sensor (the pose
-of its sensor in the vehicle, ego) and an ego_pose (that of the vehicle, when it was taken).
+of its sensor in the vehicle, ego) and an ego_pose (the vehicle's pose when it was taken).
 """
-
-from __future__ import annotations
 
 import json
 from collections import defaultdict
@@ -43,11 +41,7 @@ class Pose(_Record):
     rotation: tuple[Finite, Finite, Finite, Finite]  # w x y z
 
     def matrix(self, where: Path) -> Array:
-        """(4, 4), from the sensor's or ego's coordinates.
-
-        Raises:
-            FileError: if the quaternion has not the length 1.
-        """
+        """(4, 4), from the sensor's or ego's coordinates."""
         w, x, y, z = self.rotation
         try:
             return pose_of_quaternion(self.translation, (x, y, z, w))
@@ -89,13 +83,7 @@ class SampleData(_Record):
 
 @dataclass(frozen=True)
 class Instant:
-    """A sample, with its images and its scan.
-
-    Attributes:
-        stamp_us: of the sample.
-        scene: name of its scene.
-        taken: by channel.
-    """
+    """A sample, with its images and its scan by channel."""
 
     stamp_us: int
     scene: str
@@ -104,14 +92,7 @@ class Instant:
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """The samples of a nuScenes folder, or of one of its scenes.
-
-    Attributes:
-        folder: of the tables, beside that of the files.
-        instants: in order of time.
-        cameras: the channels that are cameras.
-        calibrated: the sensors' poses, by token.
-    """
+    """The samples of a nuScenes folder, or of one of its scenes."""
 
     folder: Path
     instants: tuple[Instant, ...]
@@ -125,9 +106,6 @@ class Tables:
 
 def find_tables(path: Path) -> tuple[Path, str | None] | None:
     """The folder of the tables, and the scene if the path names one; None if there are no tables.
-
-    Args:
-        path: of the data set, of its tables, or one of these and a scene: ``nuscenes/scene-0061``.
 
     Raises:
         FileError: if there are several versions.
@@ -143,11 +121,7 @@ def find_tables(path: Path) -> tuple[Path, str | None] | None:
 
 
 def read_tables(path: Path) -> Tables:
-    """The samples of a nuScenes folder or scene.
-
-    Raises:
-        FileError: if a table is missing or malformed, or there is no such scene.
-    """
+    """The samples of a nuScenes folder or scene."""
     found = find_tables(path)
     if found is None:
         raise FileError(path, "no nuScenes tables; expected v1.0-*/sample_data.json")
@@ -196,15 +170,11 @@ def describe_no_scan(tables: Tables) -> str:
     scans = sum(each.get("calibrated_sensor_token") in of_lidar for each in records)
     if not scans:
         return f"has no scan of {LIDAR}"
-    return f"has {scans} scans of {LIDAR}, of which none is a key frame; only key frames are read"
+    return f"has {scans} scans of {LIDAR}, and none is a key frame; only key frames are read"
 
 
 def read_ego_poses(tables: Tables) -> dict[str, Array] | None:
-    """(4, 4) T_world_ego by token, of the samples' images and scans; None without the table.
-
-    Raises:
-        FileError: if it is malformed.
-    """
+    """(4, 4) T_world_ego by token, of the samples' images and scans; None without the table."""
     path = tables.folder / "ego_pose.json"
     if not path.is_file():
         return None
@@ -226,11 +196,7 @@ def _by_token(
 
 
 def _read_list(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON list.
-
-    Raises:
-        FileError: if the file is missing or is none.
-    """
+    """The objects of a JSON list."""
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:

@@ -1,6 +1,4 @@
-"""Point clouds of PCL: .pcd files, ascii, binary and compressed."""
-
-from __future__ import annotations
+"""Point clouds of PCL: .pcd files, ascii, binary and compressed (LZF)."""
 
 import re
 import struct
@@ -13,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.io.lzf import MOST_RATIO, unpack_lzf
 from calibgraph.io.point_fields import (
     RawCloud,
     choose_fields,
@@ -23,6 +20,7 @@ from calibgraph.io.point_fields import (
     read_rows,
     too_long,
 )
+from factors.compiled import compiled
 
 _HEADER_BYTES = 65536
 _DATA = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
@@ -57,9 +55,6 @@ def read_pcd(path: Path) -> RawCloud:
     Fields may be of any type and count; those named ``_`` are padding. ``VIEWPOINT`` is the pose of
     the sensor in the world when it recorded the cloud. It is not applied, as PCL does not either:
     points of one sensor stay in its frame.
-
-    Raises:
-        FileError: if the file is malformed, truncated, or has no one x, y and z.
     """
     data = path.read_bytes()
     end = _DATA.search(data[:_HEADER_BYTES])
@@ -77,11 +72,7 @@ def read_pcd(path: Path) -> RawCloud:
 
 
 def _layout(path: Path, header: str) -> tuple[int, list[_Field]]:
-    """The number of points and the fields of each.
-
-    Raises:
-        FileError: if the header is malformed.
-    """
+    """The number of points and the fields of each."""
     lines = {words[0]: words[1:] for words in map(str.split, header.split("\n")) if words}
     try:
         names = lines.get("FIELDS") or lines["COLUMNS"]
@@ -155,3 +146,47 @@ def _compressed_columns(
 _READERS = {
     b"ascii": _ascii_columns, b"binary": _binary_columns, b"binary_compressed": _compressed_columns,
 }  # fmt: skip
+
+
+MOST_RATIO = 88
+"""Three bytes stand for at most 264."""
+
+_LITERALS, _LONG = 32, 7  # controls below are literal bytes; lengths from here on have a byte more
+
+
+def unpack_lzf(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
+    """(size,) the unpacked bytes; None if the data are damaged or unpack to another size."""
+    out = np.empty(size, np.uint8)
+    return out if _unpack(data, out) == size else None
+
+
+@compiled(boundscheck=True)
+def _unpack(data: Any, out: Any) -> int:  # noqa: PLR0911
+    """Fill ``out``; the number of bytes written, -1 if the data refer beyond it or end early."""
+    at, end = 0, 0
+    while at < len(data):
+        control: Any = np.int64(data[at])
+        at += 1
+        if control < _LITERALS:
+            length = control + 1
+            if at + length > len(data) or end + length > len(out):
+                return -1
+            for k in range(length):
+                out[end + k] = data[at + k]
+            at += length
+        else:
+            length = control >> 5
+            if length == _LONG and at < len(data):
+                length += np.int64(data[at])
+                at += 1
+            if at >= len(data):
+                return -1
+            start = end - ((control & 31) << 8) - np.int64(data[at]) - 1
+            at += 1
+            length += 2
+            if start < 0 or end + length > len(out):
+                return -1
+            for k in range(length):
+                out[end + k] = out[start + k]
+        end += length
+    return end

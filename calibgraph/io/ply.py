@@ -1,7 +1,5 @@
 """Point clouds in .ply files: the vertices, among elements of any kind."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -67,11 +65,7 @@ class _Element:
 
 
 def read_ply(path: Path) -> RawCloud:
-    """The vertices of a file.
-
-    Raises:
-        FileError: if the file is malformed, truncated, or its vertices have no one x, y and z.
-    """
+    """The vertices of a file."""
     data = path.read_bytes()
     end = _END.search(data[:_HEADER_BYTES])
     if end is None or not data.startswith(b"ply"):
@@ -90,11 +84,7 @@ def read_ply(path: Path) -> RawCloud:
 
 
 def _parse(path: Path, header: str) -> tuple[str, list[_Element]]:
-    """The byte order, "" if it is text, and the elements.
-
-    Raises:
-        FileError: if the header is malformed.
-    """
+    """The byte order, "" if it is text, and the elements."""
     order, elements = None, list[_Element]()
     for line in header.split("\n"):
         try:

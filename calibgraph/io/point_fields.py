@@ -1,7 +1,5 @@
 """Clouds as files hold them: named fields, and which of them are x, y, z and the intensity."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -45,11 +43,7 @@ def find_intensity(names: Iterable[str]) -> str | None:
 
 
 def choose_fields(path: Path | str, names: Sequence[str]) -> list[str]:
-    """The fields x, y, z, and the intensity if there is one.
-
-    Raises:
-        FileError: if a coordinate is missing, or there are two.
-    """
+    """The fields x, y, z, and the intensity if there is one."""
     chosen = []
     for axis in "xyz":
         found = [name for name in names if name == axis] or [n for n in names if n.lower() == axis]
@@ -65,16 +59,7 @@ def choose_fields(path: Path | str, names: Sequence[str]) -> list[str]:
 def raw_cloud(
     path: Path | str, names: Sequence[str], column: Callable[[str], NDArray[Any]]
 ) -> RawCloud:
-    """The cloud of fields.
-
-    Args:
-        path: of the cloud, or its name.
-        names: of the fields.
-        column: (n,) values of a field.
-
-    Raises:
-        FileError: if a coordinate is missing, or there are two.
-    """
+    """The cloud of fields."""
     columns = [column(name) for name in choose_fields(path, names)]
     if any(each.dtype.kind not in "fiu" for each in columns):
         raise FileError(path, "holds no numbers in the fields of its points")
@@ -94,11 +79,7 @@ def make_cloud(
 
 
 def read_count(word: str) -> int:
-    """A number of points, of digits alone: ``int`` takes signs and underscores.
-
-    Raises:
-        ValueError: if it is none.
-    """
+    """A number of points, of digits alone: ``int`` takes signs and underscores."""
     if not word.isdecimal() or len(word) > _MOST_DIGITS:
         raise ValueError(f"found {word[:_MOST_DIGITS]!r}, expected a number")
     return int(word)

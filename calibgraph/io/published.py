@@ -1,7 +1,5 @@
 """Folders of published data sets that hold their own rig; each format is one entry here."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +11,7 @@ from calibgraph.io.incomplete import RigRead
 
 @dataclass(frozen=True)
 class PublishedFormat:
-    """How a data set is read.
-
-    Attributes:
-        is_one: whether a path is a folder of it.
-        read_rig: its rig, of its own calibration.
-        frames: of a folder and of the rig's cameras, in order; some may lack images.
-        describe: what is worth a line in the log, empty if nothing is.
-    """
+    """How a data set is read; ``describe`` gives a line for the log, or an empty text."""
 
     is_one: Callable[[Path], bool]
     read_rig: Callable[[Path], RigRead]

@@ -1,7 +1,5 @@
 """Rigs from disk: rig files, results, dataset folders, published data sets, ROS bags."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,8 +23,8 @@ FILL_IN = "FILL_IN"
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     """Read a rig from a rig file, a result, a dataset, a published data set or a bag.
 
-    A result gives the calibrated extrinsics, KITTI, nuScenes and Argoverse those of their own
-    calibration, a bag those of its /tf_static.
+    A result gives the calibrated extrinsics, KITTI, nuScenes and Argoverse their own
+    calibration, a bag its /tf_static.
 
     Args:
         path: a file or folder.
@@ -39,11 +37,7 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
 
 
 def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
-    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere.
-
-    Raises:
-        FileError, DatasetError: if there is none, or it is malformed.
-    """
+    """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere."""
     path = rig_file(path)
     if is_bag(path):
         read = read_bag_rig(path, bag)
@@ -89,11 +83,7 @@ def _exported_rig(content: dict[str, Any], path: Path) -> Rig:
 
 
 def _require_filled(content: object, path: Path) -> None:
-    """Refuse a rig file in which a placeholder is left.
-
-    Raises:
-        FileError: with the first key that holds one.
-    """
+    """Refuse a rig file in which a placeholder is left."""
     keys = list(_placeholders(content, ""))
     if keys:
         others = f", and {len(keys) - 1} more keys" if keys[1:] else ""
@@ -113,11 +103,7 @@ def _placeholders(content: object, key: str) -> Iterator[str]:
 
 
 def rig_file(path: Path | str) -> Path:
-    """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder.
-
-    Raises:
-        FileError: if there is no such path, or a folder holds none.
-    """
+    """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder."""
     found = find_rig_file(path)
     if found is None or not (found.exists() or published_format(found)):
         what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"

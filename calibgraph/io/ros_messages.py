@@ -3,8 +3,6 @@
 Any object with the fields of the message serves: of rclpy, rospy, rosbags or a decoder of MCAP.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -57,10 +55,10 @@ def camera_from_message(
             or the transform is none.
     """
     where = _where(message)
-    lens = lens_of(message, where, rectified=rectified)
-    T_image_frame = lens.T_image_frame(with_baseline=frame_of_first)
+    stated = lens_of(message, where, rectified=rectified)
+    T_image_frame = stated.T_image_frame(with_baseline=frame_of_first)
     return checked_model(
-        Camera, {**lens.content, "T_camera_lidar": T_image_frame @ T_camera_lidar}, where
+        Camera, {**stated.lens.fields(), "T_camera_lidar": T_image_frame @ T_camera_lidar}, where
     )
 
 

@@ -1,7 +1,5 @@
 """Quaternions and roll, pitch, yaw, as files of others have them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -30,11 +28,7 @@ def roll_pitch_yaw(T: Array) -> list[float]:
 
 
 def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
-    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits.
-
-    Raises:
-        ValueError: if the quaternion has another length.
-    """
+    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits."""
     length = math.hypot(*xyzw)
     if not abs(length - 1.0) <= ROUNDING:
         raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")

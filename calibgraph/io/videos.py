@@ -1,7 +1,5 @@
 """Videos of a camera beside the clouds: a picture is read by an address, as a file is."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,10 +27,6 @@ def pictures_of_video(video: Path, stems: Sequence[str]) -> dict[str, Path]:
     clouds' stems; a cloud belongs to the nearest picture, not more than half a picture's time
     apart. Without that file there are as many pictures as clouds, in the same order.
 
-    Args:
-        video: its file.
-        stems: of the clouds, in order.
-
     Raises:
         FileError: if the video cannot be read, its pictures are not as many as its stamps or the
             clouds, or a stamp or stem is no number.
@@ -53,11 +47,7 @@ def pictures_of_video(video: Path, stems: Sequence[str]) -> dict[str, Path]:
 
 
 def load_picture(address: Path) -> NDArray[np.uint8]:
-    """(height, width, 3) the picture with this address, BGR.
-
-    Raises:
-        FileError: if it cannot be decoded, or is to be turned.
-    """
+    """(height, width, 3) the picture with this address, BGR."""
     video, number = address.parent, int(address.stem)
     times = _times(video)
     if number >= len(times):

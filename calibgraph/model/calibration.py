@@ -26,13 +26,15 @@ from calibgraph.model.result_files import (
     CALIBRATION_FORMAT,
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
+    RESULT,
     VERDICT_KEY,
+    WRITTEN_KEY,
     outputs_of_calibration,
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
-from calibgraph.outputs import require_free
+from calibgraph.outputs import require_writable
 
 Array = NDArray[np.float64]
 
@@ -226,7 +228,7 @@ class Calibration:
             FileError: if a file of these names is there that is not of a result.
         """
         path = Path(folder) / CALIBRATION_FILE
-        require_free(outputs_of_calibration(path.parent))
+        require_writable(outputs_of_calibration(path.parent))
         hashes = {
             "correspondences_sha256": self._save_table(
                 self.correspondences, path.with_name(CORRESPONDENCES_FILE)
@@ -243,7 +245,8 @@ class Calibration:
         if table is None:
             path.unlink(missing_ok=True)
             return None
-        replace(table, metadata={**table.metadata, VERDICT_KEY: self.verdict.status}).save(path)
+        marks = {VERDICT_KEY: self.verdict.status, WRITTEN_KEY: RESULT}
+        replace(table, metadata={**table.metadata, **marks}).save(path)
         return sha256(path)
 
     def __repr__(self) -> str:

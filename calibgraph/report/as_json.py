@@ -1,7 +1,5 @@
 """Results as JSON on stdout, for programs: ``--json``."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -16,12 +14,7 @@ from calibgraph.model.verdict import Verdict
 
 
 def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
-    """A result as plain values; every key names its unit.
-
-    Args:
-        result: the calibration.
-        written: the files that were written.
-    """
+    """A result as plain values; every key names its unit."""
     cameras = {}
     for name, T in result.T_camera_lidar.items():
         residuals = result.residuals.get(name)
@@ -96,11 +89,7 @@ def print_line(text: str) -> None:
 
 
 def require_stdout() -> None:
-    """Check, before hours of work, that there is a standard output.
-
-    Raises:
-        FileError: if it is closed.
-    """
+    """Check, before hours of work, that there is a standard output."""
     if sys.stdout is None:
         raise FileError("standard output", "is closed; give what is printed somewhere to go")
 

@@ -33,12 +33,7 @@ def new_figure(height_in: float) -> Figure:
 
 
 def image_figure(camera: Camera, right_in: float = 0.1) -> tuple[Figure, Axes]:
-    """A figure whose axes are the image, v downwards.
-
-    Args:
-        camera: gives the size of the image.
-        right_in: space to the right of the axes [inches].
-    """
+    """A figure whose axes are the image, v downwards."""
     left_in, below_in, above_in = 0.45, 0.25, 0.3
     width_in = WIDTH_IN - left_in - right_in
     height_in = float(np.clip(width_in * camera.height_px / camera.width_px, 0.6, 5.0))

@@ -1,7 +1,5 @@
 """The frames of a result: the one whose images are shown, and where the files are now."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -60,11 +58,7 @@ def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
 
 
 def _require_same_files(result: Calibration, entry: Mapping[str, Any], frame: Frame) -> None:
-    """Check that a frame's cloud and images are those that the result was made from.
-
-    Raises:
-        DatasetError: if one has changed, by its hash.
-    """
+    """Check that a frame's cloud and images are those that the result was made from."""
     before = {"cloud": entry["cloud"], **entry["images"]}
     now = {"cloud": frame.cloud_path, **frame.image_paths}
     for what in before.keys() & now.keys():

@@ -1,7 +1,5 @@
 """The page: the template, filled with all of a result."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Correspondences by cells of the image: counts and mean residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,13 +17,7 @@ def grid_shape(camera: Camera, columns: int) -> tuple[int, int]:
 
 
 def count_per_cell(pixels_px: Array, camera: Camera, shape: tuple[int, int]) -> NDArray[np.intp]:
-    """(rows, columns) number of pixels in each cell.
-
-    Args:
-        pixels_px: (n, 2).
-        camera: gives the size of the image.
-        shape: columns, rows.
-    """
+    """(rows, columns) number of pixels in each cell."""
     number = _cell_numbers(pixels_px, camera, shape)
     counts = np.bincount(number, minlength=shape[0] * shape[1])
     return np.asarray(counts.reshape(shape[1], shape[0]))

@@ -1,20 +1,12 @@
 """The kit of all pages: their frame, styles, scripts and macros."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 
 
 def load_template(name: str, package: str = "calibgraph.report", folder: str = "") -> Template:
-    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report.
-
-    Args:
-        name: of its file.
-        package: that the file is in.
-        folder: of the package.
-    """
+    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report."""
     return _environment(package, folder).get_template(name)
 
 

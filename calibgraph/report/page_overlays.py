@@ -37,15 +37,7 @@ _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
 
 @dataclass(frozen=True)
 class Overlays:
-    """One camera's pictures of one frame, as data URIs; by residual is None without matches.
-
-    Attributes:
-        frame: the frame's name.
-        by_depth: before, after.
-        by_residual: before, after.
-        depth_scale: colours by depth.
-        residual_scale: colours by residual.
-    """
+    """A camera's pictures of a frame, before and after, as data URIs; None without matches."""
 
     frame: str
     by_depth: tuple[str, str]
@@ -56,12 +48,7 @@ class Overlays:
 
 @dataclass(frozen=True)
 class Scale:
-    """The colour scale of a picture.
-
-    Attributes:
-        gradient: colours from left to right, for CSS.
-        ticks: percent from the left, label.
-    """
+    """A gradient of CSS, and its ticks: percent from the left, label."""
 
     gradient: str
     ticks: tuple[tuple[float, str], ...]
@@ -193,7 +180,7 @@ def to_gradient(stops: Image) -> str:
 
 
 def _shrink(image: Image, max_width: int) -> Image:
-    """The image, at most so many pixels wide."""
+    """The image, scaled down to a width of at most ``width`` pixels."""
     factor = max_width / image.shape[1]
     if factor >= 1:
         return image

@@ -1,7 +1,5 @@
 """The page's section between cameras: what each pair sees in common, as numbers and a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of camera-camera matches: two images, lines between them coloured by residual."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

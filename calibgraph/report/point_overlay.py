@@ -1,7 +1,5 @@
 """The cloud projected into an image, coloured by depth; and before-and-after PNG files of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -29,16 +27,6 @@ def write_overlays(
 ) -> list[Path]:
     """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
 
-    Args:
-        frame: the cloud and images to show.
-        initial: the rig before.
-        final: the rig after.
-        folder: to write to.
-        mark: prefix of the title of the second picture, such as that the result is FAIL.
-
-    Returns:
-        The paths.
-
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
@@ -48,9 +36,6 @@ def write_overlays(
 
 def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
     """Write ``guess_CAMERA.png`` for every camera of the guess.
-
-    Returns:
-        The paths.
 
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
@@ -113,16 +98,7 @@ def _dot_side(pixels: int, points: int) -> int:
 
 
 def write_image(path: Path, image: Image, *, command: str = "") -> None:
-    """Write a PNG atomically.
-
-    Args:
-        path: of the file.
-        image: (height, width, 3) BGR.
-        command: which marks the picture as its own; empty for no mark.
-
-    Raises:
-        CalibrationError: if it cannot be encoded or written.
-    """
+    """Write a BGR image as PNG, atomically, with the mark of a command if it has one."""
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")

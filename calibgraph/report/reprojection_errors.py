@@ -50,11 +50,7 @@ class ReprojectionErrors:
         return np.asarray(self.sizes_px <= self.gate_px)
 
     def select(self, rows: NDArray[np.bool_]) -> ReprojectionErrors:
-        """The errors of some correspondences.
-
-        Args:
-            rows: (n,) which.
-        """
+        """The errors of some correspondences."""
         columns: dict[str, Any] = {
             name: column[rows]
             for name, column in vars(self).items()

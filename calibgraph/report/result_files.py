@@ -1,7 +1,5 @@
 """All files of a result in its folder: the calibration, its tables, pictures and the report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from calibgraph.io.dataset import Dataset
@@ -22,16 +20,10 @@ def write_result(
 ) -> list[Path]:
     """Write a result: of images with an overlay picture per camera.
 
-    Args:
-        result: the calibration.
-        folder: for the files.
-        data: the images and clouds; None for a solve of correspondences.
-        with_report: whether to write the report.
-
     Returns:
         The files to name to the user.
     """
-    stale = [output.path for output in outputs_of_result(folder) if output.is_ours(output.path)]
+    stale = [output.path for output in outputs_of_result(folder) if output.is_ours]
     written = [result.save(folder)]
     if data is not None:
         middle = data.frames[len(data.frames) // 2]

@@ -1,7 +1,5 @@
 """One point projected step by step, to show the conventions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,15 +17,7 @@ _DISTANCE_M = 10.0
 
 @dataclass(frozen=True)
 class WorkedPoint:
-    """One point from the LiDAR frame to the pixel, as text.
-
-    Attributes:
-        matrix: the rows of T_camera_lidar.
-        pose: translation and quaternion of T_camera_lidar.
-        inverse: those of the static transform of ROS TF, from lidar to camera_optical.
-        steps: the calculation.
-        origin: which point it is.
-    """
+    """One point from the LiDAR frame to the pixel, as text."""
 
     matrix: str
     pose: str
@@ -37,12 +27,7 @@ class WorkedPoint:
 
 
 def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoint:
-    """Project the used correspondence nearest to 10 m, or a point on the optical axis.
-
-    Args:
-        camera: lens and extrinsic.
-        errors: of its correspondences there; None if there are none.
-    """
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis."""
     T = camera.T_camera_lidar
     used = None if errors is None else errors.select(errors.is_inlier)
     if used is None or not len(used.frame):

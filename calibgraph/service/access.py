@@ -1,6 +1,4 @@
-"""Who may call: bearer tokens with scopes, of which only hashes are kept."""
-
-from __future__ import annotations
+"""Who may call: bearer tokens with scopes; only their hashes are kept."""
 
 import hashlib
 import hmac
@@ -33,13 +31,7 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 
 class Token(BaseModel):
-    """A token that may call.
-
-    Attributes:
-        tenant: whose jobs it sees; admin tokens see all.
-        scope: what it may do.
-        sha256: of the token.
-    """
+    """A token that may call; it sees its tenant's jobs, with scope admin all."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -58,12 +50,7 @@ class TokenFile(BaseModel):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls.
-
-    Attributes:
-        tenant: whose jobs are meant.
-        scope: what the call may do.
-    """
+    """Who calls: whose jobs are meant, and what the call may do."""
 
     tenant: str
     scope: Scope
@@ -78,23 +65,12 @@ class Caller:
 
 
 def load_tokens(path: Path) -> tuple[Token, ...]:
-    """The tokens of a file.
-
-    Raises:
-        FileError: if it is missing or malformed.
-    """
+    """The tokens of a file."""
     return checked_model(TokenFile, read_yaml(path), path).tokens
 
 
 def add_token(path: Path, tenant: str, scope: Scope) -> str:
-    """Make a token and add its hash to a file, which is made if it is not there.
-
-    Returns:
-        The token, which is kept nowhere.
-
-    Raises:
-        FileError: if the file or an argument is malformed.
-    """
+    """Make a token, which is kept nowhere, and add its hash to a file, which is made if missing."""
     known = load_tokens(path) if path.exists() else ()
     secret = secrets.token_urlsafe(32)
     token = {"tenant": tenant, "scope": scope, "sha256": _hash(secret)}
@@ -111,11 +87,7 @@ def _hash(token: str) -> str:
 
 
 class Gate:
-    """Finds out who calls.
-
-    Args:
-        tokens: that may call; None: anyone may, as admin.
-    """
+    """Finds out who calls; without tokens (None) anyone may, as admin."""
 
     def __init__(self, tokens: tuple[Token, ...] | None) -> None:
         self._tokens = tokens

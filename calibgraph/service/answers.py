@@ -1,27 +1,12 @@
 """What the routes of jobs and trackers answer."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 from pydantic import BaseModel
 
-from calibgraph.service.job_task import Step
+from calibgraph.service.job_task import JobProgress
 from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.requests import JobKind
-
-
-class Progress(BaseModel):
-    """How far a job is.
-
-    Attributes:
-        stage: what it does.
-        done, total: steps of the stage.
-    """
-
-    stage: str
-    done: int
-    total: int
 
 
 class JobError(BaseModel):
@@ -58,7 +43,7 @@ class JobAnswer(BaseModel):
     created: datetime
     started: datetime | None
     finished: datetime | None
-    progress: Progress | None
+    progress: JobProgress | None
     verdict: str | None
     cannot_tell: bool | None
     error: JobError | None
@@ -78,9 +63,8 @@ class JobList(BaseModel):
     next: int | None
 
 
-def job_answer(record: JobRecord, step: Step | None) -> JobAnswer:
+def job_answer(record: JobRecord, progress: JobProgress | None) -> JobAnswer:
     """A job as an answer."""
-    is_running = record.state == "running" and step is not None
     return JobAnswer(
         id=record.id,
         kind=record.kind,
@@ -88,7 +72,7 @@ def job_answer(record: JobRecord, step: Step | None) -> JobAnswer:
         created=utc(record.created_s),
         started=None if record.started_s is None else utc(record.started_s),
         finished=None if record.finished_s is None else utc(record.finished_s),
-        progress=Progress(**vars(step)) if is_running and step else None,
+        progress=progress if record.state == "running" else None,
         verdict=record.verdict,
         cannot_tell=record.cannot_tell,
         error=JobError(kind=record.error_kind or "internal error", detail=record.error)

@@ -1,7 +1,5 @@
 """The application: its routers, and what they share."""
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -18,12 +16,11 @@ from calibgraph.service import (
     routes_trackers,
 )
 from calibgraph.service.access import Gate, load_tokens
-from calibgraph.service.api_schema import add_schemas
 from calibgraph.service.metrics import Metrics
-from calibgraph.service.problems import ProblemDetails, add_problem_handlers
+from calibgraph.service.problems import ProblemDetails, add_problem_handlers, add_schemas
+from calibgraph.service.request_guard import LOCAL_NAMES, RequestGuard
 from calibgraph.service.requests import REQUESTS, SETTINGS_OF
 from calibgraph.service.settings import Settings
-from calibgraph.service.shield import LOCAL_NAMES, Shield
 from calibgraph.service.state import Service, open_service
 
 STATIC_FOLDER = Path(__file__).parent / "static"
@@ -54,7 +51,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.settings = settings = _with_shares(settings, len(app.state.gate.tenants))
     app.state.metrics = metrics = Metrics()
     app.state.service = open_service(settings, metrics)
-    app.add_middleware(Shield, hosts=_hosts(settings), observe=metrics.observe_request)
+    app.add_middleware(RequestGuard, hosts=_hosts(settings), observe=metrics.observe_request)
     app.mount(
         "/static",
         StaticFiles(directory=STATIC_FOLDER, packages=[("calibgraph.report", "static")]),

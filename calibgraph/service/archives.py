@@ -1,7 +1,5 @@
 """Uploads as datasets: an archive of a dataset folder, or a bag. Names are checked, never paths."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -37,14 +35,7 @@ _TABLES = {b"PAR1": ".parquet"}
 
 
 def open_upload(path: Path, most_bytes: int) -> Path:
-    """The recording in an upload: what it is, its first bytes show.
-
-    Args:
-        path: of the uploaded file.
-        most_bytes: of an archive, unpacked.
-
-    Returns:
-        A folder or a bag beside it, in whose place it is.
+    """The recording in an upload, by its first bytes: a bag or the unpacked folder, in its place.
 
     Raises:
         FileError: if it is neither, or an archive holds something else, or too much.

@@ -1,10 +1,8 @@
 """Connections with limits: uvicorn's own have none on headers, on time, or on what is left unread.
 
-The parser stays that of httptools. Its callbacks show how far a request is, and one timer per
+The parser is httptools. Its callbacks show how far a request is, and one timer per
 connection runs until the next step.
 """
-
-from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
@@ -20,7 +18,7 @@ HEADER_S = 10.0
 """From the connection, or the first byte of a request, to the end of its headers."""
 BODY_S = 20.0
 LEAST_BODY_BYTES = 10_000
-"""A body brings so many in each BODY_S, unless the server itself does not read."""
+"""The least part of a body in each BODY_S, unless the server itself does not read."""
 UNREAD_S = 10.0
 """For the rest of a body that was answered before its end: who still sends can read the answer."""
 REFUSED_S, REFUSED_BYTES = 1.0, 2**18

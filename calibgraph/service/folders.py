@@ -1,7 +1,5 @@
 """The data folder: one server's, with a folder per job and per tracker."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets
@@ -14,16 +12,6 @@ from calibgraph.files import require_place_for_folder, sync_folder, write_text
 
 class DataFolder:
     """The data folder of a server, locked against a second one.
-
-    Args:
-        path: of the folder; made if it is not there.
-
-    Attributes:
-        path: of the folder, without links.
-        jobs: folder of the jobs' folders.
-        trackers: folder of the trackers' folders.
-        arriving: folder of uploads that are not whole; empty at the start.
-        owner: id of the folder.
 
     Raises:
         FileError: if it cannot be used, or another server uses it.

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import time
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +13,29 @@ from typing import TYPE_CHECKING, Any
 from calibgraph.child_process import Note, answer_requests, memory_limit, output_to
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_text
-from calibgraph.fleet.task import ErrorKind
+from calibgraph.fleet.task import describe_failure
 from calibgraph.fleet.uris import fetch
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.job_task import FILES, INPUT, LOG, SUMMARY, WORK, JobOutcome, JobTask
+from calibgraph.service.job_task import (
+    FILES,
+    INPUT,
+    LOG,
+    SUMMARY,
+    WORK,
+    JobOutcome,
+    JobProgress,
+    JobTask,
+)
 from calibgraph.service.places import require_inside
-from calibgraph.service.requests import RIG, TABLE, recording_name
+from calibgraph.service.requests import (
+    RIG,
+    TABLE,
+    CalibrationSettings,
+    CheckSettings,
+    SolveSettings,
+    recording_name,
+)
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
@@ -40,17 +55,10 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
     os.chdir(task.folder / INPUT)
     try:
         return _run(task, _progress(note))
-    except MemoryError:
-        kind: ErrorKind = "out of memory"
-        text = "not enough memory; give fewer frames, or smaller files"
-    except (CalibrationError, ValueError) as error:
-        kind, text = "bad input", str(error)
-    except OSError as error:
-        traceback.print_exc()
-        kind, text = "io", error.strerror or type(error).__name__
     except Exception as error:
-        traceback.print_exc()
-        kind, text = "internal error", f"{type(error).__name__}: {error}"
+        kind, text = describe_failure(error)
+        if isinstance(error, OSError):  # whose text may name the server's files
+            text = error.strerror or type(error).__name__
     text = text.replace(f"{task.folder}/{INPUT}/", "").replace(str(task.folder), "")
     return JobOutcome(error_kind=kind, error=str(CalibrationError(text)))
 
@@ -90,7 +98,7 @@ def _found(task: JobTask, name: str) -> Path | None:
 
 
 def _room(task: JobTask, most_bytes: int) -> int:
-    """How much an input may take of the disk, half of which is left to others."""
+    """How much of the disk an input may take: half of the free space is left to others."""
     free = shutil.disk_usage(task.folder).free - task.free_bytes
     return max(0, min(most_bytes, free // 2))
 
@@ -134,7 +142,7 @@ def _solve(
     from calibgraph.io.rigs import load_rig
     from calibgraph.pipeline import solve
 
-    settings = task.job.solve_settings()
+    settings = SolveSettings.model_validate(task.job.settings)
     if rig is None or table is None:
         raise ValueError("a solve needs a rig and correspondences")
     progress("solving", 0, 1)
@@ -151,7 +159,7 @@ def _calibrate(
     from calibgraph.matching.structure import StructureMatcher
     from calibgraph.pipeline import calibrate
 
-    settings = task.job.calibration_settings()
+    settings = CalibrationSettings.model_validate(task.job.settings)
     data = load_dataset(recordings, load_rig(rig) if rig else None, frames=settings.frames)
     options: dict[str, Any] = {"search_deg": settings.search_deg, "search_m": settings.search_m}
     if settings.search:
@@ -190,7 +198,7 @@ def _check(
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.structure import StructureMatcher
 
-    settings = task.job.check_settings()
+    settings = CheckSettings.model_validate(task.job.settings)
     if rig is None:
         raise ValueError("a check needs the deployed rig")
     deployed = load_rig(rig)
@@ -228,7 +236,7 @@ def _progress(note: Note) -> Progress:
         elif now - last_s[0] < _NOTE_EVERY_S:
             return
         stage[0], last_s[0] = what, now
-        note((what, done, total))
+        note(JobProgress(stage=what, done=done, total=total))
 
     return progress
 

@@ -1,9 +1,9 @@
 """What a job's process gets and what it returns; and the names in a job's folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
 
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.service.places import Root
@@ -17,18 +17,7 @@ FILES, SUMMARY = "files", "summary.json"
 
 @dataclass(frozen=True)
 class JobTask:
-    """A job for a process.
-
-    Attributes:
-        job: what is asked for.
-        folder: of the job.
-        roots: from which it may read.
-        memory_bytes: that it may allocate.
-        fetch_bytes: of remote recordings.
-        unpacked_bytes: of uploaded archives.
-        free_bytes: of the disk, that stay free.
-        timeout_s: after which it is ended.
-    """
+    """A job for a process, with its limits; ``free_bytes`` of the disk stay free."""
 
     job: Job
     folder: Path
@@ -42,13 +31,7 @@ class JobTask:
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """How a job ended.
-
-    Attributes:
-        verdict: of the result; None if it failed.
-        cannot_tell: whether the data determine too little for another one.
-        error_kind, error: why it failed, in one line.
-    """
+    """How a job ended: the verdict of its result, or why it failed, in one line."""
 
     verdict: str | None = None
     cannot_tell: bool | None = None
@@ -56,14 +39,15 @@ class JobOutcome:
     error: str | None = None
 
 
-@dataclass(frozen=True)
-class Step:
-    """How far a job is.
+class JobProgress(BaseModel):
+    """How far a running job is.
 
     Attributes:
         stage: what it does.
         done, total: steps of the stage.
     """
+
+    model_config = ConfigDict(frozen=True)
 
     stage: str
     done: int

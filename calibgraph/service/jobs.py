@@ -1,7 +1,5 @@
 """The table of jobs: nothing that was acknowledged is lost, whatever ends the server."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Iterable
@@ -46,22 +44,7 @@ _START = (
 
 @dataclass(frozen=True)
 class JobRecord:
-    """A job, as the table holds it.
-
-    Attributes:
-        number: in the order of submission.
-        id: random; who knows it still needs a token of the tenant.
-        tenant: whose it is.
-        kind: of the job.
-        state: queued, running, succeeded, failed or cancelled.
-        created_s, started_s, finished_s: times since 1970; None if not yet.
-        starts: how often it was started.
-        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
-        cannot_tell: whether the data determine too little for another one; None if unknown.
-        error_kind, error: why it failed, in one line.
-        idempotency_key: that the request had.
-        name, note: for people; None in databases of earlier versions.
-    """
+    """A job, as the table holds it; times are seconds since 1970, None if not yet."""
 
     number: int
     id: str
@@ -100,29 +83,14 @@ class OtherRequestError(Exception):
 
 
 class JobTable:
-    """The jobs of a server.
-
-    Args:
-        engine: of the database.
-    """
+    """The jobs of a server."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
     def add(self, id: str, tenant: str, job: Job, digest: str, *, key: str | None) -> JobRecord:
-        """Add a job; it is durable when this returns.
-
-        Args:
-            id: of the job, whose input is in its folder.
-            tenant: whose it is.
-            job: what is asked for.
-            digest: of all that is asked for, with uploads.
-            key: idempotency key: with one that is known, the job of it is returned.
-
-        Raises:
-            OtherRequestError: if the key was given with another request.
-        """
+        """Add a job; it is durable when this returns. A known idempotency key returns its job."""
         values = {
             "id": id, "tenant": tenant, "kind": job.kind, "state": "queued",
             "request": job.model_dump_json(), "digest": digest, "idempotency_key": key,
@@ -138,11 +106,7 @@ class JobTable:
             return known
 
     def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
-        """The job that a request with an idempotency key made before.
-
-        Raises:
-            OtherRequestError: if it has another digest than the one given.
-        """
+        """The job that a request with an idempotency key made before."""
         if key is None:
             return None
         where = (jobs.c.tenant == tenant) & (jobs.c.idempotency_key == key)
@@ -188,9 +152,6 @@ class JobTable:
 
         Tenants take turns: first those with the fewest jobs that run, of these the one whose last
         start is the longest ago. Of a tenant the job that has waited longest is next.
-
-        Args:
-            most_running: jobs of one tenant at the same time.
         """
         while (number := self._next(most_running)) is not None:
             with self._engine.begin() as connection:
@@ -237,11 +198,7 @@ class JobTable:
         return self._change(_is(id, "queued", "running"), values) > 0
 
     def put_back(self, id: str | None = None) -> int:
-        """Let a running job, or all of them, wait again; those started too often fail.
-
-        Returns:
-            How many wait again.
-        """
+        """Let a running job, or all, wait again, and count them; those started too often fail."""
         which = jobs.c.state == "running" if id is None else _is(id, "running")
         text = f"its process or the server ended {MOST_STARTS} times while it ran"
         self._change(

@@ -1,7 +1,5 @@
 """Numbers for Prometheus."""
 
-from __future__ import annotations
-
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -10,15 +8,7 @@ _JOB_S = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000)
 
 
 class Metrics:
-    """The numbers of one server, in a registry of its own.
-
-    Attributes:
-        jobs: that ended, by kind and state.
-        job_s: from the start of a job to its end.
-        queued: jobs that wait.
-        running: jobs that run.
-        frames: that trackers have taken in.
-    """
+    """The numbers of one server, in a registry of its own."""
 
     def __init__(self) -> None:
         self._registry = registry = CollectorRegistry()

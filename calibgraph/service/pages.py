@@ -1,16 +1,14 @@
-"""What the pages for people show: jobs, results and trackers in words."""
-
-from __future__ import annotations
+"""The content of the pages for people: jobs, results and trackers in words, and the forms."""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from calibgraph.report.kit import load_template
 from calibgraph.service.answers import utc
-from calibgraph.service.job_task import Step
+from calibgraph.service.job_task import JobProgress
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.requests import JobKind
 
@@ -44,19 +42,7 @@ def render(template: str, **content: object) -> str:
 
 @dataclass(frozen=True)
 class JobView:
-    """A job as a page shows it.
-
-    Attributes:
-        id, kind: of the job.
-        title: its name, or kind and id.
-        note: that was given with it.
-        question: that the result answers.
-        result: verdict, or else state.
-        created, took: times in words.
-        stage: what it does.
-        error: why it failed.
-        is_finished: whether nothing will change.
-    """
+    """A job as a page shows it."""
 
     id: str
     kind: str
@@ -71,7 +57,7 @@ class JobView:
     is_finished: bool
 
 
-def job_view(record: JobRecord, step: Step | None) -> JobView:
+def job_view(record: JobRecord, step: JobProgress | None) -> JobView:
     """A job as a page shows it."""
     took = ""
     if record.started_s is not None and record.finished_s is not None:
@@ -104,13 +90,7 @@ def _in_words(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera's row.
-
-    Attributes:
-        name: of the camera.
-        verdict: of it.
-        numbers: in the order of the columns.
-    """
+    """A camera's row; its numbers are in the order of the columns."""
 
     name: str
     verdict: str
@@ -132,7 +112,7 @@ def _camera_view(name: str, camera: Mapping[str, Any], rows: Sequence[_Row]) -> 
 
 
 def _numbers(camera: Mapping[str, Any], path: str, form: str) -> str:
-    """One number, or those of the axes; a dash where there is none."""
+    """One number, or one per axis; a dash where there is none."""
     value: Any = camera
     for key in path.split("."):
         value = value.get(key) if isinstance(value, Mapping) else None
@@ -165,3 +145,62 @@ def actions_of(summary: Mapping[str, Any]) -> list[str]:
     """What to do about a result."""
     actions: list[str] = summary.get("summary", {}).get("actions", [])
     return actions
+
+
+TITLES: Mapping[JobKind, str] = {
+    "calibration": "Calibrate a recording",
+    "check": "Check a deployed calibration",
+    "solve": "Solve a table of correspondences",
+}
+
+
+@dataclass(frozen=True)
+class Field:
+    """An input of a form; its type is one of HTML's, or textarea."""
+
+    name: str
+    label: str
+    hint: str = ""
+    type: str = "text"
+    required: bool = False
+    multiple: bool = False
+
+
+_ABOUT = (
+    Field("name", "Name", "For the list of jobs."),
+    Field("note", "Note", type="textarea"),
+)
+_RECORDING = Field(
+    "recording", "Recording", "A zip of a dataset folder, or bags.", "file", True, True
+)
+_RIG = Field("rig", "Guess", "A rig.yaml; without one, that of the recording.", "file")
+_FRAMES = Field("frames", "Frames", "Like 0:90:10; without, all or the best 30.")
+_FIELDS: Mapping[JobKind, tuple[Field, ...]] = {
+    "calibration": (
+        _RECORDING,
+        _RIG,
+        *_ABOUT,
+        _FRAMES,
+        Field("search_deg", "Search range, deg per axis", "Without, the matcher's.", "number"),
+        Field("search_m", "Search range, m per axis", "Without, the matcher's.", "number"),
+    ),
+    "check": (
+        replace(_RIG, label="Deployed calibration", hint="A rig.yaml or calibration.yaml.",
+                required=True),
+        _RECORDING,
+        *_ABOUT,
+        Field("tolerance_deg", "Tolerance, deg per axis", "Without, 0.5.", "number"),
+        Field("tolerance_cm", "Tolerance, cm per axis", "Without, 10.", "number"),
+        _FRAMES,
+    ),
+    "solve": (
+        replace(_RIG, hint="A rig.yaml.", required=True),
+        Field("correspondences", "Correspondences", "A .parquet or .csv.", "file", True),
+        *_ABOUT,
+    ),
+}  # fmt: skip
+
+
+def form_of(kind: JobKind) -> dict[str, Any]:
+    """What the template of a new job's page shows."""
+    return {"kind": kind, "title": TITLES[kind], "kinds": TITLES.items(), "fields": _FIELDS[kind]}

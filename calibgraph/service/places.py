@@ -1,7 +1,5 @@
 """Where jobs may read: URIs inside roots that the server's owner allows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -14,12 +12,7 @@ _SHOWN = 200
 
 @dataclass(frozen=True)
 class Root:
-    """A folder from which jobs may read.
-
-    Attributes:
-        protocol: of fsspec.
-        path: in it, without a slash at the end; of a local folder without links.
-    """
+    """A folder from which jobs may read: its fsspec protocol, and its path without links."""
 
     protocol: str
     path: str

@@ -1,11 +1,9 @@
-"""Errors as answers: problem+json (RFC 9457), with one line of what to do."""
-
-from __future__ import annotations
+"""Errors as answers: problem+json (RFC 9457), with one line of what to do; schemas for OpenAPI."""
 
 import errno
 import logging
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -13,12 +11,12 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.api_schema import reference
 
 log = logging.getLogger("calibgraph.service")
 
@@ -43,13 +41,7 @@ class ProblemDetails(BaseModel):
 
 
 class Problem(Exception):
-    """An answer that refuses a request.
-
-    Args:
-        status: of HTTP.
-        detail: what is wrong, and what to do, in one line.
-        headers: of the answer.
-    """
+    """An answer that refuses a request; its detail states in one line what to do."""
 
     def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(detail)
@@ -129,3 +121,28 @@ def _first_problem(error: RequestValidationError) -> str:
     place = ".".join(str(part) for part in first["loc"] if part != "body")
     message = str(first["msg"]).removeprefix("Value error, ")
     return f"{place}: {message}" if place else message
+
+
+_PLACE = "#/components/schemas/{model}"
+
+
+def reference(model: type[BaseModel]) -> dict[str, str]:
+    """Where the schema of a model is, once :func:`add_schemas` has put it there."""
+    return {"$ref": _PLACE.format(model=model.__name__)}
+
+
+def add_schemas(app: FastAPI, models: Iterable[type[BaseModel]]) -> None:
+    """Add models to the components of an app's description."""
+    modes: list[tuple[type[BaseModel], Any]] = [(model, "validation") for model in models]
+    describe = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        is_new = app.openapi_schema is None
+        description = describe()
+        if is_new:
+            _, found = models_json_schema(modes, ref_template=_PLACE)
+            schemas = description.setdefault("components", {}).setdefault("schemas", {})
+            schemas.update(found["$defs"])
+        return description
+
+    app.openapi = openapi  # type: ignore[method-assign]

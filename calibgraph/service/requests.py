@@ -1,7 +1,5 @@
 """What jobs are asked for: the bodies of requests, checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -82,12 +80,7 @@ Recordings = Annotated[tuple[Uri, ...], Field(min_length=1, max_length=MAX_RECOR
 
 
 class _Request(_Strict):
-    """What every request may add.
-
-    Attributes:
-        name: of the job, for people.
-        note: about it, for people.
-    """
+    """What every request may add."""
 
     name: JobName = ""
     note: JobNote = ""
@@ -146,32 +139,12 @@ REQUESTS: Mapping[JobKind, type[AnyRequest]] = {
 
 
 class Job(_Request):
-    """A job as it is kept.
-
-    Attributes:
-        kind: of the job.
-        uris: what is read from where, by the name of the input; uploads are in the job's folder.
-        recordings: how many there are.
-        settings: of the kind, as JSON.
-        name, note: for people.
-    """
+    """A job as it is kept: its URIs by the name of the input; uploads are in its folder."""
 
     kind: JobKind
     uris: dict[str, str] = {}
     recordings: int = 0
     settings: dict[str, Any] = {}
-
-    def calibration_settings(self) -> CalibrationSettings:
-        """The settings of a calibration."""
-        return CalibrationSettings.model_validate(self.settings)
-
-    def solve_settings(self) -> SolveSettings:
-        """The settings of a solve."""
-        return SolveSettings.model_validate(self.settings)
-
-    def check_settings(self) -> CheckSettings:
-        """The settings of a check."""
-        return CheckSettings.model_validate(self.settings)
 
 
 RIG, TABLE, RECORDING = "rig", "correspondences", "recording"

@@ -1,6 +1,4 @@
-"""Room for bodies that arrive, reserved before they are taken: no tenant takes that of another."""
-
-from __future__ import annotations
+"""Room for bodies that arrive, reserved before they are taken: no tenant takes another's."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,13 +15,7 @@ _RETRY_AFTER = {"Retry-After": "30"}
 
 @dataclass
 class Held:
-    """Room that is reserved for a body.
-
-    Attributes:
-        tenant: whose body it is.
-        bytes: that are reserved.
-        arrived: of them, those that have arrived.
-    """
+    """Room that is reserved for a body, and the part of it that has arrived."""
 
     tenant: str
     bytes: int = 0

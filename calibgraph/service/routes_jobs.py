@@ -1,7 +1,5 @@
 """Routes of jobs: ask for one, follow it, cancel it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time
@@ -14,11 +12,10 @@ from starlette.concurrency import run_in_threadpool
 
 from calibgraph.service.access import Reader, Submitter
 from calibgraph.service.answers import JobAnswer, JobList, job_answer
-from calibgraph.service.api_schema import reference
-from calibgraph.service.bell import progress_of, wait_for
+from calibgraph.service.job_events import progress_of, wait_for
 from calibgraph.service.job_task import LOG
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.problems import Problem, documented
+from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.requests import (
     ABOUT,
     ALLOWED,
@@ -91,11 +88,7 @@ for _kind in KINDS:
 
 
 def find_job(state: Service, caller: Reader, id: str) -> JobRecord:
-    """The job of an id.
-
-    Raises:
-        Problem: if there is none that the caller sees.
-    """
+    """The job of an id."""
     record = state.jobs.get(id, caller)
     if record is None:
         raise Problem(404, "no such job; finished jobs are removed after some time")
@@ -124,13 +117,13 @@ async def get_job(
 ) -> JobAnswer:
     """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
     end = time.monotonic() + wait_s
-    with state.bell.listen(id) as heard:
+    with state.events.listen(id) as changed:
         while True:
             record = await run_in_threadpool(find_job, state, caller, id)
             left_s = end - time.monotonic()
             if record.is_finished or left_s <= 0 or state.is_stopping:
                 return job_answer(record, state.runner.step(id))
-            await wait_for(heard, left_s)
+            await wait_for(changed, left_s)
 
 
 @router.get(
@@ -148,7 +141,7 @@ async def job_events(id: JobId, state: State, caller: Reader) -> Response:
 
 async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]:
     sent, last_s = "", time.monotonic()
-    with state.bell.listen(id, progress_of(id)) as heard:
+    with state.events.listen(id, progress_of(id)) as changed:
         while not state.is_stopping:
             record = await run_in_threadpool(state.jobs.get, id, caller)
             if record is None:
@@ -162,7 +155,7 @@ async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]
                 last_s = time.monotonic()
             if record.is_finished:
                 return
-            await wait_for(heard, _KEEP_ALIVE_S)
+            await wait_for(changed, _KEEP_ALIVE_S)
             await asyncio.sleep(0.05)  # steps come faster than anyone reads them
 
 

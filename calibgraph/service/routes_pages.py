@@ -1,7 +1,7 @@
 """Pages for people: jobs with their verdicts, a job, trackers with their drift; sign in."""
 
-from __future__ import annotations
-
+import json
+from functools import partial
 from typing import Annotated, Any
 from urllib.parse import parse_qs
 
@@ -12,28 +12,18 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
+from calibgraph.service import pages
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.api_page import operations, schemas
-from calibgraph.service.forms import form_of
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.pages import (
-    actions_of,
-    camera_table,
-    job_view,
-    minute_of,
-    read_summary,
-    reasons_of,
-    render,
-)
+from calibgraph.service.pages import form_of
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job
 from calibgraph.service.routes_service import require_docs
-from calibgraph.service.routes_trackers import find_tracker
+from calibgraph.service.routes_trackers import ask_tracker, find_tracker
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import submit
-from calibgraph.service.tracker_request import TrackerRequest
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -58,7 +48,7 @@ def _page(request: Request, template: str, status: int = 200, **content: object)
     can_sign_out = not gate.is_open and COOKIE in request.cookies
     has_docs = request.app.state.settings.api_docs != "off"
     fixed = {"can_sign_out": can_sign_out, "has_docs": has_docs}
-    return HTMLResponse(render(template, **fixed, **content), status)
+    return HTMLResponse(pages.render(template, **fixed, **content), status)
 
 
 @router.get("/")
@@ -71,7 +61,7 @@ def jobs_page(
     """The jobs, with their verdicts."""
     records = state.jobs.newest(caller, _PER_PAGE, before)
     following = records[-1].number if len(records) == _PER_PAGE else None
-    views = [job_view(record, state.runner.step(record.id)) for record in records]
+    views = [pages.job_view(record, state.runner.step(record.id)) for record in records]
     return _page(request, "jobs.html.j2", jobs=views, next=following, is_later=before is not None)
 
 
@@ -80,14 +70,14 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
     """A job: how far it is, or its verdict, its cameras and its files."""
     record = find_job(state, caller, id)
     folder = state.folder.of_job(id) / RESULT
-    summary = read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
-    columns, cameras = camera_table(summary.get("cameras", {}))
+    summary = pages.read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
+    columns, cameras = pages.camera_table(summary.get("cameras", {}))
     return _page(
         request,
         "job.html.j2",
-        job=job_view(record, state.runner.step(id)),
-        actions=actions_of(summary),
-        reasons=reasons_of(summary),
+        job=pages.job_view(record, state.runner.step(id)),
+        actions=pages.actions_of(summary),
+        reasons=pages.reasons_of(summary),
         columns=columns,
         cameras=cameras,
         page=_explanation(state, record),
@@ -143,7 +133,7 @@ async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor
 def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
     """The trackers."""
     trackers = [
-        {"id": record.id, "name": record.name, "created": minute_of(record.created_s)}
+        {"id": record.id, "name": record.name, "created": pages.minute_of(record.created_s)}
         for record in state.tracker_table.list(caller)
     ]
     return _page(request, "trackers.html.j2", trackers=trackers)
@@ -153,13 +143,12 @@ def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
 async def tracker_page(id: str, request: Request, state: State, caller: Visitor) -> Response:
     """A tracker: its verdict, its alarms, its extrinsics over time."""
     record = await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    found: dict[str, Any] = await state.trackers.answer(id, caller.tenant, asked)
-    columns, cameras = camera_table(found["cameras"])
+    found: dict[str, Any] = await ask_tracker(state, caller, id, "state")
+    columns, cameras = pages.camera_table(found["cameras"])
     return _page(
         request,
         "tracker.html.j2",
-        tracker={"name": record.name, "created": minute_of(record.created_s)},
+        tracker={"name": record.name, "created": pages.minute_of(record.created_s)},
         verdict_word=found["verdict"],
         frame=found["frame"],
         reasons=found["reasons"],
@@ -180,8 +169,8 @@ async def api_page(request: Request, state: State) -> Response:
     return _page(
         request,
         "docs.html.j2",
-        operations=operations(request.app.openapi()),
-        schemas=schemas(request.app.openapi()),
+        api=request.app.openapi(),
+        as_text=partial(json.dumps, indent=1),
         url=str(request.base_url).rstrip("/"),
         is_open=gate.is_open,
     )

@@ -1,7 +1,5 @@
 """Routes of results: the summary, the report, the files, other programs' formats."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -36,11 +34,7 @@ _SUFFIXES = {
 
 
 def _result_folder(state: Service, caller: Reader, id: str) -> Path:
-    """The folder of a result.
-
-    Raises:
-        Problem: if there is no such job, or it has none.
-    """
+    """The folder of a result."""
     record = find_job(state, caller, id)
     if record.state != "succeeded":
         why = f" ({record.error})" if record.error else ""

@@ -1,7 +1,5 @@
 """Routes of the service itself: is it alive, can it work, its numbers, its API in words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
@@ -18,11 +16,7 @@ router = APIRouter()
 
 
 class Status(BaseModel):
-    """That the server is well.
-
-    Attributes:
-        status: ok.
-    """
+    """That the server is well."""
 
     status: str = "ok"
 
@@ -69,10 +63,6 @@ async def openapi(request: Request, state: State, credentials: Credentials) -> d
 
 
 def require_docs(state: Service) -> None:
-    """Check that this server describes its API.
-
-    Raises:
-        Problem: if not.
-    """
+    """Check that this server describes its API."""
     if state.settings.api_docs == "off":
         raise Problem(404, "this server does not describe its API; see calibgraph serve --api-docs")

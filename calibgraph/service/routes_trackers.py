@@ -1,7 +1,5 @@
 """Routes of trackers: one per rig, frames in, estimates out."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from typing import Annotated, Any
@@ -15,13 +13,12 @@ from calibgraph.files import checked_model
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
 from calibgraph.service.answers import utc
-from calibgraph.service.api_schema import reference
 from calibgraph.service.jobs import new_id
-from calibgraph.service.problems import Problem, documented
+from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
-from calibgraph.service.tracker_request import ARROW, TrackerRequest
+from calibgraph.service.tracker_request import ARROW, Action, TrackerRequest
 from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.yaml_text import yaml_text
 
@@ -112,15 +109,20 @@ def tracker_answer(record: TrackerRecord) -> TrackerAnswer:
 
 
 def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
-    """The tracker of an id.
-
-    Raises:
-        Problem: if there is none that the caller sees.
-    """
+    """The tracker of an id."""
     record = state.tracker_table.get(id, caller)
     if record is None:
         raise Problem(404, "no such tracker")
     return record
+
+
+async def ask_tracker(
+    state: Service, caller: Caller, id: str, action: Action, *, body: bytes = b"", media: str = ""
+) -> Any:
+    """The answer of a tracker that the caller sees."""
+    await run_in_threadpool(find_tracker, state, caller, id)
+    request = TrackerRequest(action, str(state.folder.of_tracker(id)), body, media)
+    return await state.trackers.answer(id, caller.tenant, request)
 
 
 @router.post(
@@ -188,8 +190,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
     body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
-    asked = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
-    answer = await state.trackers.answer(id, caller.tenant, asked)
+    answer = await ask_tracker(state, caller, id, "frames", body=body, media=media)
     state.metrics.frames.inc(len(answer["updates"]))
     return JSONResponse(answer)
 
@@ -197,9 +198,7 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
 @router.get("/{id}/state", responses=documented(404, 422, 429))
 async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerState:
     """The last estimate, with its error bars, verdicts and events."""
-    await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("state", str(state.folder.of_tracker(id)))
-    return TrackerState(**await state.trackers.answer(id, caller.tenant, asked))
+    return TrackerState(**await ask_tracker(state, caller, id, "state"))
 
 
 @router.get(
@@ -209,9 +208,7 @@ async def tracker_state(id: TrackerId, state: State, caller: Reader) -> TrackerS
 )
 async def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
     """The extrinsics over time, with their error bars and events."""
-    await run_in_threadpool(find_tracker, state, caller, id)
-    asked = TrackerRequest("plot", str(state.folder.of_tracker(id)))
-    return Response(await state.trackers.answer(id, caller.tenant, asked), media_type="image/png")
+    return Response(await ask_tracker(state, caller, id, "plot"), media_type="image/png")
 
 
 @router.delete("/{id}", status_code=204, responses=documented(404, 422, 429))

@@ -1,7 +1,5 @@
 """Runs the jobs of the table, each in a child process, and keeps the table in order."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import threading
@@ -14,9 +12,9 @@ from dataclasses import dataclass, field
 from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
-from calibgraph.service.bell import progress_of
 from calibgraph.service.folders import DataFolder, remove_folder
-from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobTask, Step
+from calibgraph.service.job_events import progress_of
+from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobProgress, JobTask
 from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
@@ -42,16 +40,7 @@ class _Slot:
 
 
 class Runner:
-    """The threads that run jobs.
-
-    Args:
-        table: of the jobs.
-        folder: of the server.
-        settings: of the server.
-        roots: from which jobs may read.
-        metrics: that count them.
-        ring: called with the id of a job that has changed.
-    """
+    """The threads that run jobs."""
 
     def __init__(
         self,
@@ -61,11 +50,11 @@ class Runner:
         roots: tuple[Root, ...],
         *,
         metrics: Metrics,
-        ring: Callable[[str], None],
+        notify: Callable[[str], None],
     ) -> None:
         self._table, self._folder, self._settings = table, folder, settings
-        self._roots, self._metrics, self._ring = roots, metrics, ring
-        self._steps: dict[str, Step] = {}
+        self._roots, self._metrics, self._notify = roots, metrics, notify
+        self._steps: dict[str, JobProgress] = {}
         self._deaths: Counter[str] = Counter()
         self._slots = [_Slot() for _ in range(settings.jobs_at_once)]
         self._threads: list[threading.Thread] = []
@@ -91,7 +80,7 @@ class Runner:
             self._waiting += 1
             self._wake.notify()
 
-    def step(self, id: str) -> Step | None:
+    def step(self, id: str) -> JobProgress | None:
         """How far a running job is."""
         return self._steps.get(id)
 
@@ -109,7 +98,7 @@ class Runner:
                 slot.child.kill()
         if not running:
             self._discard_input(id)
-        self._ring(id)
+        self._notify(id)
         return True
 
     def begin_stop(self) -> None:
@@ -173,7 +162,7 @@ class Runner:
     def _run(self, slot: _Slot, record: JobRecord) -> None:
         """Run a job and write down how it ended."""
         start = time.perf_counter()
-        self._ring(record.id)
+        self._notify(record.id)
         outcome = self._ask(slot, record)
         if outcome is None:  # the server stops, or the process died: it waits again
             self._table.put_back(record.id)
@@ -195,7 +184,7 @@ class Runner:
         state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
         self._metrics.jobs.labels(record.kind, state).inc()
         self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
-        self._ring(record.id)
+        self._notify(record.id)
 
     def _ask(self, slot: _Slot, record: JobRecord) -> JobOutcome | None:
         """What the child answers; None if the job is to wait again."""
@@ -217,7 +206,7 @@ class Runner:
             if self._is_stopping:
                 return None
             log.warning("job %s: %s", record.id, error)
-            self._deaths[record.id] += 1  # those of the server are not the job's fault
+            self._deaths[record.id] += 1  # a killed server is not the job's fault
             if self._deaths[record.id] >= _MOST_DEATHS:
                 return JobOutcome(error_kind="worker died", error=str(error))
             return None
@@ -236,9 +225,9 @@ class Runner:
             timeout_s=settings.job_timeout_s,
         )
 
-    def _note(self, id: str, note: tuple[str, int, int]) -> None:
-        self._steps[id] = Step(*note)
-        self._ring(progress_of(id))
+    def _note(self, id: str, progress: JobProgress) -> None:
+        self._steps[id] = progress
+        self._notify(progress_of(id))
 
     def _renew(self, slot: _Slot, *, failed: bool) -> None:
         """End a process that has run many jobs, or one that failed: it may be in disorder."""

@@ -1,7 +1,5 @@
 """Run a server until it is told to stop."""
 
-from __future__ import annotations
-
 import ipaddress
 import resource
 import socket
@@ -28,13 +26,7 @@ _BACKLOG = 4096
 
 @dataclass(frozen=True)
 class Address:
-    """Where a server listens.
-
-    Attributes:
-        host: name or address.
-        port: number.
-        certificate, key: files for TLS; None for plain HTTP.
-    """
+    """Where a server listens; without a certificate by plain HTTP."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -43,11 +35,7 @@ class Address:
 
 
 def require_safe(address: Address, *, has_tokens: bool) -> None:
-    """Check that a server without tokens is for this machine alone.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that a server without tokens is for this machine alone."""
     if not has_tokens and not _is_loopback(address.host):
         raise CalibrationError(
             f"--host {address.host}: others could call; give --tokens FILE (see calibgraph token), "
@@ -82,16 +70,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def serve(app: FastAPI, address: Address, announce: Callable[[str], None] | None = None) -> None:
-    """Serve an application of :func:`calibgraph.service.app.create_app` until SIGTERM or Ctrl-C.
-
-    Args:
-        app: to serve.
-        address: where it listens.
-        announce: called with the URL of the pages once it listens.
-
-    Raises:
-        CalibrationError: if the address cannot be used.
-    """
+    """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens."""
     service: Service = app.state.service
     require_safe(address, has_tokens=service.settings.tokens is not None)
     _allow_many_connections()
@@ -117,11 +96,6 @@ class Server(uvicorn.Server):
     """A server of uvicorn with limits on connections.
 
     It wakes requests that wait as soon as a signal comes: uvicorn would wait for them.
-
-    Args:
-        app: of :func:`calibgraph.service.app.create_app`.
-        address: where it listens.
-        announce: called with the URL of the pages once it listens.
     """
 
     def __init__(
@@ -159,5 +133,5 @@ class Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to stop."""
         self._service.is_stopping = True
-        self._service.bell.ring_all()
+        self._service.events.notify()
         super().handle_exit(sig, frame)

@@ -1,7 +1,5 @@
 """Settings of the service: where it keeps its data, whom it serves, and its limits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

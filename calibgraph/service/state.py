@@ -1,7 +1,5 @@
 """What the routes of a server share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -9,9 +7,9 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.bell import Bell
 from calibgraph.service.database import open_database
 from calibgraph.service.folders import DataFolder, remove_folder
+from calibgraph.service.job_events import JobEvents
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root, open_roots
@@ -27,22 +25,7 @@ _RETRY_AFTER = {"Retry-After": "5"}
 
 @dataclass
 class Service:
-    """The parts of a server.
-
-    Attributes:
-        settings: of the server.
-        folder: its data.
-        engine: its database.
-        jobs: their table.
-        runner: runs them.
-        tracker_table: the trackers' table.
-        trackers: the processes that hold them.
-        roots: from which jobs may read.
-        metrics: numbers for Prometheus.
-        disk, memory: room for uploads, and for bodies that are not written to disk.
-        bell: wakes requests that wait.
-        is_stopping: whether the server was told to stop.
-    """
+    """The parts of a server."""
 
     settings: Settings
     folder: DataFolder
@@ -53,7 +36,7 @@ class Service:
     trackers: Trackers
     roots: tuple[Root, ...]
     metrics: Metrics
-    bell: Bell
+    events: JobEvents
     disk: Room = field(init=False)
     memory: Room = field(init=False)
     is_stopping: bool = field(default=False)
@@ -68,14 +51,14 @@ class Service:
         for left in self.folder.trackers.iterdir():
             if left.name not in known:  # a server was killed while it made or removed it
                 remove_folder(left)
-        self.bell.open()
+        self.events.open()
         self.runner.start()
 
     def begin_stop(self) -> None:
         """Accept nothing more, and let those go who wait."""
         self.is_stopping = True
         self.runner.begin_stop()
-        self.bell.ring_all()
+        self.events.notify()
 
     def stop(self) -> None:
         """End the jobs and trackers, and release the data folder."""
@@ -110,18 +93,18 @@ def open_service(settings: Settings, metrics: Metrics) -> Service:
     except CalibrationError:
         folder.close()
         raise
-    table, bell = JobTable(engine), Bell()
+    table, events = JobTable(engine), JobEvents()
     return Service(
         settings=settings,
         folder=folder,
         engine=engine,
         jobs=table,
-        runner=Runner(table, folder, settings, roots, metrics=metrics, ring=bell.ring),
+        runner=Runner(table, folder, settings, roots, metrics=metrics, notify=events.notify),
         tracker_table=TrackerTable(engine),
         trackers=Trackers(folder, settings),
         roots=roots,
         metrics=metrics,
-        bell=bell,
+        events=events,
     )
 
 

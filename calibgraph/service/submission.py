@@ -1,7 +1,5 @@
 """A request for a job: read, checked, put on disk, and only then acknowledged."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -50,14 +48,7 @@ _RETRY_AFTER_S = 5
 async def submit(
     service: Service, request: Request, caller: Caller, kind: JobKind, *, key: str | None
 ) -> tuple[JobRecord, bool]:
-    """Take in a job; it is durable when this returns.
-
-    Args:
-        service: of the server.
-        request: its body is JSON with URIs, or a form with files.
-        caller: whose the job will be.
-        kind: of the job.
-        key: idempotency key; None if there is none.
+    """Take in a job, of JSON with URIs or a form with files; it is durable when this returns.
 
     Returns:
         The job, and whether it was known before.
@@ -197,11 +188,7 @@ def _keep(
 
 
 def parse_json(body: bytes) -> Any:
-    """The content of a JSON body.
-
-    Raises:
-        Problem: if it is none.
-    """
+    """The content of a JSON body."""
     try:
         return json.loads(body)
     except RecursionError:

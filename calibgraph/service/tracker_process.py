@@ -30,7 +30,7 @@ RIG, CONFIG, STATE, HISTORY, EVENTS = (
 )  # fmt: skip
 
 _MOST_OPEN = 256
-_SAVE_EVERY = 50  # updates: after a kill, the plot lacks up to so many
+_SAVE_EVERY = 50  # updates: after a kill, the plot lacks fewer
 _MOST_EVENTS = 200
 _THREADS = 8  # most of an update's time it waits for the disk
 

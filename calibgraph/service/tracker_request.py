@@ -1,7 +1,5 @@
 """What a process with trackers gets, and how it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,15 +9,7 @@ ARROW = "application/vnd.apache.arrow.stream"
 
 @dataclass(frozen=True)
 class TrackerRequest:
-    """A request to a tracker.
-
-    Attributes:
-        action: what to do.
-        folder: of the tracker.
-        body: of the request: the rig, or frames.
-        content_type: of frames.
-        config: settings, as JSON.
-    """
+    """A request to a tracker: its body is a rig or frames, its config JSON."""
 
     action: Action
     folder: str
@@ -30,12 +20,7 @@ class TrackerRequest:
 
 @dataclass(frozen=True)
 class Refusal:
-    """An answer that refuses.
-
-    Attributes:
-        status: of HTTP.
-        detail: what is wrong, in one line.
-    """
+    """An answer that refuses, with the status of HTTP."""
 
     status: int
     detail: str

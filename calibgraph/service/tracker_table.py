@@ -1,7 +1,5 @@
 """The table of trackers: whose they are; their state is in their folders."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 
@@ -13,14 +11,7 @@ from calibgraph.service.database import trackers
 
 @dataclass(frozen=True)
 class TrackerRecord:
-    """A tracker, as the table holds it.
-
-    Attributes:
-        id: random.
-        tenant: whose it is.
-        name: that it was given.
-        created_s: time since 1970.
-    """
+    """A tracker, as the table holds it."""
 
     id: str
     tenant: str
@@ -29,11 +20,7 @@ class TrackerRecord:
 
 
 class TrackerTable:
-    """The trackers of a server.
-
-    Args:
-        engine: of the database.
-    """
+    """The trackers of a server."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine

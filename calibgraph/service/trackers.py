@@ -1,7 +1,5 @@
 """The processes that hold the trackers; each tracker is in one of them."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections import Counter, OrderedDict, deque
@@ -46,11 +44,7 @@ class _Host:
         self._thread.start()
 
     def ask(self, tenant: str, request: TrackerRequest) -> Future[Any]:
-        """The answer, when it has come.
-
-        Raises:
-            Problem: if too much of the tenant waits already.
-        """
+        """The answer, when it has come."""
         asked = _Asked(request, Future())
         with self._changed:
             if self._is_closed:
@@ -115,12 +109,7 @@ def _stopping() -> Problem:
 
 
 class Trackers:
-    """All trackers of a server.
-
-    Args:
-        folder: of the server.
-        settings: of the server.
-    """
+    """All trackers of a server."""
 
     def __init__(self, folder: DataFolder, settings: Settings) -> None:
         self._folder, self._settings = folder, settings
@@ -139,12 +128,7 @@ class Trackers:
             self._begun[tenant] -= 1
 
     async def answer(self, id: str, tenant: str, request: TrackerRequest) -> Any:
-        """What the process of a tracker answers; no thread waits for it.
-
-        Args:
-            id: of the tracker.
-            tenant: who asks: tenants take turns.
-            request: to it.
+        """Ask the process of a tracker; tenants take turns, and no thread waits for the answer.
 
         Raises:
             Problem: if it is refused, too much waits, or the process ended: then it may be asked
@@ -174,11 +158,7 @@ class Trackers:
 
 
 def _checked(result: Callable[[], Any]) -> Any:
-    """An answer that is none of the refusals.
-
-    Raises:
-        Problem: if it is one, or the process ended.
-    """
+    """An answer that is none of the refusals."""
     try:
         answer = result()
     except ChildEndedError:

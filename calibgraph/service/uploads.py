@@ -27,13 +27,7 @@ _MOST_HEADER_BYTES = 4096
 
 @dataclass(frozen=True)
 class Upload:
-    """The parts of a form.
-
-    Attributes:
-        texts: the fields, by name and in order.
-        files: names of the files in the folder, by the field's name.
-        digest: SHA-256 of all parts.
-    """
+    """The parts of a form: its texts in order, the names of its files, the SHA-256 of all."""
 
     texts: tuple[tuple[str, str], ...]
     files: tuple[str, ...]
@@ -52,13 +46,7 @@ class _Part:
 
 
 class FormReader:
-    """Reads a multipart form: files into a folder, under names that are ours.
-
-    Args:
-        folder: for the files.
-        allowed: names of files, and how many there may be of each. The second of a name ``a`` is
-            the file ``a_1``.
-    """
+    """Reads a form: files into a folder, the second of a name ``a`` as ``a_1``, if allowed."""
 
     def __init__(self, folder: Path, allowed: Mapping[str, int]) -> None:
         self._folder, self._allowed = folder, allowed
@@ -71,11 +59,7 @@ class FormReader:
         self._parts = 0
 
     async def read(self, request: Request, arrive: Callable[[int], None]) -> Upload:
-        """Read the form in a request's body.
-
-        Args:
-            request: with the form.
-            arrive: called with the size of each piece of the body before it is written.
+        """Read the form in a body; ``arrive`` gets the size of each piece before it is written.
 
         Raises:
             Problem: if it is malformed, or has a file that is not allowed.

@@ -1,7 +1,5 @@
 """An MCAP file of a result for Foxglove, with Foxglove's own message types."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ from calibgraph.files import write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.outputs import Output
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -33,11 +30,6 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     (CameraCalibration, of lenses that Foxglove has), ``/CAMERA/before`` and ``/CAMERA/after``
     (ImageAnnotations), ``/verdict`` (Log).
 
-    Args:
-        result: of ``calibrate``, or with frames relocated.
-        path: file to write.
-        progress: called as frames are done.
-
     Raises:
         CalibrationError: if mcap is missing, or an image or cloud cannot be read.
     """
@@ -56,16 +48,6 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
 
     write_atomically(path, write)
     return path
-
-
-def output_of_mcap(path: Path) -> Output:
-    """The file that is written, with its mark."""
-    return Output(path, "view", _is_ours, (".mcap",))
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return PROFILE.encode() in file.read(64)
 
 
 def _nanoseconds(frame: ViewFrame) -> int:

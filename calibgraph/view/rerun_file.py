@@ -10,7 +10,6 @@ from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
-from calibgraph.outputs import Output
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -28,11 +27,6 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
     Entities: ``lidar`` (the cloud, in its own frame), ``lidar/before/CAMERA`` and
     ``lidar/after/CAMERA`` (poses of the optical frames), ``images/CAMERA`` with ``before`` and
     ``after`` below it (points coloured by distance), ``verdict``.
-
-    Args:
-        result: of ``calibrate``, or with frames relocated.
-        path: file to write.
-        progress: called as frames are done.
 
     Raises:
         CalibrationError: if rerun-sdk is missing, or an image or cloud cannot be read.
@@ -54,16 +48,6 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
 
     write_atomically(path, write)
     return path
-
-
-def output_of_rerun(path: Path) -> Output:
-    """The file that is written, with its mark."""
-    return Output(path, "view", _is_ours, (".rrd",))
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open("rb") as file:
-        return APPLICATION.encode() in file.read(1024)
 
 
 def _import_rerun() -> Any:

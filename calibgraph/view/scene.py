@@ -1,7 +1,5 @@
 """What viewers show of a frame: the cloud, the images, and its points on them, before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +26,7 @@ _JPEG_QUALITY = 90
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Points of a cloud on an image.
-
-    Attributes:
-        pixels_px: (n, 2) column and row; (0, 0) is the centre of the top-left pixel.
-        colours: (n, 3) RGB by distance.
-    """
+    """Points in an image: (n, 2) pixels, and (n, 3) RGB colours by distance."""
 
     pixels_px: Array
     colours: Colours
@@ -41,13 +34,7 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """One camera in one frame.
-
-    Attributes:
-        jpeg: the image as recorded.
-        before: the points by the guess.
-        after: the points by the result.
-    """
+    """One camera in one frame."""
 
     jpeg: bytes
     before: Projected

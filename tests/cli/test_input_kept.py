@@ -17,7 +17,7 @@ from calibgraph import (
 from calibgraph.cli import outputs
 from calibgraph.cli.app import COMMANDS
 from calibgraph.cli.fleet import fleet
-from calibgraph.cli.init import init
+from calibgraph.cli.guess import init
 from calibgraph.cli.simulate import simulate
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun

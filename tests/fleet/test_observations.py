@@ -11,7 +11,7 @@ from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import payload
 from calibgraph.fleet.rows import SCHEMA
-from calibgraph.fleet.standing import STATES, stand
+from calibgraph.fleet.status import STATES, assess_status
 
 
 def rows_of(**columns: list[object]) -> pa.Table:
@@ -36,7 +36,7 @@ def test_rows_without_a_result_measure_nothing() -> None:
     assert np.isnan(of.day).all()
     assert of.covariates == {}
     fleet = fit_fleet(of)
-    standing = stand(rows, fleet)
+    standing = assess_status(rows, fleet)
     assert [STATES[s] for s in standing.state] == ["PASS", "WARN", "NO RESULT"]
     assert standing.reasons == ["", "no error bar; few frames", "no images"]
     assert payload(fleet, standing, "")["vehicles"] == ["a", "b"]

@@ -16,7 +16,7 @@ from benchmarks.fleet.vehicles import simulate_fleet
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import write_fleet_report
-from calibgraph.fleet.standing import STATES, changed_poses, stand
+from calibgraph.fleet.status import STATES, assess_status, changed_poses
 from calibgraph.model.geometry import retract_all
 from tests.conftest import Call
 from tests.report.test_browser import browser, render
@@ -49,7 +49,7 @@ def page(rows: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_states_follow_status_verdict_and_deviation(rows: pa.Table) -> None:
     fleet = fit_fleet(observe(rows))
-    states = np.array(STATES)[stand(rows, fleet).state]
+    states = np.array(STATES)[assess_status(rows, fleet).state]
     assert set(states[:6]) == {"NO RESULT"}
     assert set(states[6:12]) == {"FAIL"}
     verdict = np.asarray(rows["verdict"].to_pylist())[12:]

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.fleet.vehicles import CAMERAS, Fleet, simulate_fleet
 from calibgraph import Rig, load_rig
 from calibgraph.errors import RigError
-from calibgraph.fleet.knowledge import write_knowledge
 from calibgraph.fleet.model import FleetModel, fit_fleet
+from calibgraph.fleet.model_files import write_fleet_model
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.prior import expected_pose, prior_rig
 from calibgraph.model.geometry import relative_transform, twists_between
@@ -66,7 +66,7 @@ def rig_of_six() -> Rig:
 
 def test_files_can_be_read_again(halves: tuple[Fleet, FleetModel], tmp_path: Path) -> None:
     fleet = halves[1]
-    paths = write_knowledge(fleet, tmp_path, {"van": rig_of_six()})
+    paths = write_fleet_model(fleet, tmp_path, {"van": rig_of_six()})
     assert sorted(path.name for path in paths) == sorted(path.name for path in tmp_path.iterdir())
     rig = load_rig(tmp_path / "prior_van.yaml")
     nominal = fleet.models["van"].mounts["left"].centers.nominal

@@ -104,7 +104,7 @@ def test_an_image_that_16_bits_make_black_is_named(tmp_path: Path) -> None:
     camera = make_camera()
     path = tmp_path / "dark.png"
     cv2.imwrite(str(path), np.full((camera.height_px, camera.width_px), 200, np.uint16))
-    with pytest.raises(FileError, match="16 bits, of which only the lower 8"):
+    with pytest.raises(FileError, match="16 bits and uses only the lower 8"):
         load_image(path, camera)
 
 

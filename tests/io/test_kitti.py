@@ -54,9 +54,9 @@ def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:
         ("P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0", "undo its scale: divide by 2"),
         ("P2: 700 80 600 0 0 700 180 0 0 0 1 0", "its skew is 80 px"),
         ("P3: 700 0 600 0 0 700 180 0 0 0 1 0\nP3: 7 0 6 0 0 7 2 0 0 0 1 0", "P3 is given twice"),
-        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "P2: is no camera matrix"),
+        ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "line 'P2' has 12 numbers, expected 12 finite"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and the LiDAR's pose: T_camera_lidar"),
-        ("Tr: 1 0 0", "expected 12 numbers"),
+        ("Tr: 1 0 0", "line 'Tr' has 3 numbers, expected 12"),
         ("\xff\xfe", "is not a text file"),
     ],
 )

@@ -66,9 +66,12 @@ def test_one_calibration_leaves_nothing_out(training: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("R0_rect", "R0_rect: 1 0 0"), "line 'R0_rect': expected 9 numbers"),
+        (("R0_rect", "R0_rect: 1 0 0"), "line 'R0_rect' has 3 numbers, expected 9"),
         (("Tr_velo_to_cam", ""), "line 'Tr_velo_to_cam' is missing"),
-        (("P2", "P2: " + " ".join(["nan"] * 12)), "is no camera matrix"),
+        (
+            ("P2", "P2: " + " ".join(["nan"] * 12)),
+            "line 'P2' has 12 numbers, expected 12 fin",
+        ),
     ],
 )
 def test_a_wrong_calibration_is_one_line(

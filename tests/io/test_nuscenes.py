@@ -141,7 +141,7 @@ def test_sweeps_without_key_frames_are_counted(given: Dataset, tmp_path: Path) -
         record["is_key_frame"] = False
     write_tables(tmp_path, tables)
     scans = 2 * len(given.frames)
-    said = f"has {scans} scans of LIDAR_TOP, of which none is a key frame; only key frames are read"
+    said = f"has {scans} scans of LIDAR_TOP, and none is a key frame; only key frames are read"
     for read in (load_rig, load_dataset):
         with pytest.raises(CalibrationError, match=said):
             read(tmp_path)

@@ -41,7 +41,7 @@ INVERTING = {
     "calibgraph/fleet/deviations.py": NO_TRANSFORM,
     "calibgraph/fleet/findings.py": NO_TRANSFORM,
     "calibgraph/fleet/fit.py": NO_TRANSFORM,
-    "calibgraph/fleet/standing.py": NO_TRANSFORM,
+    "calibgraph/fleet/status.py": NO_TRANSFORM,
     "calibgraph/matching/cmrnext/training/samples.py": "a camera matrix K",
     "calibgraph/solver/augmented_fit.py": NO_TRANSFORM,
     "calibgraph/solver/hierarchy.py": NO_TRANSFORM,

@@ -12,8 +12,8 @@ from starlette.testclient import TestClient
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.service.access import COOKIE, add_token, load_tokens
 from calibgraph.service.places import open_roots
+from calibgraph.service.request_guard import STRICT_HEADERS
 from calibgraph.service.serve import Address, require_certificate, require_safe
-from calibgraph.service.shield import STRICT_HEADERS
 from tests.service.conftest import Make, Problem, make_tokens
 
 OPEN = {("GET", "/healthz"), ("GET", "/readyz")}

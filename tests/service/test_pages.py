@@ -8,6 +8,7 @@ from pathlib import Path
 
 from starlette.testclient import TestClient
 
+from calibgraph.service.requests import CalibrationSettings
 from tests.conftest import SAMPLE
 from tests.service.conftest import Make, Problem, make_tokens, service_folder
 
@@ -58,7 +59,7 @@ def test_a_form_without_a_script_takes_in_a_job(make_server: Make, small: Proble
     assert "first: can this calibration be used?" in client.get(place).text
     id = place.removeprefix("/jobs/")
     job = client.app.state.service.jobs.request(id)  # type: ignore[attr-defined]
-    settings = job.calibration_settings()
+    settings = CalibrationSettings.model_validate(job.settings)
     assert (settings.frames, settings.search_deg, settings.search_m) == ("0:4", 3.5, None)
     assert {path.name for path in (service_folder(client) / "jobs" / id / "input").iterdir()} == {
         "recording"

@@ -3,8 +3,6 @@
 The rest of the package reads a message as it reads a file: by the path that is its address.
 """
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 
@@ -22,11 +20,7 @@ from calibgraph.io.motion import ScanMotion
 
 
 def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.float32]:
-    """(n, 4) the cloud in the message with this address, corrected for motion if it is given.
-
-    Raises:
-        FileError, DatasetError: if it cannot be read, or holds no point.
-    """
+    """(n, 4) the cloud in the message with this address, corrected for motion if it is given."""
     content = read_message(path)[1]
     if motion is None:
         cloud = points_of(content, str(path))
@@ -39,11 +33,7 @@ def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.f
 
 
 def scan_duration_s(path: Path) -> float | None:
-    """Seconds between the first and the last point of a cloud in a message; None without times.
-
-    Raises:
-        FileError, DatasetError: if it cannot be read.
-    """
+    """Seconds between the first and the last point of a cloud in a message; None without times."""
     content = read_message(path)[1]
     if not time_fields(content):
         return None
@@ -52,11 +42,7 @@ def scan_duration_s(path: Path) -> float | None:
 
 
 def load_bag_image(path: Path) -> NDArray[np.uint8]:
-    """(height, width, 3) the image in the message with this address, BGR.
-
-    Raises:
-        FileError, DatasetError: if it cannot be read or decoded.
-    """
+    """(height, width, 3) the image in the message with this address, BGR."""
     return picture_of(read_message(path)[1], str(path))
 
 

@@ -1,14 +1,20 @@
 """CameraInfo messages as lenses, of the images as recorded or of rectified ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.io.lenses import fitted_coefficients, intrinsics_of_matrix, lens_model
+from calibgraph.io.lenses import (
+    CameraLens,
+    fitted_coefficients,
+    intrinsics_of_matrix,
+    lens_model,
+    listed_intrinsics,
+)
+from calibgraph.model.rig import Intrinsics
+from factors import LensModel
 
 Array = NDArray[np.float64]
 
@@ -18,19 +24,19 @@ _SAME = 1e-6
 
 
 @dataclass(frozen=True)
-class CameraLens:
+class StatedLens:
     """A lens, as a CameraInfo describes it.
 
     Attributes:
         frame: the frame of the camera, z forward and y down, as the message names it.
-        content: the fields of :class:`calibgraph.Camera` apart from the extrinsic.
+        lens: of the images.
         R_image_frame: (3, 3) from the frame to the axes of the image, which rectification turns.
         baseline_m: (3,) by P's fourth column, the origin of the first camera's frame in the axes of
             this image; zero for a camera that is no second one of a pair.
     """
 
     frame: str
-    content: dict[str, Any]
+    lens: CameraLens
     R_image_frame: Array
     baseline_m: Array
 
@@ -43,17 +49,12 @@ class CameraLens:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the axes of the image are not those of the frame."""
+        """Whether the axes of the image and of the frame differ."""
         return bool(np.abs(self.R_image_frame - np.eye(3)).max() > _SAME)
 
 
-def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
-    """The lens of a camera's images.
-
-    Args:
-        message: a CameraInfo.
-        where: its topic, for errors.
-        rectified: whether the images are rectified: by R, and of the camera matrix P.
+def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:
+    """The lens of a camera's images as recorded, or as rectified by R to the matrix P.
 
     Raises:
         FileError: if the camera is not calibrated, or its lens model is unknown.
@@ -62,18 +63,18 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> CameraLens:
     matrix = "P" if rectified else "K"
     K = np.reshape(_field(message, matrix), (3, -1))[:, :3]
     intrinsics_of_matrix(K, f"{where}: {matrix}")
-    model, distortion = ("pinhole", []) if rectified else _distortion(message, where)
-    content = {"model": model, "distortion": distortion, **_on_image(message, K)}
+    model, distortion = ("pinhole", ()) if rectified else _distortion(message, where)
+    lens = CameraLens(model, *_on_image(message, K, where), distortion)
     R = np.reshape(_field(message, "R"), (3, 3))
     R = R if R.any() else np.eye(3)
     baseline_m = stated_baseline(message)
     if rectified:
-        return CameraLens(frame, content, R, baseline_m)
-    return CameraLens(frame, content, np.eye(3), R.T @ baseline_m)
+        return StatedLens(frame, lens, R, baseline_m)
+    return StatedLens(frame, lens, np.eye(3), R.T @ baseline_m)
 
 
 def stated_baseline(message: Any) -> Array:
-    """(3,) t of P = K [I t] [m]; zeros if it is that of no camera."""
+    """(3,) t of P = K [I t] [m]; zeros if P is no camera's."""
     P = np.reshape(_field(message, "P"), (3, 4))
     if not (np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
         return np.zeros(3)
@@ -86,23 +87,20 @@ def _field(message: Any, name: str) -> Array:
     return np.array(getattr(message, name.lower()) if value is None else value, np.float64)
 
 
-def _on_image(message: Any, K: Array) -> dict[str, Any]:
+def _on_image(message: Any, K: Array, where: str) -> tuple[tuple[int, int], Intrinsics]:
     """Size and intrinsics of the image: K is of the full sensor, before its window and binning."""
     bins = np.maximum([message.binning_x, message.binning_y], 1)
     window = message.roi
     size = np.array([window.width or message.width, window.height or message.height]) // bins
     corner = np.array([window.x_offset, window.y_offset])
     focal, centre = np.diag(K)[:2] / bins, (K[:2, 2] - corner) / bins
-    return {
-        "width_px": int(size[0]),
-        "height_px": int(size[1]),
-        "intrinsics_px": dict(zip(("fx", "fy", "cx", "cy"), (*focal, *centre), strict=True)),
-    }
+    intrinsics = listed_intrinsics([*focal.tolist(), *centre.tolist()], where)
+    return (int(size[0]), int(size[1])), intrinsics
 
 
-def _distortion(message: Any, where: str) -> tuple[str, list[float]]:
+def _distortion(message: Any, where: str) -> tuple[LensModel, tuple[float, ...]]:
     """Lens model and coefficients; both may be empty for none, and zeros appended."""
     given = _field(message, "D")
     stated = message.distortion_model.strip()
     model = lens_model("none" if stated in _AS_NONE and not given.any() else stated, where)
-    return model, list(fitted_coefficients(given.tolist(), model, where))
+    return model, fitted_coefficients(given.tolist(), model, where)

@@ -1,7 +1,5 @@
 """The frames of a bag: each cloud with the image of every camera that is nearest by stamp."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +28,7 @@ class BagFrame:
         stamp_ns: of the cloud.
         cloud: its address.
         images: the address of each camera's image.
-        to_s: the median stamp of the images, in seconds after that of the cloud.
+        to_s: the median stamp of the images, in seconds after the cloud's.
     """
 
     number: int
@@ -57,16 +55,7 @@ class BagFrames:
 
 
 def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> BagFrames:
-    """Pair the clouds of a bag with its images, without keeping any of them.
-
-    Args:
-        path: the bag.
-        cameras: the rig's, each of which a frame has an image of.
-        options: topics, tolerance, and which frames to pick.
-
-    Raises:
-        FileError, DatasetError: if the bag is damaged, a topic is missing, or nothing pairs.
-    """
+    """Pair the clouds of a bag with its images, without keeping any of them."""
     bag = Bag(path)
     topics = choose_topics(bag, options.topics, cameras)
     images = {name: each.image for name, each in topics.cameras.items()}

@@ -6,8 +6,6 @@ The message of livox_ros_driver, livox_ros_driver2 and livox_interfaces:
     CustomPoint: uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line
 """  # noqa: E501
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -25,16 +23,7 @@ _TAIL_BYTES = 8 + 4 + 1 + 3 + 4  # timebase to the number of points
 
 
 def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
-    """The PointCloud2 with the header and the points of a CustomMsg.
-
-    Args:
-        data: the serialized message.
-        types: message classes by name, of rosbags' type store.
-        ros1: whether it is serialized as in ROS 1, else as CDR, which aligns numbers.
-
-    Raises:
-        ValueError: if there are fewer bytes than points.
-    """
+    """The PointCloud2 of a CustomMsg that is serialized as in ROS 1, or as CDR, which aligns."""
     big_endian = not ros1 and data[1] == 0
     order = ">" if big_endian else "<"
     body = np.frombuffer(data, np.uint8, offset=0 if ros1 else 4)
@@ -60,7 +49,7 @@ def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
 
 
 def _cloud(types: Any, header: Any, points: Any, step: int, *, big_endian: bool) -> Any:
-    """A PointCloud2 of points of so many bytes."""
+    """A PointCloud2 of points of ``step`` bytes."""
     fields = [
         types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=code, count=1)
         for name, (code, offset) in _FIELDS.items()

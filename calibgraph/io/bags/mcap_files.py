@@ -1,10 +1,8 @@
 """MCAP files, through the library mcap: with a whole index, a part of one, or none.
 
 Recorders may leave out message indexes, chunk indexes, statistics, chunks or the profile, and may
-write channels of any encoding beside those of ROS.
+write channels of any encoding beside ROS's.
 """
-
-from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
@@ -140,12 +138,7 @@ class McapFile:
                 yield block
 
     def _records_at(self, offset: int, *, without_data: bool = False) -> list[McapRecord]:
-        """The record at an offset, of a chunk those in it; none of the kinds that are not read.
-
-        Args:
-            offset: in the file.
-            without_data: leave the data out of a message outside of chunks.
-        """
+        """The record at an offset, of a chunk those in it; none of the kinds that are not read."""
         self._file.seek(offset)
         stream = ReadDataStream(self._file)
         opcode, length = _HEAD.unpack(stream.read(_HEAD.size))

@@ -37,14 +37,7 @@ _MOST_OPEN_BAGS = 8
 
 @dataclass(frozen=True)
 class Message:
-    """A message of a bag.
-
-    Attributes:
-        topic: its topic.
-        record_ns: when it was recorded [ns].
-        number: how many messages of the topic were recorded earlier in that nanosecond.
-        content: its fields, named as in ROS.
-    """
+    """A message; ``number`` counts earlier ones of its topic in the same nanosecond."""
 
     topic: str
     record_ns: int
@@ -58,13 +51,7 @@ class Message:
 
 
 class Bag:
-    """An open bag. It is closed when it is no longer referred to.
-
-    Attributes:
-        path: its file or folder.
-        topics: by name.
-        start_ns, stop_ns: when the first message was recorded, and after the last [ns].
-    """
+    """An open bag. It is closed when it is no longer referred to."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -86,16 +73,7 @@ class Bag:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """The messages of some topics in the order of recording, read as they are asked for.
-
-        Args:
-            topics: names.
-            start_ns: when the first was recorded at the earliest [ns].
-            stop_ns: before which the last was recorded [ns].
-
-        Raises:
-            FileError: if the bag is damaged.
-        """
+        """The messages recorded from ``start_ns`` to before ``stop_ns``, in that order, lazily."""
         last: dict[str, tuple[int, int]] = {}
         with errors_in_one_line(self.path):
             for topic, record_ns, data in self._recording.messages(topics, start_ns, stop_ns):
@@ -105,21 +83,13 @@ class Bag:
                 yield Message(topic, record_ns, last[topic][1], content)
 
     def first(self, topic: str) -> Any:
-        """The content of a topic's first message.
-
-        Raises:
-            FileError: if there is none, or the bag is damaged.
-        """
+        """The content of a topic's first message."""
         for message in self.messages([topic]):
             return message.content
         raise FileError(self.path, f"has no message of {topic}; choose another topic")
 
     def read(self, topic: str, record_ns: int, number: int) -> tuple[bytes, Any]:
-        """The bytes and the content of one message; threads may call this at the same time.
-
-        Raises:
-            FileError: if there is none, or the bag is damaged.
-        """
+        """The bytes and the content of one message; threads may call this at the same time."""
         with self._lock, errors_in_one_line(self.path):
             found = self._recording.messages([topic], record_ns, record_ns + 1)
             data = [each for _, _, each in islice(found, number, number + 1)]
@@ -128,11 +98,7 @@ class Bag:
         return data[0], self._deserialize(topic, record_ns, data[0])
 
     def _deserialize(self, topic: str, record_ns: int, data: bytes) -> Any:
-        """The content of a message.
-
-        Raises:
-            FileError: if it is none of its type.
-        """
+        """The content of a message."""
         kind = self.topics[topic]
         ros1 = kind.encoding == "ros1"
         store = type_store(ros1=ros1)
@@ -171,11 +137,7 @@ class Drive:
 
 
 def read_message(path: Path) -> tuple[bytes, Any]:
-    """The bytes and the content of the message with this address.
-
-    Raises:
-        FileError: if its bag or itself is missing, or the bag is damaged.
-    """
+    """The bytes and the content of the message with this address."""
     bag = next((parent for parent in path.parents if is_bag(parent)), None)
     if bag is None:
         raise FileError(path, "no such message: its bag is not there")

@@ -1,7 +1,5 @@
 """What is read of a bag, and how its images are paired with its clouds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +20,7 @@ class BagOptions:
         topics: the clouds' topic under ``lidar``, and image topics by camera name,
             and that of the ``odometry``; those that are
             not given are found by their types.
-        every_s: seconds between frames, of which only the surroundings are read; all if None.
+        every_s: seconds between frames; only their surroundings are read. All frames if None.
         tolerance_s: largest difference of the stamps of a cloud and its images. The default is half
             a turn of a LiDAR at 10 Hz: streams of equal rates pair, whatever their phase.
         stamps: ``header``, those of the sensors; or ``record``, when a message was recorded, for

@@ -1,7 +1,5 @@
 """Image and CompressedImage messages as BGR images of 8 bits."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -51,10 +49,6 @@ def picture_of(message: Any, where: str) -> Image:
 
     Of images with 16 bits, 8 are kept: the upper ones of the smallest depth (8, 10, 12, 14 or 16
     bits) that holds the brightest value.
-
-    Args:
-        message: the message.
-        where: the message, for errors.
 
     Returns:
         (height, width, 3) uint8, BGR.
@@ -110,9 +104,9 @@ def _pixels(message: Any, channels: int, kind: str, where: str) -> NDArray[Any]:
 
 
 def _of_two_planes(message: Any, conversion: int, colour_share: float, where: str) -> Image:
-    """The image of a gray plane and one of colour, of which every second row and column counts.
+    """The image of a gray plane and a colour plane of half its rows and columns.
 
-    The height is that of the image or, with some drivers, of both planes.
+    The stated height is the image's or, with some drivers, the height of both planes.
     """
     data, width = np.ascontiguousarray(message.data), message.width
     height, step = _plane_size(message, 1 + colour_share, where)
@@ -127,13 +121,7 @@ def _of_two_planes(message: Any, conversion: int, colour_share: float, where: st
 
 
 def _plane_size(message: Any, planes: float, where: str) -> tuple[int, int]:
-    """Height of the image and bytes per row of its gray plane.
-
-    Args:
-        message: an Image of two planes.
-        planes: the bytes of both planes over those of the gray one.
-        where: the message, for errors.
-    """
+    """Height and bytes per gray row; ``planes`` is the size of both planes over the gray one's."""
     length = len(message.data)
     for height in (message.height, int(message.height / planes)):
         for step in (message.step, message.width):

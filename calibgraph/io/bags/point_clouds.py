@@ -1,7 +1,5 @@
 """PointCloud2 messages: fields in any order, of any type and byte order, organised or not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,10 +17,6 @@ _LONGEST_S = 1.0
 
 def points_of(message: Any, where: str) -> NDArray[np.float32]:
     """The points of a message that are returns.
-
-    Args:
-        message: a PointCloud2.
-        where: the message, for errors.
 
     Returns:
         (n, 4) x y z [m], and the intensity as recorded, NaN where there is none. Points with a

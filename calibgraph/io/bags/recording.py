@@ -1,7 +1,5 @@
 """What every kind of bag is to its readers: topics, and messages as bytes in order of recording."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,14 +10,7 @@ ENCODINGS = ("cdr", "ros1")
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag.
-
-    Attributes:
-        name: of the topic.
-        type: of its messages, ``package/msg/Name``; with the encoding if that is none of ROS.
-        count: number of its messages.
-        encoding: how they are serialized.
-    """
+    """A topic of a bag; the type names the encoding if that is none of ROS."""
 
     name: str
     type: str

@@ -1,7 +1,5 @@
 """The rig of a bag: lenses from camera_info, the guess from tf_static."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.files import checked_model
-from calibgraph.io.bags.camera_info import CameraLens, lens_of, stated_baseline
+from calibgraph.io.bags.camera_info import StatedLens, lens_of, stated_baseline
 from calibgraph.io.bags.messages import CAMERA_INFO, Bag, Drive
 from calibgraph.io.bags.options import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
@@ -35,13 +33,13 @@ class BagCamera:
     """A camera of a bag.
 
     Attributes:
-        lens: from its CameraInfo.
+        stated: the lens in its CameraInfo.
         T_camera_lidar: (4, 4); None if no static transforms connect it with the LiDAR.
         frame_id: of its image, if the frame has the image's axes and origin.
         where: its CameraInfo, for errors.
     """
 
-    lens: CameraLens
+    stated: StatedLens
     T_camera_lidar: Array | None
     frame_id: str | None
     where: str
@@ -84,14 +82,10 @@ class BagRig:
         return checked_model(Rig, content, self.path)
 
     def _content(self, name: str) -> dict[str, Any]:
-        """The fields of a Camera.
-
-        Raises:
-            DatasetError: if the extrinsic is missing.
-        """
+        """The fields of a Camera."""
         camera = self.cameras[name]
         if camera.T_camera_lidar is None:
-            frame = camera.lens.frame
+            frame = camera.stated.frame
             raise DatasetError(
                 f"{camera.where}: no static transforms connect the LiDAR's frame {self.lidar!r} "
                 f"with the frame {frame!r} of camera {name!r}: "
@@ -102,19 +96,11 @@ class BagRig:
                 camera=name,
             )
         extrinsic = {"frame_id": camera.frame_id, "T_camera_lidar": camera.T_camera_lidar}
-        return {**camera.lens.content, **extrinsic}
+        return {**camera.stated.lens.fields(), **extrinsic}
 
 
 def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
-    """What a bag holds about its rig; extrinsics may be missing.
-
-    Args:
-        path: the bag.
-        options: which topics, those found by type if None; and the bags beside it.
-
-    Raises:
-        FileError, DatasetError: if the bag is damaged, or a topic or a lens is missing.
-    """
+    """What a bag holds about its rig; extrinsics may be missing."""
     options = options or BagOptions()
     bag = Bag(path)
     drive = Drive(bag, options.beside)
@@ -203,7 +189,7 @@ class _CameraReader:
         frame_id = None if lens.is_turned or with_baseline else lens.frame or None
         return BagCamera(lens, T_camera_lidar, frame_id, where)
 
-    def _counts_baseline(self, name: str, lens: CameraLens, bag: Bag, info: str) -> bool:
+    def _counts_baseline(self, name: str, lens: StatedLens, bag: Bag, info: str) -> bool:
         """Whether the frame of a second camera is at the place of the first, not at its own."""
         length_m = float(np.linalg.norm(lens.baseline_m))
         if length_m < _LEAST_BASELINE_M:

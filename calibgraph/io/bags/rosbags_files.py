@@ -1,7 +1,5 @@
 """ROS 1 bags, databases and compressed folders of ROS 2, through the library rosbags."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Collection, Iterator
 from copy import copy

@@ -1,6 +1,4 @@
-"""The stamps of a bag's clouds and images: one pass over the messages, of which none is kept."""
-
-from __future__ import annotations
+"""The stamps of a bag's clouds and images: one pass over the messages, none of which is kept."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
@@ -64,17 +62,7 @@ def _to_ns(stamp: object) -> int:
 def read_stamps(
     bag: Bag, topics: Collection[str], windows: Iterable[tuple[int, int]], stamps: Stamps
 ) -> dict[str, TopicStamps]:
-    """The stamps of some topics.
-
-    Args:
-        bag: the bag.
-        topics: their names.
-        windows: from when to when messages were recorded that are read [ns], one after another.
-        stamps: those of the headers, or of recording.
-
-    Raises:
-        FileError, DatasetError: if the bag or a cloud is damaged.
-    """
+    """The stamps of some topics within windows of recording time [ns], one after another."""
     found = {topic: TopicStamps() for topic in topics}
     for start_ns, stop_ns in windows:
         for message in bag.messages(topics, start_ns, stop_ns):

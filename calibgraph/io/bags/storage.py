@@ -1,7 +1,5 @@
 """Bags by their files: which library reads one, and the folder of a ROS 2 bag as one recording."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePath
@@ -80,11 +78,7 @@ class BagFolder:
 
 
 def _files_of(folder: Path) -> list[Path]:
-    """The files of a folder, of whichever storage; none if they are compressed.
-
-    Raises:
-        FileError: if one is not there.
-    """
+    """The files of a folder, of whichever storage; none if they are compressed."""
     stated = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
     if (stated.get("compression_mode") or "none").lower() != "none":
         return []

@@ -16,12 +16,7 @@ _BEST_FIRST = ("image_raw", "image", "image_color", "image_mono", "image_rect_co
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of a camera.
-
-    Attributes:
-        image: of its images.
-        info: of its CameraInfo; None if there is none beside the images.
-    """
+    """The topics of a camera."""
 
     image: str
     info: str | None
@@ -79,7 +74,7 @@ def choose_topics(
 
 
 def _why_no_camera(bag: Bag, infos: _Infos) -> str:
-    """Why no image topic is that of a camera, and what to do."""
+    """Why no image topic belongs to a camera, and what to do."""
     for topic in _image_topics(bag):
         if infos.beside(topic):  # so it is depth, by its encoding
             message = bag.first(topic)
@@ -117,12 +112,7 @@ def _camera(bag: Bag, name: str, topic: str | None, infos: _Infos) -> CameraTopi
 
 
 def _found_cameras(bag: Bag, infos: _Infos | None) -> dict[str, str]:
-    """The best image topic of each camera, by the camera's name.
-
-    Args:
-        bag: the bag.
-        infos: leave out those without a CameraInfo of these.
-    """
+    """The best image topic by camera; with ``infos`` only of cameras that have a CameraInfo."""
     best: dict[str, str] = {}
     for topic in _image_topics(bag):
         if _namespace(topic) in best or (infos and infos.beside(topic) is None):

@@ -41,11 +41,6 @@ _NEIGHBOUR_S = 0.35  # of a scan, that is registered with it
 def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -> MotionOf:
     """A function of a frame that returns the motion during its scan.
 
-    Args:
-        path: of the bag.
-        frames: all that were recorded, in order.
-        options: where the motion is from.
-
     Raises:
         FileError, DatasetError: if the bag has no such topic or no such transforms.
     """
@@ -68,11 +63,7 @@ class _Trajectory:
 
     @staticmethod
     def of(path: Path, poses: Iterator[tuple[int, Array]]) -> _Trajectory:
-        """Of stamps [ns] and poses in any order; of several with one stamp, the last.
-
-        Raises:
-            DatasetError: if there are less than two.
-        """
+        """Of stamps [ns] and poses in any order; of several with one stamp, the last."""
         by_stamp = dict(sorted(dict(poses).items()))
         if len(by_stamp) < 2:  # noqa: PLR2004
             raise DatasetError(f"{path}: has {len(by_stamp)} poses of the LiDAR; --motion needs "
@@ -149,12 +140,7 @@ def _xyz(frame: BagFrame) -> Array:
 
 
 def _register(target: Array, source: Array, where: Path) -> Array:
-    """(4, 4) T_target_source of two scans, coarse and then fine.
-
-    Raises:
-        CalibrationError: if small_gicp is missing.
-        DatasetError: if they do not fit.
-    """
+    """(4, 4) T_target_source of two scans, coarse and then fine."""
     try:
         import small_gicp
     except ImportError as error:

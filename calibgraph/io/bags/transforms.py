@@ -54,9 +54,6 @@ class Transforms:
 
     Where they do not connect two frames, those of other bags of the drive serve, and then those on
     /tf that never change, as ROS 1 may have them.
-
-    Args:
-        drive: the bag, whose transforms count first, and others.
     """
 
     def __init__(self, drive: Drive) -> None:

@@ -1,7 +1,5 @@
 """Autoware's sensor_kit_calibration.yaml: poses of camera_link, x forward, not optical."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from pydantic import ConfigDict
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import commented_yaml
+from calibgraph.io.formats.documents import commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport, frame_id
 from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
@@ -77,11 +75,7 @@ def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
 
 
 def read_autoware(content: dict[str, Any], path: Path) -> Part:
-    """The frames of a sensor kit.
-
-    Raises:
-        FileError: if it is malformed.
-    """
+    """The frames of a sensor kit."""
     return Part(path, links=tuple(_link(*entry, path) for entry in _entries(content)))
 
 

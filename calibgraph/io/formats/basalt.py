@@ -1,7 +1,5 @@
 """Basalt's calibration.json: lenses and T_imu_cam, which maps camera to IMU coordinates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +33,7 @@ def is_basalt(content: dict[str, Any]) -> bool:
 
 
 def read_basalt(content: dict[str, Any], path: Path) -> Part:
-    """The lenses cam0, cam1, ... and their frames in that of the IMU.
-
-    Raises:
-        FileError: if it is malformed, or a lens is none of ours.
-    """
+    """The lenses cam0, cam1, ... and their frames in the IMU's frame."""
     found = checked_model(_Calibration, content["value0"], path)
     try:
         lenses, links = {}, []

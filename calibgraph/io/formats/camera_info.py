@@ -1,7 +1,5 @@
 """A CameraInfo message as ``ros2 topic echo`` and ``rostopic echo`` print it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -11,8 +9,7 @@ from pydantic import AliasChoices, Field
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.formats.part import Part
-from calibgraph.io.lenses import CameraLens
-from calibgraph.model.rig import Finite, Intrinsics, Size
+from calibgraph.model.rig import Finite, Size
 
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
@@ -56,15 +53,10 @@ def is_camera_info(content: dict[str, Any]) -> bool:
 
 
 def read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame.
-
-    Raises:
-        FileError: if it is malformed, or the lens is none of ours.
-    """
+    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
     message = checked_model(_Message, content, path)
-    lens = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
-    size = (lens.content["width_px"], lens.content["height_px"])
-    intrinsics = checked_model(Intrinsics, lens.content["intrinsics_px"], path)
+    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     camera = name or path.stem
-    found = CameraLens(lens.content["model"], size, intrinsics, tuple(lens.content["distortion"]))
-    return Part(path, {camera: found}, frame_ids={camera: lens.frame} if lens.frame else {})
+    return Part(
+        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
+    )

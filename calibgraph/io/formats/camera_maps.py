@@ -1,7 +1,7 @@
 """Files of named numbers: OpenCV FileStorage, camera_info, parameters of SLAM programs and others.
 
 A camera is any mapping that holds the numbers of a lens, at any depth. These transforms are read;
-p are coordinates of a point, those of cameras in optical axes (x right, y down, z forward):
+p are coordinates of a point, for cameras in optical axes (x right, y down, z forward):
 
 =================================  ===========================  ==================================
 keys                               program                      direction
@@ -65,16 +65,7 @@ _PROGRAMS = (
 
 
 def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -> Part | None:
-    """The cameras and transforms of a mapping; None if it holds none.
-
-    Args:
-        content: of the file.
-        path: of the file.
-        name: of the camera, if there is a single one; None for the file's own name of it.
-
-    Raises:
-        FileError: if it is malformed, or a lens is none of ours.
-    """
+    """The cameras and transforms of a mapping; None if it holds none."""
     maps = [_Map(keys, ": ".join([str(path), *keys]), each) for keys, each in _maps(content)]
     cameras = [each for each in maps if each.numbers.hold_a_lens]
     owner = name or ONLY_CAMERA
@@ -101,7 +92,7 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
 
 
 def _camera_of(each: _Map, owner: str, path: Path, *, single: bool) -> str:
-    """The camera that a mapping is about: its own, or that of the whole file."""
+    """The camera that a mapping is about: its own, or the whole file's."""
     if each.target:
         return each.target
     return owner if single or not each.numbers.hold_a_lens else each.name or path.stem
@@ -133,13 +124,7 @@ def _extrinsics(named: Iterable[tuple[str, _Map]], path: Path) -> dict[str, Arra
 
 
 class _Map:
-    """A mapping in a file.
-
-    Args:
-        above: the keys that lead to it.
-        where: the file and these keys, for errors.
-        content: its keys and values.
-    """
+    """A mapping in a file, with the keys that lead to it."""
 
     def __init__(self, above: tuple[str, ...], where: str, content: Mapping[str, Any]) -> None:
         self.numbers = LensKeys(content, where)
@@ -182,11 +167,7 @@ class _Map:
                 )
 
     def _transform(self, names: tuple[str, ...]) -> Array:
-        """(4, 4) of a matrix of 3 or 4 rows, or of a rotation and a translation.
-
-        Raises:
-            FileError: if it is none.
-        """
+        """(4, 4) of a matrix of 3 or 4 rows, or of a rotation and a translation."""
         if len(names) == 1:
             rows = self.numbers.array(names[0], (4, 4), (3, 4))
         else:
@@ -200,7 +181,7 @@ class _Map:
 
 
 def _maps(content: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """The mappings in a content with the keys above them; those of a lens's groups are its own."""
+    """The mappings in a content with the keys above them; a lens keeps its groups."""
     if isinstance(content, dict):
         yield above, content
     children = content.items() if isinstance(content, dict) else enumerate(content)

@@ -1,7 +1,5 @@
 """COLMAP's cameras.txt: lenses by number; its pixel (0.5, 0.5) is the centre of the first one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -49,11 +47,7 @@ def is_colmap(text: str) -> bool:
 
 
 def read_colmap(path: Path) -> Part:
-    """The lenses, named camera_ID.
-
-    Raises:
-        FileError: if a line is malformed, or a lens is none of ours.
-    """
+    """The lenses, named camera_ID."""
     lenses = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):

@@ -1,8 +1,5 @@
 """Write a result or a rig in the format of another program."""
 
-from __future__ import annotations
-
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -11,7 +8,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
-from calibgraph.io.formats.comments import commented
+from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
 from calibgraph.io.formats.kitti_calib import kitti_statement, write_kitti
 from calibgraph.io.formats.koide import write_koide
@@ -31,7 +28,7 @@ from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
-from calibgraph.outputs import Output, require_free
+from calibgraph.outputs import Output, require_writable
 
 WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
     "kalibr": write_kalibr,
@@ -50,8 +47,7 @@ WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
 }
 _WITH_BASE = ("autoware", "nuscenes")
 _WITHOUT_COMMENTS = "kitti"
-_MARK = re.compile(rb"calibgraph[ _]export")
-_MARK_BYTES = 2**16
+_MARKS = (b"calibgraph export", b"calibgraph_export")
 
 
 def export_calibration(
@@ -101,11 +97,7 @@ def export_calibration(
 
 
 def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
-    """Check the verdicts of the cameras that are to be written.
-
-    Raises:
-        CalibrationError: if one is FAIL.
-    """
+    """Check the verdicts of the cameras that are to be written."""
     failed = [name for name in cameras if result.camera_verdicts[name].status == "FAIL"]
     if not failed:
         return
@@ -120,11 +112,7 @@ def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
 
 
 def _require_known(format: str, *, with_base: bool) -> None:
-    """Check the format, and that it has a base frame if one is given.
-
-    Raises:
-        ValueError: if not.
-    """
+    """Check the format, and that it has a base frame if one is given."""
     if format not in WRITERS:
         raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
     if with_base and format not in _WITH_BASE:
@@ -142,15 +130,7 @@ def _loaded(path: Path | str) -> Calibration | Rig:
 def outputs_of_export(path: Path, format: str) -> list[Output]:
     """The file of an export, and for the format without comments a text file beside it."""
     beside = [path.with_name(f"{path.stem}.direction.txt")] if format == _WITHOUT_COMMENTS else []
-    return [Output(file, "export", _is_exported) for file in (path, *beside)]
-
-
-def _is_exported(path: Path) -> bool:
-    """Whether a file was exported before, by its mark."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return _MARK.search(file.read(_MARK_BYTES)) is not None
+    return [Output(file, "export", _MARKS) for file in (path, *beside)]
 
 
 def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
@@ -159,7 +139,7 @@ def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
     contents = [WRITERS[format](export)]
     if format == _WITHOUT_COMMENTS:
         contents.append(commented(kitti_statement(export)))
-    require_free(outputs)
+    require_writable(outputs)
     for output, content in zip(outputs, contents, strict=True):
         if isinstance(content, bytes):
             write_bytes(output.path, content)

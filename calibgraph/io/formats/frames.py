@@ -1,7 +1,5 @@
 """Frames in their parents, as in TF and URDF: where the cameras are, seen from the LiDAR."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -76,11 +74,7 @@ def is_optical(frame: str) -> bool:
 
 
 def find_lidar_frame(tree: FrameTree) -> str:
-    """The one frame with the name of a LiDAR.
-
-    Raises:
-        CalibrationError: if there is none, or several.
-    """
+    """The one frame with the name of a LiDAR."""
     found = [name for name in tree.names if any(word in name.lower() for word in _LIDAR_WORDS)]
     if len(found) != 1:
         what = f"could be {', '.join(found)}" if found else f"is none of {', '.join(tree.names)}"

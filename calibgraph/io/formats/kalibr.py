@@ -1,7 +1,5 @@
 """Kalibr's camchain YAML, with T_cam_lidar as further key of a camera."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +9,7 @@ from pydantic import ConfigDict, Field
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import commented_yaml
+from calibgraph.io.formats.documents import commented_yaml
 from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import IMU, FrameLink, Part, RelativeCamera
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
@@ -121,9 +119,6 @@ def read_kalibr(content: dict[str, Any], path: Path) -> Part:
     """Lenses, T_cam_lidar where it is given, and T_cn_cnm1 as relative poses.
 
     T_cam_imu maps IMU to camera coordinates: a file with the LiDAR in the IMU completes it.
-
-    Raises:
-        FileError: if the file is malformed, or a lens is none of ours.
     """
     keys = sorted((key for key in content if re.fullmatch(r"cam\d+", str(key))), key=_number)
     chain = checked_model(_Camchain, {"cameras": {key: content[key] for key in keys}}, path)

@@ -1,7 +1,5 @@
 """KITTI odometry's calib.txt: P0 to P3, and Tr from the LiDAR to the rectified cameras."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -51,7 +49,7 @@ def kitti_statement(export: RigExport) -> list[str]:
 
 
 def _numbers(export: RigExport) -> dict[str, int]:
-    """The k of P_k per camera: that of image_k, else the order."""
+    """The k of P_k per camera: the number in image_k, else its place in the order."""
     found = {name: re.fullmatch(r"image_0?([0-3])", name) for name in export.cameras}
     numbers = {name: int(match[1]) for name, match in found.items() if match}
     if len(set(numbers.values())) == len(export.cameras):

@@ -11,8 +11,6 @@ perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified ima
 =======================  ==========================  ==============================================
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,15 +45,7 @@ def is_kitti_lines(text: str) -> bool:
 
 
 def read_kitti_lines(path: Path, name: str | None) -> Part:
-    """The lenses and transforms of a file.
-
-    Args:
-        path: of the file.
-        name: of the camera of a single matrix; None for the only one, KITTI-360's for image_00.
-
-    Raises:
-        FileError: if it is malformed, or no such file.
-    """
+    """The lenses and transforms of a file."""
     lines = dict(_lines(path))
     transforms = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
     rectified = sorted(key[-2:] for key in lines if re.fullmatch(r"P_rect_\d\d", key))
@@ -94,11 +84,7 @@ def _rectified(lines: dict[str, list[float]], numbers: list[str], path: Path) ->
 
 
 def _T_camera_lidar(lines: dict[str, list[float]], path: Path) -> Array:
-    """(4, 4) of the one matrix of a file, in the direction that its name states.
-
-    Raises:
-        FileError: if it holds another one, or its name states no direction.
-    """
+    """(4, 4) of the one matrix of a file, in the direction that its name states."""
     if {"R", "T"} <= lines.keys():
         R, t = _matrix(lines, "R", (3, 3), path), _matrix(lines, "T", (3, 1), path)
         row = np.hstack([R, t]).ravel().tolist()
@@ -150,11 +136,7 @@ def _matrix(lines: dict[str, list[float]], key: str, shape: tuple[int, int], pat
 
 
 def _rigid(row: list[float], path: Path, what: str) -> Array:
-    """(4, 4) of 12 or 16 numbers.
-
-    Raises:
-        FileError: if they are no rigid transform.
-    """
+    """(4, 4) of 12 or 16 numbers."""
     if len(row) not in (12, 16):
         raise FileError(path, f"{what} has {len(row)} numbers, expected 12 or 16; {_EXPECTED}")
     rows = row if len(row) == 16 else [*row, 0.0, 0.0, 0.0, 1.0]  # noqa: PLR2004 - 4 x 4

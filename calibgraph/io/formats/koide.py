@@ -1,14 +1,12 @@
 """calib.json of koide3's direct_visual_lidar_calibration: one camera, T_lidar_camera."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import stated_json
+from calibgraph.io.formats.documents import stated_json
 from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import Part
 from calibgraph.io.formats.rig_export import RigExport
@@ -88,16 +86,7 @@ def is_koide(content: dict[str, Any]) -> bool:
 
 
 def read_koide(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens and the result, or else an initial guess; without image size.
-
-    Args:
-        content: of calib.json.
-        path: of it.
-        name: of the camera, unless the file was written here.
-
-    Raises:
-        FileError: if the file is malformed, or the lens is none of ours.
-    """
+    """The lens and the result, or else an initial guess; a file written here has its own name."""
     found = checked_model(_Calibration, content, path)
     name = str(found.meta.get("camera", name or path.stem))
     r = found.results

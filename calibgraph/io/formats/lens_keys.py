@@ -5,8 +5,6 @@ One table of keys serves OpenCV, camera_info files, Autoware.AI, camodocal (VINS
 a dot or slash do not count: ``Camera.fx``, ``cam_fx``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,12 +59,7 @@ _LENS_KEYS = frozenset(alias for aliases in _KEYS.values() for alias in aliases)
 
 
 class LensKeys:
-    """The numbers of a lens in a mapping.
-
-    Args:
-        content: keys and values, of a file or a part of one.
-        where: the file, and the key of the part, for errors.
-    """
+    """The numbers of a lens in a mapping."""
 
     def __init__(self, content: Mapping[str, Any], where: str) -> None:
         self._where = where
@@ -90,11 +83,7 @@ class LensKeys:
         return any(self._key(name) is not None for name in ("width", "size"))
 
     def read(self) -> tuple[CameraLens, str]:
-        """The lens, and a note on what was assumed; empty if nothing was.
-
-        Raises:
-            FileError: if a number is missing or malformed, or the lens model is open.
-        """
+        """The lens, and a note on what was assumed; empty if nothing was."""
         stated = stated_model(self._content, self._where)
         model, coefficients, note = self._distortion(stated)
         return CameraLens(model, self._size(), self._intrinsics(), coefficients), note
@@ -113,11 +102,7 @@ class LensKeys:
         return self._keys[name]
 
     def array(self, name: str, *shapes: tuple[int, int]) -> Array:
-        """The numbers of a plain key in the one of some shapes that they fill.
-
-        Raises:
-            FileError: if they fill none.
-        """
+        """The numbers of a plain key in the one of some shapes that they fill."""
         where = f"{self._where}: {self._keys[name]}"
         found = numbers(self._content[self._keys[name]], where)
         for shape in shapes:
@@ -127,11 +112,7 @@ class LensKeys:
         raise FileError(where, f"has {found.size} numbers, expected {sizes}")
 
     def _key(self, quantity: str) -> str | None:
-        """The key of a quantity.
-
-        Raises:
-            FileError: if two keys give it different values.
-        """
+        """The key of a quantity."""
         given = [self._keys[alias] for alias in _KEYS[quantity] if alias in self._keys]
         for other in given[1:]:
             if self._content[other] != self._content[given[0]]:
@@ -201,11 +182,7 @@ class LensKeys:
         return unified_coefficients(mirror, others, self._where)
 
     def _assume(self, found: Array, key: str) -> str:
-        """The note on a pinhole that no key states.
-
-        Raises:
-            FileError: if it may as well be a fisheye: four coefficients in a column.
-        """
+        """The note on a pinhole that no key states."""
         if found.size != _FISHEYE_COUNT or not found.any():
             return ""
         if found.ndim > 1 and len(found) > 1:
@@ -217,11 +194,7 @@ class LensKeys:
         )
 
     def _named(self, model: LensModel, stated: LensModel | None) -> list[float]:
-        """The coefficients that have a key each, as k1 or d0.
-
-        Raises:
-            FileError: if the model is open.
-        """
+        """The coefficients that have a key each, as k1 or d0."""
         plain = {f"{part}{i}" for part in ("d", "camd") for i in range(8)} & self._keys.keys()
         if plain:
             return [self._number(self._keys[name]) for name in sorted(plain)]
@@ -243,11 +216,7 @@ class _Image(StrictNumbers):
 
 
 def numbers(value: Any, where: str) -> Array:
-    """A number, a list, or OpenCV's matrix of rows, cols and data, as an array of its shape.
-
-    Raises:
-        FileError: if it is none of these, or its numbers are not finite or not as many as stated.
-    """
+    """A number, a list, or OpenCV's matrix of rows, cols and data, as an array of its shape."""
     is_matrix = isinstance(value, dict) and "data" in value
     data = value["data"] if is_matrix else value
     try:

@@ -1,17 +1,11 @@
 """Lenses that a format cannot carry are refused, not rounded."""
 
-from __future__ import annotations
-
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 
 
 def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> list[float]:
-    """A pinhole's coefficients, ``most`` of them, in OpenCV's order.
-
-    Raises:
-        CalibrationError: if there are further ones that are not zero.
-    """
+    """A pinhole's coefficients, ``most`` of them, in OpenCV's order."""
     padded = [*camera.distortion, *[0.0] * most]
     if any(padded[most:]):
         raise CalibrationError(
@@ -32,11 +26,7 @@ def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
 
 
 def require_undistorted(name: str, camera: Camera, what: str) -> None:
-    """Check that a camera is a pinhole without distortion.
-
-    Raises:
-        CalibrationError: if not.
-    """
+    """Check that a camera is a pinhole without distortion."""
     if camera.model != "pinhole":
         raise CalibrationError(
             f"camera {name!r}: {what} cannot hold a {camera.model} lens; choose another --format, "

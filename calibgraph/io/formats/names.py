@@ -1,7 +1,5 @@
 """The formats by name; imports nothing, so that the help of the command line answers at once."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

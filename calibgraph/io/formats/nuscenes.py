@@ -1,7 +1,5 @@
 """nuScenes' table calibrated_sensor: sensor -> ego, quaternions w x y z, undistorted images."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

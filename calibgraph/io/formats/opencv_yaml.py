@@ -1,7 +1,5 @@
 """OpenCV FileStorage YAML: one map per camera."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,13 +1,11 @@
 """Plain JSON and NumPy archives: both directions of the extrinsic, lenses, covariance."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 
 import numpy as np
 
-from calibgraph.io.formats.comments import stated_json
+from calibgraph.io.formats.documents import stated_json
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
 

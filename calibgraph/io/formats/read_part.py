@@ -1,13 +1,11 @@
 """One file of another program, in the format that its name or content shows."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, read_text, require_file
+from calibgraph.files import read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
@@ -31,18 +29,14 @@ from calibgraph.io.formats.urdf import read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig
-from calibgraph.model.rig import Camera, Intrinsics
+from calibgraph.model.rig import Camera
 
 _MAX_BYTES = 32 * 2**20
 _COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:
-    """What a file holds about a rig.
-
-    Args:
-        path: of the file, or of a KITTI sequence, a result's folder or a ROS bag.
-        name: of the camera, if the file is of a single one; None for the file's own name of it.
+    """Read a file; ``name`` replaces the file's own name of its camera if it has a single one.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.
@@ -126,18 +120,12 @@ def _part_of_bag(path: Path) -> Part:
     found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
     return Part(
         path,
-        lenses={name: _lens_of_bag(camera.lens.content, path) for name, camera in cameras.items()},
+        lenses={name: camera.stated.lens for name, camera in cameras.items()},
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
         frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
         lidar=read.lidar,
         notes=tuple(read.notes),
     )
-
-
-def _lens_of_bag(content: Mapping[str, Any], path: Path) -> CameraLens:
-    size = (content["width_px"], content["height_px"])
-    intrinsics = checked_model(Intrinsics, content["intrinsics_px"], path)
-    return CameraLens(content["model"], size, intrinsics, tuple(content["distortion"]))
 
 
 def _part_of_rig(path: Path) -> Part:

@@ -1,7 +1,5 @@
 """A rig as the exporters take it: frames by name, covariances, and the statement of direction."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -69,11 +67,7 @@ class RigExport:
         return ros_pose_covariance(self.covariance[name], self.cameras[name].T_camera_lidar)
 
     def only_camera(self, what: str) -> tuple[str, Camera]:
-        """The one camera, for a format that holds no more.
-
-        Raises:
-            CalibrationError: if there are several.
-        """
+        """The one camera, for a format that holds no more."""
         if len(self.cameras) > 1:
             raise CalibrationError(
                 f"{what} holds one camera, these are {', '.join(self.cameras)}: name one with "
@@ -82,11 +76,7 @@ class RigExport:
         return next(iter(self.cameras.items()))
 
     def statement(self, *direction: str) -> list[str]:
-        """Lines for a comment: origin, direction, and a worked point of each camera.
-
-        Args:
-            direction: sentences on what the file's numbers map to what.
-        """
+        """Lines for a comment: origin, direction, and a worked point of each camera."""
         verdict = f"verdict {self.verdict}" if self.verdict else "a rig file, without verdict"
         frames = ", ".join(f"{name}: {frame}" for name, frame in self.optical_frames.items())
         lines = [
@@ -152,7 +142,7 @@ def prepare_export(
 
 
 def _camera_frame(camera: Camera, given: str | None) -> str:
-    """That given, else that of the rig, else one by the camera's name."""
+    """The given frame, else the rig's, else one by the camera's name."""
     return (camera.frame_id or CAMERA_FRAME) if given is None else given
 
 

@@ -1,10 +1,8 @@
 """A rig from the files of other programs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -106,11 +104,7 @@ class RigParts:
         relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
         relative_sigma_cm: float = RELATIVE_SIGMA_CM,
     ) -> Rig:
-        """The rig, with further (4, 4) T_camera_lidar, which stand in for those of the files.
-
-        Raises:
-            CalibrationError: if an image size or an extrinsic is missing.
-        """
+        """The rig, with further (4, 4) T_camera_lidar, which replace the files'."""
         T = {**self.T_camera_lidar, **(extrinsics or {})}
         sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
         content: dict[str, Any] = {
@@ -175,11 +169,7 @@ def read_rig_parts(
 def _read_all(
     files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
 ) -> list[Part]:
-    """The parts, of which one has a lens at least.
-
-    Raises:
-        CalibrationError: if a file is malformed, or none has a lens.
-    """
+    """The parts; at least one has a lens."""
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
     lenses = sorted({name for part in read for name in part.lenses})
@@ -211,11 +201,7 @@ def _merged(
     what: str,
     is_same: Callable[[Value, Value], bool],
 ) -> dict[str, Value]:
-    """What the parts hold, by camera.
-
-    Raises:
-        FileError: if two parts differ.
-    """
+    """What the parts hold, by camera."""
     merged: dict[str, Value] = {}
     for part in parts:
         for name, value in select(part).items():
@@ -276,11 +262,7 @@ def _camera(
     *,
     parts: RigParts,
 ) -> dict[str, Any]:
-    """The content of a rig file for a camera.
-
-    Raises:
-        RigError: if the image size or the extrinsic is missing.
-    """
+    """The content of a rig file for a camera."""
     size = lens.size_px or size_px
     if size is None:
         raise RigError(
@@ -296,11 +278,4 @@ def _camera(
             f"describe its mounting to calibgraph guess{notes}",
             camera=name,
         )
-    return {
-        "model": lens.model,
-        "width_px": size[0],
-        "height_px": size[1],
-        "intrinsics_px": lens.intrinsics_px,
-        "distortion": lens.distortion,
-        "T_camera_lidar": T_camera_lidar,
-    }
+    return {**replace(lens, size_px=size).fields(), "T_camera_lidar": T_camera_lidar}

@@ -1,7 +1,5 @@
 """Static transforms of ROS: publisher lines, a launch file, tf2's message."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.comments import commented, commented_xml, commented_yaml
+from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
@@ -138,9 +136,6 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
     """The frames of TFMessages and TransformStampeds; the last of several for a child.
 
     A frame whose numbers are no transform is left out with a note: others may do without it.
-
-    Raises:
-        FileError: if one is malformed.
     """
     links: dict[str, FrameLink] = {}
     notes: list[str] = []
@@ -156,11 +151,7 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
 
 
 def _link(stamped: _Stamped) -> FrameLink:
-    """The frame of a message.
-
-    Raises:
-        ValueError: if its numbers are no transform.
-    """
+    """The frame of a message."""
     t, q = stamped.transform.translation, stamped.transform.rotation
     if not np.isfinite([t.x, t.y, t.z]).all():
         raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")

@@ -1,7 +1,5 @@
 """URDF: fixed joints to optical frames, and the links of a robot."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
-from calibgraph.io.formats.comments import commented_xml
+from calibgraph.io.formats.documents import commented_xml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport
 from calibgraph.io.rotations import pose_of_angles, roll_pitch_yaw
@@ -40,11 +38,7 @@ def _text(values: list[float] | NDArray[np.float64]) -> str:
 
 
 def read_urdf(root: ElementTree.Element, path: Path) -> Part:
-    """The frames of a URDF: its joints at their zero position.
-
-    Raises:
-        FileError: if it is not a URDF, or not expanded.
-    """
+    """The frames of a URDF: its joints at their zero position."""
     if root.tag != "robot":
         raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
     if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):

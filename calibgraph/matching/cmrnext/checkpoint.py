@@ -23,7 +23,7 @@ from calibgraph.matching.cmrnext.network import CmrNext
 from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
 
 SAFETENSORS = ".safetensors"
-_CONVERTED = "calibgraph-cmrnext/1"
+CONVERTED = "calibgraph-cmrnext/1"
 TORCH_SUFFIXES = (".tar", ".pt", ".pth")
 
 DOWNLOAD = (
@@ -85,7 +85,7 @@ class Checkpoint:
         """Write the weights and their config as a .safetensors file."""
         from safetensors.torch import save_file
 
-        metadata = {"format": _CONVERTED, "config": json.dumps(self.config)}
+        metadata = {"format": CONVERTED, "config": json.dumps(self.config)}
         # Some tensors are stored under two names; safetensors requires separate memory.
         state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
         write_atomically(path, lambda temporary: save_file(state, temporary, metadata))
@@ -95,17 +95,6 @@ def _is_parameter(name: str) -> bool:
     """Whether an entry of a state dict is neither a second name nor a running statistic."""
     statistics = ("running_mean", "running_var", "num_batches_tracked")
     return ".downsample.1." not in name and not name.endswith(statistics)
-
-
-def is_converted(path: Path) -> bool:
-    """Whether a .safetensors file was written by :meth:`Checkpoint.save_safetensors`."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            return (file.metadata() or {}).get("format") == _CONVERTED
-    except (SafetensorError, OSError):
-        return False
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:

@@ -16,9 +16,9 @@ from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.window_table import WindowTables
-from calibgraph.memory import keep
+from calibgraph.memory import mmap_copy
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.parallel import Once
+from calibgraph.parallel import KeyedCache
 
 FileVersion = tuple[Path, int, int]
 """Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
@@ -34,8 +34,10 @@ class FrameCache:
     """
 
     def __init__(self) -> None:
-        self._clouds: Once[tuple[FileVersion, ScanMotion | None], PreparedCloud] = Once()
-        self._images: Once[tuple[FileVersion, int, int], NDArray[np.uint8]] = Once()
+        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = (
+            KeyedCache()
+        )
+        self._images: KeyedCache[tuple[FileVersion, int, int], NDArray[np.uint8]] = KeyedCache()
         self._tables = WindowTables()
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
@@ -60,7 +62,7 @@ class FrameCache:
 
         def load() -> NDArray[np.uint8]:
             gray = frame.load_gray(name, camera)
-            return gray if isinstance(frame, KeptFrame) else keep(gray)
+            return gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
 
         image = self._images.get(key, load)
         self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.matching.structure.directions import scan_angles
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.window_table import WindowTable, WindowTables
-from calibgraph.memory import keep
+from calibgraph.memory import mmap_copy
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
 
@@ -55,8 +55,8 @@ class PreparedCloud:
         intensity = np.nan_to_num(cloud[far, 3].astype(np.float64))
         hidden = ~find_visible(scan_angles(points), distance_m, ORIGIN_CELL_RAD)
         return PreparedCloud(
-            keep(points),
-            keep(_ranks(intensity) / max(1, len(intensity))),
+            mmap_copy(points),
+            mmap_copy(_ranks(intensity) / max(1, len(intensity))),
             seen_from_origin=bool(hidden.sum() <= MAX_HIDDEN_FROM_ORIGIN * len(hidden)),
             tables=tables or WindowTables(),
         )

@@ -16,7 +16,7 @@ from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
 from calibgraph.matching.structure.windows import Windows
-from calibgraph.memory import reserve
+from calibgraph.memory import mmap_zeros
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
@@ -77,7 +77,7 @@ def score_frame(
     places = find_places(windows.rays_m, viewpoint_m, camera, scale)
     reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
-    grids: Grids = reserve((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
+    grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, image, places, windows, group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
     centres = _mean_by_group(centres_lidar_m, group, counts)
@@ -116,7 +116,7 @@ def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     """The groups of several frames of one camera in one object."""
     columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
-    grids: Grids = reserve((len(stacked["counts"]), *scores[0].grids.shape[1:]), np.float32)
+    grids: Grids = mmap_zeros((len(stacked["counts"]), *scores[0].grids.shape[1:]), np.float32)
     np.concatenate([s.grids for s in scores], out=grids)
     return ShiftScores(**stacked, grids=grids, steps_per_px=scores[0].steps_per_px)
 

@@ -14,8 +14,8 @@ from calibgraph.matching.structure.windows import (
     Windows,
     cut_windows,
 )
-from calibgraph.memory import keep, reserve
-from calibgraph.parallel import Once
+from calibgraph.memory import mmap_copy, mmap_zeros
+from calibgraph.parallel import KeyedCache
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -56,10 +56,10 @@ class WindowTable:
         kept = thin(usable, spacing_rad)
         centres = thin(usable[kept], stride_spacings * spacing_rad)
         self._cloud = rays_m, intensity_rank
-        self._rows = keep(rows[kept].astype(np.int32))
-        self._centres = keep(np.random.default_rng(0).permutation(centres).astype(np.int32))
-        self._slots = keep(np.full(len(centres), _UNCUT, np.int32))
-        self._windows, self._count = Windows.empty(len(centres), reserve), 0
+        self._rows = mmap_copy(rows[kept].astype(np.int32))
+        self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
+        self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
         self._neighbours: Neighbours | None = None
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._lock = Lock()
@@ -126,7 +126,7 @@ class WindowTables:
     """The tables of several clouds: those used last, up to ``MAX_BYTES`` and ``MAX_TREE_BYTES``."""
 
     def __init__(self) -> None:
-        self._tables: Once[tuple[Hashable, ...], WindowTable] = Once()
+        self._tables: KeyedCache[tuple[Hashable, ...], WindowTable] = KeyedCache()
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], WindowTable]) -> WindowTable:
         """The table of a key whose first entry is the cloud; made if it is missing."""

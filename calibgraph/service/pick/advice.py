@@ -1,7 +1,5 @@
 """What to pick next: the part of the image whose points reduce the largest uncertainty most."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,8 +1,6 @@
 """What the page gets: the session, the estimate and the advice, as plain values."""
 
-from __future__ import annotations
-
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from calibgraph.model.calibration import degrees_and_centimetres
 from calibgraph.model.geometry import pose_difference
@@ -79,6 +77,8 @@ class CameraEstimateAnswer(BaseModel):
 class AdviceAnswer(BaseModel):
     """Where to pick next: words, and the third of the image."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     words: str
     column: int
     row: int
@@ -132,9 +132,7 @@ def estimate_answer(revision: int, estimate: PickEstimate, advice: Advice | None
         revision=revision,
         scale=None if solve is None else solve.scale,
         cameras=[_camera_answer(name, one, solve) for name, one in estimate.cameras.items()],
-        advice=None
-        if advice is None
-        else AdviceAnswer(words=advice.words, column=advice.column, row=advice.row),
+        advice=None if advice is None else AdviceAnswer.model_validate(advice),
     )
 
 

@@ -1,7 +1,5 @@
 """The application of `calibgraph pick`: one session, for the person at this machine."""
 
-from __future__ import annotations
-
 import socket
 
 import uvicorn
@@ -16,18 +14,14 @@ from calibgraph.service.metrics import Metrics
 from calibgraph.service.pick.router import pick_router
 from calibgraph.service.pick.workspace import Workspace
 from calibgraph.service.problems import add_problem_handlers
-from calibgraph.service.shield import LOCAL_NAMES, Shield
+from calibgraph.service.request_guard import LOCAL_NAMES, RequestGuard
 
 
 def create_pick_app(workspace: Workspace) -> FastAPI:
-    """The application of a session: its routes, without jobs and trackers.
-
-    Args:
-        workspace: of the session.
-    """
+    """The application of a session: its routes, without jobs and trackers."""
     app = FastAPI(title="calibgraph pick", docs_url=None, redoc_url=None)
     app.state.gate = Gate(None)
-    app.add_middleware(Shield, hosts=LOCAL_NAMES, observe=Metrics().observe_request)
+    app.add_middleware(RequestGuard, hosts=LOCAL_NAMES, observe=Metrics().observe_request)
     app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
     add_problem_handlers(app)
     app.include_router(pick_router(workspace))
@@ -35,14 +29,7 @@ def create_pick_app(workspace: Workspace) -> FastAPI:
 
 
 def loopback_socket(port: int) -> socket.socket:
-    """A socket that listens on this machine alone.
-
-    Args:
-        port: 0 for any that is free.
-
-    Raises:
-        CalibrationError: if the port is taken.
-    """
+    """A socket that listens on this machine alone."""
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

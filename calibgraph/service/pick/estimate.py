@@ -1,7 +1,5 @@
 """What picked pairs determine: PnP by several solvers, the joint solve, and what is weak."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -12,8 +10,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.service.pick.joint import JointSolve, solve_pairs
 from calibgraph.service.pick.leave_out import Influence, influences
 from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
-from calibgraph.service.pick.shape import Shape, shape_of
-from calibgraph.service.pick.solvers import MIN_PAIRS, SolverPose, poses_by_solver
+from calibgraph.service.pick.solvers import MIN_PAIRS, Shape, SolverPose, poses_by_solver, shape_of
 from calibgraph.trust.observability import weakest_direction
 
 PAIRS_TO_FIND_A_WRONG_ONE = 6
@@ -44,12 +41,7 @@ class CameraEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PickEstimate:
-    """What all pairs give.
-
-    Attributes:
-        solve: of the cameras that are determined; None if there is none.
-        cameras: per camera of the rig.
-    """
+    """The joint solve, None if no camera is determined, and the estimate of each camera."""
 
     solve: JointSolve | None
     cameras: Mapping[str, CameraEstimate] = field(default_factory=dict)

@@ -4,8 +4,6 @@ No loss and no gate: with a dozen pairs a robust loss hides a wrong one and make
 depend on it. A wrong pair is found by what leaving it out changes, and removed by its picker.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -64,12 +62,7 @@ class JointSolve:
 
 
 def solve_pairs(rig: Rig, pairs: Mapping[str, Sequence[Pair]]) -> JointSolve:
-    """Solve all cameras of a rig jointly: the paper's Eq. 5 with its reprojection term alone.
-
-    Args:
-        rig: the cameras to solve, at the start; its measured relative poses take part.
-        pairs: per camera that has any.
-    """
+    """Solve all cameras of a rig jointly: the paper's Eq. 5 with its reprojection term alone."""
     freedom = 2 * sum(map(len, pairs.values())) + _POSE * (
         len(rig.relative_poses) - len(rig.cameras)
     )

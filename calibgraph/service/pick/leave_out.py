@@ -1,7 +1,5 @@
 """What a result depends on: each pair's residual, and what leaving it out changes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -47,12 +45,7 @@ class Influence:
 def influences(
     solve: JointSolve, pairs: Mapping[str, Sequence[Pair]]
 ) -> dict[str, list[Influence]]:
-    """Per camera and pair: residual, and the change by one Gauss-Newton step without it.
-
-    Args:
-        solve: of these pairs.
-        pairs: per camera.
-    """
+    """Per camera and pair: residual, and the change by one Gauss-Newton step without it."""
     count = sum(map(len, pairs.values()))
     return {name: _of_camera(solve, name, some, count) for name, some in pairs.items()}
 
@@ -111,12 +104,7 @@ def _influence(
 
 
 def _chance(solve: JointSolve, drop: float) -> float | None:
-    """Probability that one pair adds so much to the sum of squares, by an F test (2, rest).
-
-    Args:
-        solve: all pairs.
-        drop: of the sum of squares when the pair is left out.
-    """
+    """Probability that one pair adds so much to the sum of squares, by an F test (2, rest)."""
     if solve.freedom <= _OF_A_PAIR:  # without a pair, the others fit whatever they are
         return None
     rest = PSEUDO_RESIDUALS + solve.freedom - _OF_A_PAIR

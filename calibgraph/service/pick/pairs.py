@@ -1,7 +1,5 @@
 """Picked pairs: a pixel of an image and a point of the cloud of the same frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What a session gives: the table of its pairs, and the reference with its error bars."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,12 +10,12 @@ import numpy as np
 from calibgraph.errors import CalibrationError
 from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.model.calibration import degrees_and_centimetres
-from calibgraph.model.result_files import WRITTEN_KEY, written_by
+from calibgraph.model.result_files import WRITTEN_KEY, table_mark
 from calibgraph.model.rig import Rig
-from calibgraph.outputs import Output, has_yaml_mark, yaml_mark
+from calibgraph.outputs import Output, marked_yaml, yaml_mark
 from calibgraph.service.pick.estimate import PickEstimate
 from calibgraph.service.pick.pairs import Pair, to_table
-from calibgraph.service.pick.session import SESSION_FILE, is_session
+from calibgraph.service.pick.session import SESSION_FILE, SESSION_FORMAT
 
 TABLE_FILE = "picked.parquet"
 PICK = "calibgraph pick"
@@ -26,18 +24,14 @@ PICK = "calibgraph pick"
 def outputs_of_pick(folder: Path) -> list[Output]:
     """The files of a session in its folder."""
     return [
-        Output(folder / SESSION_FILE, "pick", is_session),
-        Output(folder / TABLE_FILE, "pick", written_by(PICK)),
-        Output(folder / REFERENCE_FILE, "pick", has_yaml_mark("pick")),
+        Output(folder / SESSION_FILE, "pick", (SESSION_FORMAT.encode(),)),
+        Output(folder / TABLE_FILE, "pick", (table_mark(PICK),)),
+        marked_yaml(folder / REFERENCE_FILE, "pick"),
     ]
 
 
 def reference_rig(estimate: PickEstimate) -> Rig:
-    """The rig of the cameras that the pairs determine, each with its covariance.
-
-    Raises:
-        CalibrationError: if there is none.
-    """
+    """The rig of the cameras that the pairs determine, each with its covariance."""
     solve = estimate.solve
     if solve is None or solve.covariance is None:
         reasons = [word for camera in estimate.cameras.values() for word in camera.warnings]
@@ -55,9 +49,6 @@ def reference_rig(estimate: PickEstimate) -> Rig:
 
 def write_reference(folder: Path, estimate: PickEstimate, pairs: Sequence[Pair]) -> list[Path]:
     """Write ``reference.yaml``, with error bars, and the pairs as a table of correspondences.
-
-    Returns:
-        The paths.
 
     Raises:
         CalibrationError: if the pairs determine no camera.

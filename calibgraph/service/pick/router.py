@@ -1,7 +1,5 @@
 """Routes of a session of picking, under ``/v1/pick``, and its page, ``/pick``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -61,11 +59,7 @@ class PairChange(_Body):
 
 
 def pick_router(workspace: Workspace) -> APIRouter:
-    """The routes of a session.
-
-    Args:
-        workspace: of the session.
-    """
+    """The routes of a session."""
     router = APIRouter(responses=documented(404, 409, 422))
     _add_page(router)
     _add_data(router, workspace)
@@ -189,11 +183,7 @@ def _add_changes(router: APIRouter, workspace: Workspace) -> None:
 
 
 def _pair(workspace: Workspace, body: NewPair) -> Pair:
-    """The pair that is to be added.
-
-    Raises:
-        Problem: if there is no such point.
-    """
+    """The pair that is to be added."""
     workspace.camera(body.camera, estimated=False)
     cloud = workspace.cloud(body.frame)
     if body.point_index >= len(cloud):
@@ -209,11 +199,7 @@ def _with(session: Session, pairs: Sequence[Pair]) -> Session:
 
 
 def _pairs_with(session: Session, place: int) -> list[Pair]:
-    """The pairs of a session that has this place.
-
-    Raises:
-        Problem: if it has not.
-    """
+    """The pairs of a session that has this place."""
     if place >= len(session.pairs):
         raise Problem(404, f"the session has {len(session.pairs)} pairs")
     return list(session.pairs)

@@ -72,11 +72,7 @@ class Session(BaseModel):
 
 
 def load_session(path: Path) -> Session:
-    """Read a session.
-
-    Raises:
-        FileError: if it is none.
-    """
+    """Read a session."""
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -86,11 +82,6 @@ def load_session(path: Path) -> Session:
 
 def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> Session:
     """The session of a file, or a new one.
-
-    Args:
-        path: of the file.
-        frames: names of the dataset's frames.
-        cameras: of the rig.
 
     Raises:
         FileError: if the file is of another dataset or no session.
@@ -104,12 +95,3 @@ def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> S
             "is a session of other frames or cameras; give the same --frames, or another --out",
         )
     return session
-
-
-def is_session(path: Path) -> bool:
-    """Whether a file is a session."""
-    try:
-        load_session(path)
-    except FileError:
-        return False
-    return True

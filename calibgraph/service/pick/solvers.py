@@ -1,10 +1,8 @@
-"""One camera's extrinsic from a few pairs by several PnP solvers, whose spread shows blunders."""
-
-from __future__ import annotations
+"""PnP by several solvers, and the shape of the points that they are given."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -15,7 +13,11 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import normalized
 
 Array = NDArray[np.float64]
+Shape = Literal["line", "plane", "space"]
 
+FLAT_M = 0.06
+"""Root mean square distance from a line or plane up to which points lie on it: ranges have 2 to
+3 cm of noise, so that two planes nearer than that are one."""
 MIN_PAIRS = 4
 """Three pairs have up to four solutions; the fourth chooses."""
 MIN_PAIRS_LINEAR = 6
@@ -28,13 +30,7 @@ _ITERATIONS = 2000  # of samples of 4: with half of the pairs wrong, all but 1e-
 
 @dataclass(frozen=True, eq=False)
 class SolverPose:
-    """The extrinsic of one solver.
-
-    Attributes:
-        solver: its name.
-        T_camera_lidar: (4, 4).
-        median_px: median reprojection error of all pairs, with the lens.
-    """
+    """The (4, 4) extrinsic of a PnP solver, and the median error of all pairs, with the lens."""
 
     solver: str
     T_camera_lidar: Array
@@ -149,3 +145,14 @@ def _median_error(camera: Camera, T: Array, points_lidar_m: Array, pixels_px: Ar
     projected, valid = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
     errors = np.linalg.norm(projected - pixels_px, axis=1)
     return float(np.median(np.where(valid, errors, np.inf)))
+
+
+def shape_of(points_m: Array) -> tuple[Shape, float]:
+    """Whether (n, 3) points lie on a line, in a plane, or neither, and how far off it [m], rms."""
+    centred = points_m - points_m.mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(points_m))
+    spread = np.pad(spread, (0, 3 - len(spread)))
+    off_line = float(np.hypot(spread[1], spread[2]))
+    if off_line <= FLAT_M:
+        return "line", off_line
+    return ("plane" if spread[2] <= FLAT_M else "space"), float(spread[2])

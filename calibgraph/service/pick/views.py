@@ -1,7 +1,5 @@
 """What the page shows of a frame: the points that a camera sees, and corners near a pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -23,13 +21,7 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 
 @dataclass(frozen=True, eq=False)
 class VisiblePoints:
-    """The points of a cloud that a camera sees.
-
-    Attributes:
-        rows: (k,) in the cloud.
-        pixels_px: (k, 2).
-        distance_m: (k,) from the camera.
-    """
+    """The points of a cloud that a camera sees: their rows, (k, 2) pixels and distances from it."""
 
     rows: NDArray[np.intp]
     pixels_px: Array
@@ -48,12 +40,7 @@ class VisiblePoints:
 
 
 def visible_points(points_lidar_m: Array, camera: Camera) -> VisiblePoints:
-    """The points in a camera's image that no much nearer point hides.
-
-    Args:
-        points_lidar_m: (n, 3).
-        camera: lens and extrinsic.
-    """
+    """The points in a camera's image that no much nearer point hides."""
     rows, angles, distance_m = find_in_view(points_lidar_m, camera)
     seen = find_visible(angles, distance_m, _cell_rad(angles))
     rows, distance_m = rows[seen], distance_m[seen]

@@ -1,7 +1,5 @@
 """A dataset, its session on disk, and the estimate of the pairs so far."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import lru_cache
@@ -32,10 +30,6 @@ class StaleError(Exception):
 class Workspace:
     """A session of picking, for the routes.
 
-    Args:
-        dataset: frames and the guess.
-        folder: of the session and what it gives; written after every change.
-
     Raises:
         FileError: if the folder holds a session of another dataset.
     """
@@ -57,15 +51,7 @@ class Workspace:
         return self._session
 
     def change(self, revision: int, change: Change) -> Session:
-        """Change the session and save it.
-
-        Args:
-            revision: of the session that is meant.
-            change: from the session to the next.
-
-        Raises:
-            StaleError: if the session was changed since.
-        """
+        """Change the session and save it."""
         with self._lock:
             if revision != self._session.revision:
                 raise StaleError
@@ -85,11 +71,7 @@ class Workspace:
             return self._estimated[1]
 
     def camera(self, name: str, *, estimated: bool) -> Camera:
-        """A camera at the guess, or at the estimate if there is one.
-
-        Raises:
-            DatasetError: if the rig has none of this name.
-        """
+        """A camera at the guess, or at the estimate if there is one."""
         cameras = self.dataset.rig.cameras
         if name not in cameras:
             raise DatasetError(f"the rig has no camera {name!r}; it has {', '.join(cameras)}")
@@ -97,11 +79,7 @@ class Workspace:
         return cameras[name] if solve is None else solve.rig.cameras.get(name, cameras[name])
 
     def frame(self, index: int) -> Frame:
-        """The frame of a number.
-
-        Raises:
-            DatasetError: if there is none.
-        """
+        """The frame of a number."""
         if index not in self._frames:
             raise DatasetError(f"the dataset has no frame {index}")
         return self._frames[index]
@@ -136,11 +114,7 @@ class Workspace:
         )
 
     def write(self) -> list[Path]:
-        """Write the reference and the table of pairs.
-
-        Raises:
-            CalibrationError: if the pairs determine no camera.
-        """
+        """Write the reference and the table of pairs."""
         return write_reference(self.folder, self.estimate(), self._session.pairs)
 
     def _load_cloud(self, index: int) -> NDArray[np.float32]:

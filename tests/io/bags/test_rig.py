@@ -151,8 +151,8 @@ def test_lenses_are_named_as_in_ros(kind: str) -> None:
 
     def content(model: str, *values: float) -> tuple[Any, Any]:
         info = make.camera_info(camera, "eye", distortion_model=model, D=np.array(values))
-        lens = lens_of(info, "here", rectified=False)
-        return lens.content["model"], lens.content["distortion"]
+        lens = lens_of(info, "here", rectified=False).lens
+        return lens.model, [*lens.distortion]
 
     assert content("equidistant", 0.1, 0.2, 0.0, 0.0) == ("fisheye", [0.1, 0.2, 0.0, 0.0])
     assert content("plumb_bob", 0.1, 0.2, 0.3, 0.4, 0.5) == ("pinhole", [0.1, 0.2, 0.3, 0.4, 0.5])
@@ -170,19 +170,20 @@ def test_a_window_and_binning_move_the_intrinsics() -> None:
         do_rectify=False,
     )  # fmt: skip
     info = MAKE.camera_info(camera, "eye", roi=roi, binning_x=2, binning_y=2)
-    found = lens_of(info, "here", rectified=False).content
-    assert (found["width_px"], found["height_px"]) == (400, 150)
-    assert found["intrinsics_px"] == {"fx": 359.0, "fy": 355.0, "cx": 253.5, "cy": 82.5}
+    found = lens_of(info, "here", rectified=False).lens
+    assert found.size_px == (400, 150)
+    assert found.intrinsics_px.model_dump() == {"fx": 359.0, "fy": 355.0, "cx": 253.5, "cy": 82.5}
 
 
 def test_rectified_images_have_the_rectified_matrix_and_axes() -> None:
     R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     P = np.array([700.0, 0, 600, -70, 0, 700, 180, 0, 0, 0, 1, 0])
     info = MAKE.camera_info(make_camera(distortion=(0.1, 0.2, 0, 0)), "eye", R=R.ravel(), P=P)
-    lens = lens_of(info, "here", rectified=True)
-    assert lens.content["intrinsics_px"] == {"fx": 700.0, "fy": 700.0, "cx": 600.0, "cy": 180.0}
-    assert lens.content["distortion"] == []
-    np.testing.assert_array_equal(lens.R_image_frame, R)
+    stated = lens_of(info, "here", rectified=True)
+    found = stated.lens.intrinsics_px.model_dump()
+    assert found == {"fx": 700.0, "fy": 700.0, "cx": 600.0, "cy": 180.0}
+    assert stated.lens.distortion == ()
+    np.testing.assert_array_equal(stated.R_image_frame, R)
 
 
 def test_a_message_of_a_pairs_second_camera_counts_its_baseline_on_request() -> None:

@@ -33,7 +33,7 @@ from calibgraph.matching.cmrnext.training.validation import (
     pose_error,
     summarize_poses,
 )
-from calibgraph.outputs import Output, has_yaml_mark, require_free
+from calibgraph.outputs import Output, marked_yaml, require_writable
 
 SETTINGS_SUFFIX = ".settings.yaml"
 """Of the file beside a checkpoint with the settings of its training."""
@@ -144,7 +144,7 @@ def start_run(
     if out.suffix.lower() not in TORCH_SUFFIXES:
         raise FileError(out, f"the weights' name must end in one of {', '.join(TORCH_SUFFIXES)}")
     beside = out.with_suffix(SETTINGS_SUFFIX)
-    require_free([Output(out, "train"), Output(beside, "train", has_yaml_mark("train"))])
+    require_writable([Output(out, "train"), marked_yaml(beside, "train")])
     if start is None:
         run = TrainingRun(settings, device)
     else:

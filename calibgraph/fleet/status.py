@@ -1,7 +1,5 @@
 """PASS, WARN, FAIL or no result: where each camera of each vehicle stands."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +17,7 @@ _PASS, _WARN, _FAIL, _NO_RESULT = range(4)
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class FleetStatus:
     """One entry per row of the fleet.
 
     Attributes:
@@ -34,14 +32,8 @@ class Standing:
     reasons: list[str]
 
 
-def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> Standing:
-    """Where every row stands.
-
-    Args:
-        rows: one per vehicle and camera, from which the model was fitted.
-        fleet: its model.
-        before: earlier rows, if there are any.
-    """
+def assess_status(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> FleetStatus:
+    """Where every row stands."""
     changed = np.zeros(len(rows), dtype=np.bool_)
     if before is not None and len(before):
         changed = changed_poses(fleet.observations, observe(before))
@@ -53,7 +45,7 @@ def stand(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = None) -> 
     state[fleet.apart | (done & (verdict == "FAIL"))] = _FAIL
     turned = set(moved_lidars(fleet))
     lidar = np.isin(fleet.observations.vehicle, list(turned)) if turned else changed & False
-    return Standing(state, changed, _reasons(rows, fleet, changed, lidar))
+    return FleetStatus(state, changed, _reasons(rows, fleet, changed, lidar))
 
 
 def changed_poses(now: Observations, before: Observations) -> NDArray[np.bool_]:

@@ -1,7 +1,5 @@
 """The files of a fleet's model: shrunk estimates, nominal poses with spreads, priors as rigs."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
@@ -18,38 +16,29 @@ from calibgraph.fleet.fit import Mount, Pooled
 from calibgraph.fleet.model import FleetModel, ModelFit
 from calibgraph.fleet.prior import expected_pose, prior_rig
 from calibgraph.model.rig import Rig
-from calibgraph.outputs import Output, has_yaml_mark, starts_with, yaml_mark
+from calibgraph.outputs import Output, marked_yaml, yaml_mark
 
 ESTIMATES_FILE, MODEL_FILE = "estimates.parquet", "fleet_model.json"
 FORMAT = "calibgraph-fleet-model/1"
 COMMAND = "fleet-model"
-_MARK = f'{{\n "format": "{FORMAT}"'
+_MARK = f'{{\n "format": "{FORMAT}"'.encode()
 
 
-def outputs_of_knowledge(folder: Path) -> list[Output]:
+def outputs_of_fleet_model(folder: Path) -> list[Output]:
     """The files in a folder; its priors are those there."""
-    of_model = starts_with(_MARK.encode())(folder / MODEL_FILE)
+    model = folder / MODEL_FILE
     return [
-        Output(folder / MODEL_FILE, COMMAND, starts_with(_MARK.encode())),
-        Output(folder / ESTIMATES_FILE, COMMAND, lambda _: of_model),
-        *(Output(path, COMMAND, has_yaml_mark(COMMAND)) for path in folder.glob("prior_*.yaml")),
+        Output(model, COMMAND, (_MARK,)),
+        Output(folder / ESTIMATES_FILE, COMMAND, (_MARK,), marked=model),
+        *(marked_yaml(path, COMMAND) for path in folder.glob("prior_*.yaml")),
     ]
 
 
-def write_knowledge(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
+def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
     """Write what a fleet knows.
 
-    Args:
-        fleet: its model.
-        folder: for ``estimates.parquet`` (a row per vehicle and camera), ``fleet_model.json`` and,
-            per model of vehicle with a rig, ``prior_MODEL.yaml`` and one for each batch.
-        rigs: per model of vehicle, any of its rigs, for the lenses.
-
-    Returns:
-        The files.
-
     Raises:
-        RigError: if a rig has a camera of which the fleet knows nothing.
+        RigError: if a rig has a camera that the fleet has not measured.
         FileError: if a file cannot be written.
     """
     priors = {

@@ -1,14 +1,12 @@
 """Waiting, in the event loop, for what threads do to a job."""
 
-from __future__ import annotations
-
 import asyncio
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 
-class Bell:
+class JobEvents:
     """Wakes the requests that wait for a job, from any thread; a request is a task of the loop."""
 
     def __init__(self) -> None:
@@ -19,48 +17,39 @@ class Bell:
         """Begin, in the event loop."""
         self._loop = asyncio.get_running_loop()
 
-    def ring(self, id: str) -> None:
-        """Wake those who wait for an id, from any thread."""
+    def notify(self, id: str | None = None) -> None:
+        """Wake those who wait for an id, or all, from any thread or a handler of signals."""
         loop = self._loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._set, id)
 
-    def ring_all(self) -> None:
-        """Wake all, from any thread or a handler of signals."""
-        loop = self._loop
-        if loop is not None and not loop.is_closed():
-            loop.call_soon_threadsafe(self._set_all)
-
     @contextmanager
     def listen(self, *ids: str) -> Iterator[asyncio.Event]:
-        """An event that is set whenever something happens to one of these."""
-        heard = asyncio.Event()
+        """An event that is set whenever one of these jobs changes."""
+        changed = asyncio.Event()
         for id in ids:
-            self._waiting[id].add(heard)
+            self._waiting[id].add(changed)
         try:
-            yield heard
+            yield changed
         finally:
             for id in ids:
-                self._waiting[id].discard(heard)
+                self._waiting[id].discard(changed)
                 if not self._waiting[id]:
                     del self._waiting[id]
 
-    def _set_all(self) -> None:
-        for id in list(self._waiting):
-            self._set(id)
-
-    def _set(self, id: str) -> None:
-        for heard in self._waiting.get(id, ()):
-            heard.set()
+    def _set(self, id: str | None) -> None:
+        for waiting in [*self._waiting] if id is None else [id]:
+            for changed in self._waiting.get(waiting, ()):
+                changed.set()
 
 
 def progress_of(id: str) -> str:
-    """What is rung when a job gets on, apart from its changes of state."""
+    """The id under which progress of a job is notified; its changes of state have its own id."""
     return f"{id} progress"
 
 
-async def wait_for(heard: asyncio.Event, seconds: float) -> None:
+async def wait_for(changed: asyncio.Event, seconds: float) -> None:
     """Wait until an event is set, not longer than these seconds; then clear it."""
     with suppress(TimeoutError):
-        await asyncio.wait_for(heard.wait(), seconds)
-    heard.clear()
+        await asyncio.wait_for(changed.wait(), seconds)
+    changed.clear()

@@ -1,7 +1,5 @@
 """A rig in words: where each camera looks and sits, for people to check."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,25 +1,44 @@
-"""A comparison of results as tables for a terminal, in degrees and centimetres."""
+"""An audit, and a comparison of results, as tables for a terminal, in degrees and centimetres."""
 
-from __future__ import annotations
+from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from calibgraph.audit import Drift
+from calibgraph.audit import Audit, Drift
 from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
 from calibgraph.cli.terminal import print_plain
 
-_COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "CHANGED": "red"}
-_QUESTION = "drift: does one of the results deviate from the others?"
+_SAME = "; this recording made it, and errors that it repeats are not seen: check another one"
+_COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red", "CHANGED": "red"}
 _LETTERS = 13  # of a result's name in a table; reasons have all of it
+
+
+def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
+    """Print the status with its reasons, the deviations per axis, and what was written."""
+    same = _SAME if audit.same_recording else ""
+    _print_status(console, audit.status, f"check: is the deployed calibration still right?{same}")
+    if audit.lidar is not None:
+        print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
+    for name, camera in audit.cameras.items():
+        print_plain(console, f"  {camera.status} {name}: {camera.reason}")
+    console.print(audit_table(audit))
+    console.print(
+        "deviation: motion of the camera from where it is deployed, about and along its own axes; "
+        "sigma: its standard deviation; detectable: the smallest change that is told from none, "
+        "with 90 % probability at 95 % confidence; changed intrinsics, and distances in the clouds "
+        "that are all too long or too short, look like a motion"
+    )
+    time = f"{sum(audit.timings_s.values()):.1f} s"
+    written = "nothing was written" if page is None else f"{page}: written"
+    print_plain(console, f"{_tolerance(audit)}; {audit.frames} frames; {time}; {written}")
 
 
 def print_drift(console: Console, drift: Drift) -> None:
     """Print the status with its reasons, the deviations and what would have been detected."""
-    status = f"[bold {_COLOURS[drift.status]}]{drift.status}[/]"
-    console.print(f"{status}  {_QUESTION}", highlight=False, soft_wrap=True)
+    _print_status(console, drift.status, "drift: does one of the results deviate from the others?")
     for line in _reasons(drift):
         print_plain(console, f"  {line}")
     console.print(_deviation_table(drift))
@@ -29,9 +48,35 @@ def print_drift(console: Console, drift: Drift) -> None:
         "its own axes; detectable: what would have been seen with 90 % probability. Errors that "
         "all results share cancel, but are part of the sigmas: the test is conservative"
     )
-    text = f"tolerance {drift.tolerance_deg:g} deg, {drift.tolerance_cm:g} cm per axis"
     rate = f"{drift.false_alarm_rate:.0%}"
-    print_plain(console, f"{text}; false alarms of at most {rate} per call")
+    print_plain(console, f"{_tolerance(drift)}; false alarms of at most {rate} per call")
+
+
+def _print_status(console: Console, status: str, question: str) -> None:
+    console.print(
+        f"[bold {_COLOURS[status]}]{status}[/]  {question}", highlight=False, soft_wrap=True
+    )
+
+
+def _tolerance(of: Audit | Drift) -> str:
+    return f"tolerance {of.tolerance_deg:g} deg, {of.tolerance_cm:g} cm per axis"
+
+
+def _axes_table(title: str, *names: str) -> Table:
+    """An empty table with a number per axis of a camera behind its names."""
+    table = empty_table(title, *names)
+    add_number_columns(table, *CAMERA_AXES_COLUMNS)
+    return table
+
+
+def audit_table(audit: Audit) -> Table:
+    """Three rows per camera: deviation, sigma, smallest detectable change."""
+    table = _axes_table("Deviation from the deployed calibration", "camera", "")
+    for name, camera in audit.cameras.items():
+        table.add_row(escape(name), "deviation", *twist_cells(camera.deviation, "+z.2f"))
+        table.add_row("", "sigma", *twist_cells(camera.sigma, ".2f"))
+        table.add_row("", "detectable", *twist_cells(camera.detectable, ".2f"))
+    return table
 
 
 def _reasons(drift: Drift) -> list[str]:
@@ -53,8 +98,7 @@ def _reasons(drift: Drift) -> list[str]:
 
 def _deviation_table(drift: Drift) -> Table:
     """A row per camera and result, and one for the trend."""
-    table = empty_table("Deviation from the other results", "camera", "result", "")
-    add_number_columns(table, *CAMERA_AXES_COLUMNS)
+    table = _axes_table("Deviation from the other results", "camera", "result", "")
     for name, entries in drift.cameras.items():
         for row, (result, each) in enumerate(zip(drift.results, entries, strict=True)):
             status = f"[{_COLOURS[each.status]}]{each.status}[/]"
@@ -69,8 +113,7 @@ def _deviation_table(drift: Drift) -> Table:
 
 def _detectable_table(drift: Drift) -> Table:
     """A row per camera and result."""
-    table = empty_table("Smallest detectable change", "camera", "result")
-    add_number_columns(table, *CAMERA_AXES_COLUMNS)
+    table = _axes_table("Smallest detectable change", "camera", "result")
     for name, entries in drift.cameras.items():
         for row, (result, each) in enumerate(zip(drift.results, entries, strict=True)):
             cells = twist_cells(each.detectable, ".2f")

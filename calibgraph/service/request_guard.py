@@ -1,7 +1,5 @@
 """What every request passes: the host it names, the page it comes from; strict headers back."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from urllib.parse import urlsplit
@@ -32,16 +30,11 @@ Observe = Callable[[str, str, int, float], None]
 """Called with the method, the route, the status and the seconds of each request."""
 
 
-class Shield:
+class RequestGuard:
     """Checks requests before any route, and adds headers to all answers.
 
     A page of another site that a browser shows could otherwise call a server without tokens: its
     name is then not one of ours, or its ``Origin`` is another one.
-
-    Args:
-        app: that answers.
-        hosts: names by which the server may be called; any if empty.
-        observe: see :data:`Observe`.
     """
 
     def __init__(self, app: ASGIApp, hosts: tuple[str, ...], observe: Observe) -> None:
