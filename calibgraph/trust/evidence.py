@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
-from calibgraph.model.error_sources import COMMON, PAIRS, PLACES, TIMES, ErrorSources
+from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference, relative_transform
 from calibgraph.model.rig import Rig
@@ -36,6 +36,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
+from calibgraph.trust.pose_posterior import measure_posteriors, widen
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -67,10 +68,13 @@ class Evidence:
     Attributes:
         solution: of the joint solve.
         guess: the rig as it was first guessed.
+        posteriors: per camera, (6, 6) second moments of its pose by the images' evidence; empty
+            where nothing but correspondences is known.
     """
 
     solution: Solution
     guess: Rig
+    posteriors: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -137,10 +141,19 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich.
+        """(6 N, 6 N): of the matches, widened where the images' evidence is flat.
 
         Cameras that are held are unknown by a radian and a metre.
         """
+        if self.covariance_of_matches is None:
+            return None
+        free = [name for name in self.posteriors if name not in self.solution.held]
+        posteriors = {self.cameras.index(name): self.posteriors[name] for name in free}
+        return widen(self.covariance_of_matches, posteriors)
+
+    @cached_property
+    def covariance_of_matches(self) -> Array | None:
+        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
         solution = self.solution
         if solution.config.preset == "auto":
             return None if self.errors is None else self.errors.fit.covariance
@@ -154,15 +167,18 @@ class Evidence:
     @cached_property
     def error_sources(self) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources."""
-        if self.joint_covariance is None:
+        if self.covariance_of_matches is None or self.joint_covariance is None:
             return {}
-        total, held = np.diag(self.joint_covariance), self.solution.held
+        total, held = np.diag(self.covariance_of_matches), self.solution.held
         if self.errors is None:
             parts = self._sandwich_parts
             fixed = parts[COMMON] + parts[PAIRS]
             forecast = {times: fixed + (total - fixed) / times for times in TIMES}
         else:
             parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
+        flat = np.diag(self.joint_covariance) - total
+        forecast = {times: variance + flat / times for times, variance in forecast.items()}
+        total, parts = total + flat, {**parts, FLAT: flat}
         return {
             name: sources_of_error(total, parts, forecast, number)
             for number, name in enumerate(self.cameras)
@@ -399,7 +415,16 @@ class RunEvidence:
     @cached_property
     def solution(self) -> Evidence:
         """Of the solution of the last round."""
-        return Evidence(self.run.solution, self.run.guess)
+        return Evidence(self.run.solution, self.run.guess, self._posteriors)
+
+    @property
+    def _posteriors(self) -> Mapping[str, Array]:
+        """By the images; empty with matchers that may use what these scores do not."""
+        run = self.run
+        if run.out_of_time or not run.matcher.fails_on_images:
+            return {}
+        solution = run.solution
+        return measure_posteriors(run.dataset, solution.solved_rig, seed=solution.config.seed)
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:
