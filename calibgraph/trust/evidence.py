@@ -377,22 +377,25 @@ class Evidence:
         return pose_difference(joint, own)
 
     def estimate(self, camera: str) -> Estimate:
-        """What the checks of one camera's estimate need."""
+        """What the checks of one camera's estimate need.
+
+        Of the matches alone: where the images are flat, the error bar says so, and no check fails.
+        """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
-        sigmas = self.data_sigmas
+        sigmas, held = self.data_sigmas, camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
-            covariance=self.covariance_of(camera),
+            covariance=None if held else self._block(self.covariance_of_matches, camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
             conflicts=tuple(c for c in self.conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
-            held=camera in solution.held,
+            held=held,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
         )

@@ -15,7 +15,9 @@ from calibgraph import Dataset, Rig
 from calibgraph.audit.judgement import Tolerance, judge_camera
 from calibgraph.model.error_sources import FLAT
 from calibgraph.model.perturbation import perturb
+from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.pose_posterior import REACH, measure_posteriors, widen
 from tests.conftest import SAMPLE
@@ -117,3 +119,13 @@ def test_a_deployed_pose_is_not_wrong_where_the_images_allow_it(pair: Rig) -> No
     plain, flat = Evidence(solution, deployed), Evidence(solution, deployed, {"left": WIDE})
     assert judge_camera(plain, "left", "", tolerance).status == "WRONG"
     assert judge_camera(flat, "left", "", tolerance).status == "CANNOT TELL"
+
+
+def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    evidence = Evidence(solution, pair, {name: 4 * WIDE for name in pair.cameras})
+    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    assert found.doubt is not None
+    assert found.doubt.by_error_bar > 0.9
+    assert found.doubt.by_checks < 0.01
+    assert found.status == "WARN" and found.cannot_tell
