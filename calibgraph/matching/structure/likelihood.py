@@ -26,7 +26,7 @@ prefer some a degree off where fine ones are flat, as on grass slopes."""
 CHANCE_VARIANCE = 3.0
 """Variance of the summed score over that of independent windows: what windows of a frame and frames
 of a place share. With it the errors of a KITTI rig, of a car with six cameras and of a 16-beam
-LiDAR are likeliest under the error bars that it leads to; without any one of them it is 3, too."""
+LiDAR are likeliest under the error bars that it leads to; without any one of them it is 3 or 4."""
 
 
 def log_likelihood(scores: ShiftScores) -> Callable[[Array], Array]:
