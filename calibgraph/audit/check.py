@@ -115,7 +115,7 @@ def _judge(
     run: MatchingRun, tolerance: Tolerance, progress: Progress
 ) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
     """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
-    evidence = Evidence(run.solution, run.guess)
+    evidence = RunEvidence(run, {}).solution
     doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras

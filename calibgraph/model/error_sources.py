@@ -16,6 +16,7 @@ STRETCH = "LiDAR's elevation scale"
 MOTION = "LiDAR's motion during a scan"
 PAIRS = "images of camera pairs"
 PRIORS = "priors and relative poses"
+FLAT = "flat evidence of the images"
 
 NEEDED = 0.3
 """Error bar over tolerance at which 99.5 % of the errors are within, as a PASS needs."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
-from calibgraph.model.error_sources import COMMON, PAIRS, PLACES, TIMES, ErrorSources
+from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference, relative_transform
 from calibgraph.model.rig import Rig
@@ -36,6 +36,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
+from calibgraph.trust.pose_posterior import measure_posteriors, widen
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -62,10 +63,18 @@ class DataOnly:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A solution, the first guess, and the values that checks compute from them."""
+    """A solution, the first guess, and the values that checks compute from them.
+
+    Attributes:
+        solution: of the joint solve.
+        guess: the rig as it was first guessed.
+        posteriors: per camera, (6, 6) second moments of its pose by the images' evidence; empty
+            where nothing but correspondences is known.
+    """
 
     solution: Solution
     guess: Rig
+    posteriors: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -132,10 +141,19 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich.
+        """(6 N, 6 N): of the matches, widened where the images' evidence is flat.
 
         Cameras that are held are unknown by a radian and a metre.
         """
+        if self.covariance_of_matches is None:
+            return None
+        free = [name for name in self.posteriors if name not in self.solution.held]
+        posteriors = {self.cameras.index(name): self.posteriors[name] for name in free}
+        return widen(self.covariance_of_matches, posteriors)
+
+    @cached_property
+    def covariance_of_matches(self) -> Array | None:
+        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
         solution = self.solution
         if solution.config.preset == "auto":
             return None if self.errors is None else self.errors.fit.covariance
@@ -149,15 +167,18 @@ class Evidence:
     @cached_property
     def error_sources(self) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources."""
-        if self.joint_covariance is None:
+        if self.covariance_of_matches is None or self.joint_covariance is None:
             return {}
-        total, held = np.diag(self.joint_covariance), self.solution.held
+        total, held = np.diag(self.covariance_of_matches), self.solution.held
         if self.errors is None:
             parts = self._sandwich_parts
             fixed = parts[COMMON] + parts[PAIRS]
             forecast = {times: fixed + (total - fixed) / times for times in TIMES}
         else:
             parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
+        flat = np.diag(self.joint_covariance) - total
+        forecast = {times: variance + flat / times for times, variance in forecast.items()}
+        total, parts = total + flat, {**parts, FLAT: flat}
         return {
             name: sources_of_error(total, parts, forecast, number)
             for number, name in enumerate(self.cameras)
@@ -358,22 +379,25 @@ class Evidence:
         return pose_difference(joint, own)
 
     def estimate(self, camera: str) -> Estimate:
-        """The input of the checks of one camera's estimate."""
+        """The input of the checks of one camera's estimate.
+
+        Of the matches alone: where the images are flat, the error bar says so, and no check fails.
+        """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
-        sigmas = self.data_sigmas
+        sigmas, held = self.data_sigmas, camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
-            covariance=self.covariance_of(camera),
+            covariance=None if held else self._block(self.covariance_of_matches, camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
             conflicts=tuple(c for c in self.conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
-            held=camera in solution.held,
+            held=held,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
         )
@@ -390,7 +414,16 @@ class RunEvidence:
     @cached_property
     def solution(self) -> Evidence:
         """The evidence of the last round's solution."""
-        return Evidence(self.run.solution, self.run.guess)
+        return Evidence(self.run.solution, self.run.guess, self._posteriors)
+
+    @property
+    def _posteriors(self) -> Mapping[str, Array]:
+        """By the images; empty with matchers that may use what these scores do not."""
+        run = self.run
+        if run.out_of_time or not run.matcher.image_checks_can_fail:
+            return {}
+        solution = run.solution
+        return measure_posteriors(run.dataset, solution.solved_rig, seed=solution.config.seed)
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:

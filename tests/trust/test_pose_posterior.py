@@ -1,0 +1,131 @@
+"""How wide the images' evidence is, and the error bar that it leads to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import calibgraph
+from calibgraph import Dataset, Rig
+from calibgraph.audit.judgement import Tolerance, judge_camera
+from calibgraph.model.error_sources import FLAT
+from calibgraph.model.perturbation import perturb
+from calibgraph.pipeline import to_calibration
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import assess
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.pose_posterior import REACH, measure_posteriors, widen
+from tests.conftest import SAMPLE
+from tests.trust.conftest import simulated
+
+Array = NDArray[np.float64]
+NAME = "front_left"
+WIDE = np.diag((REACH / 2) ** 2)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    """One camera of the sample at its true pose."""
+    whole = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    return Rig(cameras={NAME: whole.cameras[NAME]})
+
+
+@pytest.fixture(scope="module")
+def dataset(truth: Rig) -> Dataset:
+    return calibgraph.load_dataset(SAMPLE, truth)
+
+
+def with_images_of(dataset: Dataset, folder: Path) -> Dataset:
+    """Images without any structure, but for noise."""
+    rng, frames = np.random.default_rng(0), []
+    for frame in dataset.frames[:2]:
+        path = folder / f"{frame.name}.png"
+        shape = (dataset.rig.cameras[NAME].height_px, dataset.rig.cameras[NAME].width_px)
+        cv2.imwrite(str(path), rng.normal(120, 20, shape).clip(0, 255).astype(np.uint8))
+        frames.append(replace(frame, image_paths={NAME: path}))
+    return replace(dataset, frames=tuple(frames))
+
+
+def random_covariance(size: int, seed: int) -> Array:
+    root = np.random.default_rng(seed).standard_normal((size, 2 * size))
+    return np.asarray(root @ root.T)
+
+
+def test_images_with_structure_tell_the_pose_to_a_tenth_of_a_degree(
+    dataset: Dataset, truth: Rig
+) -> None:
+    sigmas = np.sqrt(np.diag(measure_posteriors(dataset, truth)[NAME]))
+    assert np.degrees(sigmas[:3].max()) < 0.1
+    assert 100 * sigmas[3:].max() < 4
+
+
+def test_images_that_show_nothing_leave_all_poses_open(
+    dataset: Dataset, truth: Rig, tmp_path: Path
+) -> None:
+    found = measure_posteriors(with_images_of(dataset, tmp_path), truth)[NAME]
+    assert (np.sqrt(np.diag(found)) > 0.5 * REACH).all()
+
+
+def test_about_a_wrong_result_it_reaches_as_far_as_the_truth(dataset: Dataset, truth: Rig) -> None:
+    wrong = perturb(truth, rotation_deg=0.8, translation_m=0.1, seed=3)
+    turned = np.degrees(np.sqrt(np.trace(measure_posteriors(dataset, wrong)[NAME][:3, :3])))
+    assert turned > 0.5
+
+
+def test_a_narrower_posterior_leaves_the_covariance_as_it_is() -> None:
+    joint = random_covariance(12, seed=0)
+    found = widen(joint, {0: joint[:6, :6] / 2, 1: joint[6:, 6:] / 3})
+    np.testing.assert_allclose(found, joint, rtol=1e-9)
+
+
+def test_no_direction_is_narrower_than_by_the_matches_or_by_the_images() -> None:
+    joint, moments = random_covariance(12, seed=0), 2 * random_covariance(6, seed=1)
+    found = widen(joint, {1: moments})
+    for least in (joint[6:, 6:], moments):
+        assert np.linalg.eigvalsh(found[6:, 6:] - least).min() > -1e-9
+    np.testing.assert_allclose(found[:6, :6], joint[:6, :6])
+
+
+def test_the_relative_pose_of_tied_cameras_stays_known_where_both_are_widened_alike() -> None:
+    own, between = np.eye(6), 1e-4 * np.eye(6)
+    joint = np.block([[own, own], [own, own + between]])
+    found = widen(joint, {0: 9 * own, 1: 9 * own})
+    relative = found[:6, :6] + found[6:, 6:] - 2 * found[:6, 6:]
+    assert found[0, 0] == pytest.approx(9)
+    assert np.diag(relative).max() < 2 * 9e-4
+
+
+def test_flat_evidence_widens_the_error_bar_and_is_named_as_its_source(pair: Rig) -> None:
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    plain, flat = Evidence(solution, pair), Evidence(solution, pair, {"left": WIDE})
+    narrow, wide = (np.sqrt(np.diag(each.covariance_of("left"))) for each in (plain, flat))
+    assert (wide > 3 * narrow).all()
+    sources = flat.error_sources["left"]
+    assert sources.rotation[FLAT] > 0.8
+    assert sum(sources.rotation.values()) == pytest.approx(1.0)
+    assert "flat evidence of the images" in sources.describe((0.5, 10.0))
+    assert FLAT not in plain.error_sources["left"].rotation
+
+
+def test_a_deployed_pose_is_not_wrong_where_the_images_allow_it(pair: Rig) -> None:
+    deployed = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1)
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    tolerance = Tolerance(0.5, 10.0)
+    plain, flat = Evidence(solution, deployed), Evidence(solution, deployed, {"left": WIDE})
+    assert judge_camera(plain, "left", "", tolerance).status == "WRONG"
+    assert judge_camera(flat, "left", "", tolerance).status == "CANNOT TELL"
+
+
+def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    evidence = Evidence(solution, pair, {name: 4 * WIDE for name in pair.cameras})
+    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    assert found.doubt is not None
+    assert found.doubt.by_error_bar > 0.9
+    assert found.doubt.by_checks < 0.01
+    assert found.status == "WARN" and found.cannot_tell
