@@ -12,9 +12,9 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.quantiles import median
 from calibgraph.tracking.halves import Halves
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, joint_estimate
-from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.trust.estimate import Estimate

@@ -15,6 +15,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.component_sizes import Sizes
+from calibgraph.solver.quantiles import median
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
@@ -23,7 +24,6 @@ from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
     inflation,
-    median,
     no_groups,
     widening,
 )
