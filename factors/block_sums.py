@@ -34,7 +34,8 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
     eigenvectors, and directions without information get a zero row.
     """
-    return conditioning.square_root(sums.hessian, sums.gradient, float(sums.cost))
+    hessian, gradient = np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient)
+    return conditioning.square_root(hessian, gradient, float(sums.cost))
 
 
 _PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]

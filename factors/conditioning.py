@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -48,24 +52,44 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
 def square_root(hessian: Array, gradient: Array, cost: float) -> tuple[Array, Array]:
     """(n + 1,) error and (n + 1, n) Jacobian of sums, see ``block_sums.square_root``."""
     n = len(gradient)
-    scaled, units = unit_diagonal(hessian)
-    along = gradient / units
-    jacobian, error = np.zeros((n + 1, n)), np.zeros(n + 1)
-    bordered = np.empty((n + 1, n + 1))
-    bordered[:n, :n], bordered[n, :n], bordered[:n, n] = scaled, along, along
-    bordered[n, n] = 2 * cost + np.finfo(np.float64).tiny  # more than the root of the rest needs
-    try:
-        root = np.linalg.cholesky(bordered)
-        regular = np.diag(root)[:n].min() ** 2 > _REGULAR
-    except np.linalg.LinAlgError:
-        regular = False
-    if regular:
-        jacobian[:n], error[:n] = root[:n, :n].T, root[n, :n]
-    else:
-        values, vectors = np.linalg.eigh(scaled)
-        seen = values > _SEEN * max(values[-1], 0.0)
-        roots = np.sqrt(values[seen])
-        jacobian[:n][seen] = roots[:, None] * vectors.T[seen]
-        error[:n][seen] = vectors.T[seen] @ along / roots
-    error[n] = np.sqrt(max(cost - error @ error, 0.0))
-    return error, jacobian * units
+    error, jacobian, units = np.zeros(n + 1), np.zeros((n, n + 1)), np.ones(n)
+    if not _fill_triangular_root(hessian, gradient, units, jacobian, error):
+        jacobian[:], error[:] = 0.0, 0.0
+        values, vectors = np.linalg.eigh(unit_diagonal(hessian)[0])
+        seen = np.flatnonzero(values > _SEEN * max(values[-1], 0.0))
+        roots, vectors = np.sqrt(values[seen]), vectors[:, seen]
+        jacobian[:, seen] = roots * vectors
+        error[seen] = (gradient / units) @ vectors / roots
+    error[n] = math.sqrt(max(cost - float(error @ error), 0.0))
+    return error, (units[:, None] * jacobian).T
+
+
+@compiled()
+def _fill_triangular_root(hessian, gradient, units, jacobian, error):  # type: ignore[no-untyped-def]
+    """Fill in Cholesky's root of a regular matrix, and the error; whether it is regular.
+
+    Args:
+        hessian: (n, n).
+        gradient: (n,).
+        units: (n,), filled: of a unit diagonal.
+        jacobian: (n, n + 1), filled below the diagonal, in these units.
+        error: (n + 1,), all but the last filled.
+    """
+    for i in range(len(gradient)):
+        if hessian[i, i] > 0.0:
+            units[i] = math.sqrt(hessian[i, i])
+    for i in range(len(gradient)):
+        error[i] = gradient[i] / units[i]
+        for j in range(i + 1):
+            rest = hessian[i, j] / (units[i] * units[j])
+            for m in range(j):
+                rest -= jacobian[i, m] * jacobian[j, m]
+            if j < i:
+                jacobian[i, j] = rest / jacobian[j, j]
+                error[i] -= jacobian[i, j] * error[j]
+            elif rest > _REGULAR:
+                jacobian[i, i] = math.sqrt(rest)
+                error[i] /= jacobian[i, i]
+            else:
+                return False
+    return True

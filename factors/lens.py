@@ -143,13 +143,13 @@ class Lens:
             inside the injective domain of the lens). It may still lie outside the image.
         """
         points = np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
-        return self.project_with_jacobian(points)[0], self._sees(points)
+        return self.project_with_jacobian(points)[0], self.sees(points)
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
-        return self._sees(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
+        return self.sees(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
 
-    def _sees(self, points_camera_m: Array) -> NDArray[np.bool_]:
+    def sees(self, points_camera_m: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points of the camera frame lie inside the injective domain."""
         x, y, z = points_camera_m.T
         if self.kind == EQUIRECTANGULAR:
