@@ -5,8 +5,8 @@ cache folder, else beside the source. Where nothing can be written, kernels are 
 and one line on standard error (by ``logging``) reports it once.
 
 numba compares the source file of a kernel alone, and no options. So the code lies in a folder of
-its own for each version of the files in ``factors`` and each choice of options. Kernels elsewhere
-use kernels and constants of their own file and of ``factors`` alone; a test holds them to it.
+its own for each version of the files with kernels, beside the kernel's and in ``factors``, and each
+choice of options. Kernels use kernels and constants of these alone; a test holds them to it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         folder = _folder()
-        with _kept_in(folder / _fingerprint(options) if folder else None):
+        sources = Path(function.__code__.co_filename).parent
+        with _kept_in(folder / _fingerprint(sources, options) if folder else None):
             kept = folder is not None
             return numba.njit(nogil=True, error_model="numpy", cache=kept, **options)(function)
 
@@ -78,19 +79,21 @@ def _kept_in(folder: Path | None) -> Iterator[None]:
         numba.config.CACHE_DIR = before
 
 
-def _fingerprint(options: dict[str, Any]) -> str:
-    """The name of the folder for kernels with these options."""
+def _fingerprint(sources: Path, options: dict[str, Any]) -> str:
+    """The name of the folder for kernels with these options, from this folder of sources."""
     ordered = sorted((name, sorted(value) if isinstance(value, set) else value)
                      for name, value in options.items())  # fmt: skip
-    return hashlib.sha256(f"{_sources()} {ordered}".encode()).hexdigest()[:16]
+    return hashlib.sha256(f"{_digest(sources)} {ordered}".encode()).hexdigest()[:16]
 
 
 @cache
-def _sources() -> str:
-    """A digest of the files of this package: kernels anywhere may use theirs."""
+def _digest(sources: Path) -> str:
+    """Of what kernels in a folder may use: the files of this package, and those with kernels."""
     digest = hashlib.sha256()
-    for file in sorted(_HERE.glob("*.py")):
-        digest.update(file.read_bytes())
+    for file in [*sorted(_HERE.glob("*.py")), *sorted(sources.glob("*.py"))]:
+        content = file.read_bytes()
+        if file.parent == _HERE or b"@compiled(" in content:
+            digest.update(content)
     return digest.hexdigest()
 
 
