@@ -71,12 +71,12 @@ def one_at_a_time(kernel: Any) -> Callable[..., Any]:
 @contextmanager
 def _kept_in(folder: Path | None) -> Iterator[None]:
     """Have numba choose this folder for the kernels that are defined meanwhile."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder or before)
+    config: Any = numba.config  # numba reads NUMBA_CACHE_DIR into it
+    before, config.CACHE_DIR = config.CACHE_DIR, str(folder or config.CACHE_DIR)
     try:
         yield
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
 
 
 def _fingerprint(sources: Path, options: dict[str, Any]) -> str:

@@ -38,15 +38,16 @@ def solve_reweighted(
         (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors at the solution. None if
         that matrix is singular.
     """
-    errors = -columns[-1]
+    errors, solution = -columns[-1], np.zeros(len(columns) - 1)
     for _ in range(_MAX_ITERATIONS):
         squares = np.einsum("pn,pn->n", errors, errors)
         scale = loss_scale or _LOSS_MEDIANS * median(squares) ** 0.5 + 1e-12
         weights = 1.0 / (1.0 + squares / scale**2)
         products = weighted_products(columns, weights)
-        solution = _solve(products[:-1, :-1], products[:-1, -1])
-        if solution is None:
+        found = _solve(products[:-1, :-1], products[:-1, -1])
+        if found is None:
             return None
+        solution = found
         before, errors = errors, np.tensordot(solution, columns[:-1], 1) - columns[-1]
         if np.abs(errors - before).max() < _CONVERGED * scale:
             break
