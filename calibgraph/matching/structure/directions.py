@@ -44,7 +44,7 @@ def thin(rays: Array, cell_rad: float) -> Rows:
     """
     if not len(rays):
         return np.empty(0, np.intp)
-    x, y, z = rays.T
+    x, y, z = np.asarray(rays, dtype=np.float64).T
     up = np.arctan2(z, np.hypot(x, y)) / cell_rad
     row = np.floor(up)
     along = (np.arctan2(y, x) + math.pi) * np.cos((row + 0.5) * cell_rad) / cell_rad
