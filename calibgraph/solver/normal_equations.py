@@ -67,9 +67,10 @@ def _solve(normal: Array, right: Array) -> Array | None:
 
 
 def grouped_gradients(
-    columns: Array, errors: Array, weights: Array, group: NDArray[np.int64]
+    columns: Array, errors: Array, weights: Array, group: NDArray[np.intp]
 ) -> Array:
-    """(g, k) sums of weighted columns times (2, n) errors, over the rows of each group, sorted."""
-    terms = np.einsum("kpn,pn->kn", columns, weights * errors)
-    starts = np.flatnonzero(np.diff(group, prepend=-1))
-    return np.asarray(np.add.reduceat(terms, starts, axis=1).T)
+    """(g, k) sums of weighted columns times (2, n) errors, over the rows of each (n,) group."""
+    terms = np.einsum("kpn,pn->nk", columns, weights * errors)
+    sums = np.zeros((group.max() + 1, len(columns)))
+    np.add.at(sums, group, terms)
+    return sums
