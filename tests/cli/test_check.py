@@ -10,7 +10,7 @@ import pytest
 from calibgraph import Audit, CameraAudit, load_rig
 from calibgraph.audit import audit_summary
 from calibgraph.cli import remote
-from tests.audit.test_check import motion, with_camera_moved
+from tests.audit.deployed import motion, with_camera_moved
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
 

@@ -18,7 +18,7 @@ from calibgraph.service.app import create_app
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, make_tokens, service_folder
 from tests.service.hostile import zipped
-from tests.service.test_faults import on_a_port
+from tests.service.ports import on_a_port
 
 MB = 10**6
 ROOM_BYTES = 300 * MB

@@ -25,7 +25,7 @@ from calibgraph.solver.hierarchy_fit import HierarchyFit, bends_of, fit_hierarch
 from calibgraph.solver.hierarchy_poses import Poses, start_poses
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
-from tests.solver.test_camera_pairs import simulated_pairs
+from tests.solver.pairs import simulated_pairs
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 STATED = {
