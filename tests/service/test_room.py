@@ -108,7 +108,7 @@ BOMBS = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("name", [pytest.param("ratio", marks=pytest.mark.slow), "size"])
 def test_a_bomb_is_refused_before_it_is_unpacked_and_leaves_nothing(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

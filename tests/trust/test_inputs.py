@@ -80,6 +80,7 @@ def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_the_command_prints_warnings_once(folder: Path, call: Call, tmp_path: Path) -> None:
     with_principal_point(80, 45).save(folder / "rig.yaml")
     table = calibgraph.simulate_correspondences(RIG, frames=2, matches=200, seed=1)
