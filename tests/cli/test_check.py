@@ -20,7 +20,7 @@ AXES = ("deviation_deg", "deviation_cm", "sigma_deg", "sigma_cm", "detectable_de
 
 def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> None:
     code, out, err = call("check", REFERENCE, SAMPLE, "--json")
-    assert (code, err) == (0, "")
+    assert code == 0, err  # after 5 s, on a busy machine, err has a line of progress
     content = json.loads(out)
     assert set(content) == {
         "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording", "cameras",
