@@ -6,7 +6,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist l
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help install run test test-ci test-slow lint type docs web bench clean
+.PHONY: help install run test coverage test-ci test-slow lint type docs web bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,6 +29,9 @@ run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
 
 test: $(VENV)/test ## Run the tests
 	$(PYTEST)
+
+coverage: $(VENV)/test ## Measure the branches of solver, trust and factors that their tests reach
+	$(PYTEST) --cov --cov-report term tests/factors tests/solver tests/trust
 
 test-ci: $(VENV)/test ## Run a short choice of the slow tests (about 3 minutes)
 	$(PYTEST) --dist worksteal -m ci

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
 import yaml
 from typer.main import get_command
@@ -18,6 +17,7 @@ from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.config import Config
 from docs.tables import GENERATED, PART, with_generated_parts
 from tests.conftest import ROOT
+from tests.docs_text import resolve, takes
 
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
 NOTES = sorted(ROOT.glob("benchmarks/notes/*.md"))
@@ -103,33 +103,6 @@ def test_commands_and_options_exist(page: Path) -> None:
         for option in (word for word in rest if word.startswith("--")):
             assert option.partition("=")[0] in {*known, *VALUES}, f"{words}: {option}"
         assert takes(command, rest), f"{words}: arguments do not fit"
-
-
-def resolve(words: list[str]) -> tuple[click.Command, list[str]]:
-    """The command that some words call, and the words after it."""
-    command: click.Command = get_command(app)
-    while children := getattr(command, "commands", None):
-        assert words and words[0] in children, f"{words}: no such command"
-        command, words = children[words[0]], words[1:]
-    return command, words
-
-
-def takes(command: click.Command, words: list[str]) -> bool:
-    """Whether the words are as many arguments as the command needs, options and values apart."""
-    wanted = [p for p in command.params if p.param_type_name == "argument" and p.required]
-    with_value = {
-        name
-        for p in command.params
-        for name in p.opts
-        if p.param_type_name == "option" and not getattr(p, "is_flag", False)
-    }
-    given, skip = 0, False
-    for word in words:
-        if skip or word.startswith("--"):
-            skip = word in with_value
-        else:
-            given += 1
-    return given >= len(wanted)
 
 
 def test_every_command_is_shown() -> None:

@@ -19,7 +19,7 @@ from calibgraph.files import read_yaml, write_atomically, write_yaml
 from calibgraph.model.config import load_config
 from calibgraph.yaml_text import parse_yaml, yaml_text
 from tests.conftest import SAMPLE
-from tests.model.test_rig import written
+from tests.model.rig_files import written
 
 
 def test_a_key_given_twice_is_refused(pair: Rig, tmp_path: Path) -> None:

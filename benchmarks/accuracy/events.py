@@ -28,10 +28,10 @@ from benchmarks.accuracy.drives import (
     move_lidar,
     random_step,
 )
-from benchmarks.simulated_drive import simulate_drive
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import IncrementalCalibrator, Rig, perturb
 from calibgraph.model.geometry import twist_between
+from calibgraph.simulation.drive_matches import simulate_drive
 
 
 @dataclass(frozen=True)

@@ -22,34 +22,23 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.uncertainty import (
-    FIFTH,
-    Drawn,
-    calibration,
-    displaced,
-    left_frames,
-    nees_of,
-    parts,
-    stereo,
-    tied,
-    tied_alone,
-)
+from benchmarks.accuracy.uncertainty import calibration, left_frames, nees_of, parts, tied_alone
 from benchmarks.tables import Table, add_record_option, publish
-from calibgraph import Config, Rig, concatenate, simulate_correspondences
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph import Config, Rig, concatenate
+from calibgraph.model.geometry import twist_between
+from calibgraph.simulation.place_draws import (
+    FRAMES,
+    Drawn,
+    draw_places,
+    tied,
+)
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.scan_distortion import distortions_at
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
-from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 
-FRAMES = 3
-SIZES = error_components().matchers["structure"]
 COLUMNS = (
     "case", "error of", "mean NEES / 6", "in the 95 % region", "error [deg]", "[cm]",
     "before [deg]", "[cm]",
@@ -109,65 +98,6 @@ def errors_of(solved: Solution, truth: Rig) -> Iterator[tuple[str, Array]]:
                       for of, e, _ in found})  # fmt: skip
     for of, after in sizes[0].items():
         yield of, np.array([*after, *sizes[1][of]])
-
-
-def draw_places(
-    places: int, matches: int, rng: Rng, *, frames: int = FRAMES, rounds: int = 1
-) -> Drawn:
-    """A table of so many places, that states the errors which were drawn.
-
-    Args:
-        places: how many.
-        matches: of a camera in a frame.
-        rng: draws the errors.
-        frames: of a place in each round.
-        rounds: how often all places are visited, one after the other.
-    """
-    truth, there = stereo(), []
-    findings = MatcherFindings.from_metadata(vars(SIZES))
-    whole = np.repeat(findings.rigid_sigmas, 3)
-    bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
-    at_place = np.repeat([SIZES.place_rotation_rad, SIZES.place_translation_m], 3)
-    cloud = np.sqrt(1 - SIZES.camera_share) * whole * rng.standard_normal(6)
-    cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
-    everywhere = displaced(truth, cloud, cameras)
-    tables, names = [], [list[int]() for _ in range(places)]
-    for visit in range(places * rounds):
-        place = visit % places
-        if visit < places:
-            moved = displaced(everywhere, at_place * rng.standard_normal(6), np.zeros((2, 6)))
-            there.append(displaced(moved, np.zeros(6), draw_cameras(truth, matches, rng)))
-        table = simulate_correspondences(
-            there[place],
-            frames=frames,
-            matches=matches,
-            errors=FIFTH,
-            seed=int(rng.integers(2**31)),
-        )
-        points = table.points_lidar_m
-        bent = points + np.tensordot(bends, distortions_at(points), axes=1)
-        tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
-        names[place] += range(frames * visit, frames * (visit + 1))
-    stated = {name: value for name, value in vars(SIZES).items()}
-    joined = concatenate(tables)
-    metadata = {**joined.metadata, **stated, "places": names}
-    return Drawn(truth, replace(joined, metadata=metadata))
-
-
-def draw_cameras(truth: Rig, matches: int, rng: Rng) -> Array:
-    """(2, 6) displacement of each camera's matches at a place, in the shape of its information."""
-    table = simulate_correspondences(
-        truth, frames=1, matches=matches, errors=FIFTH, seed=int(rng.integers(2**31))
-    )
-    steps = []
-    for name, camera in truth.cameras.items():
-        rows = table.of_camera(name)
-        block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
-        hessian = block.sums(to_T_lidar_camera(camera.T_camera_lidar)).hessian
-        variance = SIZES.place_variance * FIFTH.noise_px**2
-        root = np.linalg.cholesky(variance * np.linalg.inv(hessian))
-        steps.append(root @ rng.standard_normal(6))
-    return np.array(steps)
 
 
 def one_place_off(drawn: Drawn, rng: Rng, *, deg: float, cm: float) -> Drawn:

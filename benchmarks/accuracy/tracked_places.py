@@ -16,12 +16,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.place_draws import Drawn, draw_places, parse_options
+from benchmarks.accuracy.place_draws import parse_options
 from benchmarks.accuracy.uncertainty import calibration
 from benchmarks.tables import Table, publish
 from calibgraph import Config, IncrementalCalibrator
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.simulation.place_draws import Drawn, draw_places
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -29,12 +29,9 @@ from scipy.stats import chi2
 
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import (
-    Camera,
     Config,
     Correspondences,
-    Intrinsics,
     MatcherErrors,
-    RelativePose,
     Rig,
     concatenate,
     simulate_correspondences,
@@ -45,6 +42,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
+from calibgraph.simulation.place_draws import FIFTH, Drawn, displaced, stereo, tied
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
@@ -53,9 +51,7 @@ Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
-FIFTH = MatcherErrors(noise_px=1.6**0.5, frame_noise_px=0.4**0.5, outlier_share=0.15)
 SHARED = np.repeat([np.radians(0.09), 0.02], 3)
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 COLUMNS = ("error of", "covariance", "mean NEES / 6", "in the 95 % region")
@@ -97,17 +93,6 @@ def calibration(nees: Sequence[float]) -> tuple[str, str]:
     """Their mean over 6, and the share in the region that should hold 95 %."""
     inside = np.mean(np.array(nees) < chi2.ppf(0.95, 6))
     return f"{np.mean(nees) / 6:.2f}", f"{inside:.1%}"
-
-
-def stereo() -> Rig:
-    """A pair like KITTI's, half a metre apart."""
-    lens = Intrinsics(fx=718.0, fy=718.0, cx=607.0, cy=185.0)
-    cameras = {}
-    for name, y_m in (("left", 0.1), ("right", -0.44)):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = FORWARD, -FORWARD @ [0.3, y_m, -0.1]
-        cameras[name] = Camera(width_px=1241, height_px=376, intrinsics_px=lens, T_camera_lidar=T)
-    return Rig(cameras=cameras)
 
 
 def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float]]:
@@ -156,19 +141,6 @@ def independent(solved: Solution) -> Array:
     return joint
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What one draw solves.
-
-    Attributes:
-        rig: the true extrinsics; relative poses, if any, as they were measured.
-        table: the correspondences.
-    """
-
-    rig: Rig
-    table: Correspondences
-
-
 Change = Callable[[Drawn, Rng], Drawn]
 
 
@@ -191,17 +163,6 @@ def draw_shared(rng: Rng) -> tuple[Array, Array]:
     return half * rng.standard_normal(6), half * rng.standard_normal((2, 6))
 
 
-def displaced(rig: Rig, cloud: Array, cameras: Array) -> Rig:
-    """The rig with its cloud and its cameras displaced."""
-    T_cloud = gtsam.Pose3.Expmap(cloud).matrix()
-    return rig.moved_to(
-        {
-            name: gtsam.Pose3.Expmap(xi).matrix() @ T @ T_cloud
-            for (name, T), xi in zip(rig.T_camera_lidar.items(), cameras, strict=True)
-        }
-    )
-
-
 def state_shared(table: Correspondences) -> Correspondences:
     """The table of a matcher that states the error that all its frames share."""
     stated = {"systematic_rotation_rad": SHARED[0], "systematic_translation_m": SHARED[3]}
@@ -213,16 +174,6 @@ def left_frames(drawn: Drawn, rng: Rng, *, count: int) -> Drawn:
     table = drawn.table
     of_left = table.camera_index == table.cameras.index("left")
     return replace(drawn, table=table.select(~of_left | (table.frame < count)))
-
-
-def tied(drawn: Drawn, rng: Rng, *, deg: float, cm: float) -> Drawn:
-    """The relative pose of the cameras is measured, with an error of this size."""
-    sigmas = {"rotation_sigma_rad": np.radians(deg), "translation_sigma_m": cm / 100}
-    error = np.repeat([*sigmas.values()], 3) * rng.standard_normal(6)
-    T_left_right = relative_transform(*drawn.rig.T_camera_lidar.values())
-    measured = T_left_right @ gtsam.Pose3.Expmap(error).matrix()
-    pair = RelativePose(a="left", b="right", T_a_b=measured, **sigmas)
-    return replace(drawn, rig=drawn.rig.model_copy(update={"relative_poses": (pair,)}))
 
 
 def tied_alone(drawn: Drawn, rng: Rng, *, deg: float, cm: float) -> Drawn:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
     Calibration,
     Camera,
@@ -21,6 +20,7 @@ from calibgraph import (
     concatenate,
     perturb,
 )
+from calibgraph.simulation.drive_matches import simulate_drive
 
 Rng = np.random.Generator
 

@@ -16,19 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 
-from benchmarks.fleet.tables import write_fleet
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
-
-_WORKERS = (
-    "calibgraph.fleet.child",
-    "ray::run_in_kept_child",
-    "multiprocessing.spawn",
-    "multiprocessing-fork",
-)
+from calibgraph.simulation.fleet_tables import write_fleet
+from tests.fleet.killing import kill_at_random
 
 
 def main() -> None:
@@ -145,33 +138,6 @@ def _kill_workers(
     assert _rows(out) == expected
     failed, again = sum(summary.failures.values()), _count_again(before, _seconds(out))
     return f"workers, {engine}", str(kills[0]), str(failed), str(again), str(len(expected))
-
-
-def kill_at_random(stop: threading.Event, kills: list[int], most: int = 50) -> None:
-    """Kill one of the workers below this process every half second or so."""
-    rng = random.Random(0)
-    while kills[0] < most and not stop.wait(rng.uniform(0.2, 0.8)):
-        below = psutil.Process().children(recursive=True)
-        workers = [each for each in below if _is_worker(each)]
-        if any(map(_is_job, workers)):
-            rng.choice(workers).kill()
-            kills[0] += 1
-
-
-def _is_job(process: psutil.Process) -> bool:
-    """Whether it is a job's process: before the first, a cluster is still starting."""
-    try:
-        return "calibgraph.fleet.child" in process.cmdline()
-    except psutil.Error:
-        return False
-
-
-def _is_worker(process: psutil.Process) -> bool:
-    try:
-        command = " ".join(process.cmdline())
-    except psutil.Error:
-        return False
-    return any(name in command for name in _WORKERS) and "IDLE" not in command
 
 
 def _kill_commands(

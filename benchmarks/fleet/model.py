@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.fleet.vehicles import Fleet, errors_of, simulate_fleet
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph.fleet.findings import Finding, find_changes
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import twists_between
+from calibgraph.simulation.fleet_rows import Fleet, errors_of, simulate_fleet
 
 
 @dataclass

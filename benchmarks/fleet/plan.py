@@ -18,13 +18,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from benchmarks.fleet.engines import kill_at_random
 from benchmarks.fleet.simulation import Plan, simulate
-from benchmarks.fleet.tables import write_fleet
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.task import CameraResult, Outcome, Task
+from calibgraph.simulation.fleet_tables import write_fleet
+from tests.fleet.killing import kill_at_random
 
 Seconds = NDArray[np.float64]
 JOBS, SLOTS = 100_000, (100, 1_000, 10_000)

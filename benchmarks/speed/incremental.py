@@ -20,12 +20,12 @@ import gtsam
 import numpy as np
 
 from benchmarks.accuracy.drives import camera
-from benchmarks.simulated_drive import simulate_drive
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.simulation.drive_matches import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.optimizer import to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS

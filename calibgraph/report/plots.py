@@ -31,7 +31,7 @@ _MAX_DOTS = 6000
 _MAX_GATES = 2.0  # axes of residuals end here
 _MEDIAN_BINS = 15
 _MIN_PER_BIN = 10
-_ARROW_COLUMNS = 12  # cells across the image
+ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
 _OCTAVES_M = (0.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, np.inf)
 _OCTAVE_NAMES = ("< 2", "2-4", "4-8", "8-16", "16-32", "32-64", "> 64")
@@ -83,8 +83,8 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
     figure, axes = image_figure(camera)
     inliers = errors.select(errors.is_inlier)
     axes.plot(*_thin(inliers.pixels_px).T, ".", color=_INLIER, markersize=2, alpha=0.35)
-    centres, means, cell_px = mean_residuals(camera, inliers, _ARROW_COLUMNS)
-    factor = _arrow_factor(means, cell_px)
+    centres, means, cell_px = mean_residuals(camera, inliers, ARROW_COLUMNS)
+    factor = arrow_factor(means, cell_px)
     axes.quiver(
         *centres.T, *(factor * means).T, angles="xy", scale_units="xy", scale=1.0,
         color=_OUTLIER, width=0.005, headwidth=3.5, headlength=3.5, headaxislength=3, minshaft=2,
@@ -219,7 +219,7 @@ def _running_median(errors: ReprojectionErrors) -> Array:
     return np.array(medians).reshape(-1, 2)
 
 
-def _arrow_factor(means: Array, cell_px: float) -> float:
+def arrow_factor(means: Array, cell_px: float) -> float:
     """A round factor by which the longer arrows fill their cells."""
     longest = float(np.quantile(np.hypot(*means.T), 0.9)) if len(means) else 0.0
     wanted = max(1.0, 0.9 * cell_px / max(longest, 1e-6))

@@ -99,7 +99,7 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
         points_lidar_m=block.points_lidar_m,
         pixels_px=block.pixels_px,
         projected_px=block.pixels_px + residuals,
-        vectors_px=_constrained(residuals, matches.information),
+        vectors_px=constrained(residuals, matches.information),
         distances_m=np.linalg.norm(points_camera, axis=1),
         frame=matches.frame,
         gate_px=gate_px,
@@ -107,7 +107,7 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
     return everything.select(valid)
 
 
-def _constrained(residuals: Array, information: Array | None) -> Array:
+def constrained(residuals: Array, information: Array | None) -> Array:
     """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is ``whitening.constrained_error_px``.
 
     The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).

@@ -78,7 +78,7 @@ def cast_beams(
         return middle, cast(world, origins, middle)
     parts = [(shots + offset) @ R.T for offset in _parts_of_beam(shots, errors.beam_mrad)]
     hits = [cast(world, origins, part.astype(np.float32)) for part in parts]
-    return middle, _foremost(hits)
+    return middle, foremost(hits)
 
 
 def _parts_of_beam(shots: Array, beam_mrad: float) -> list[Array]:
@@ -92,7 +92,7 @@ def _parts_of_beam(shots: Array, beam_mrad: float) -> list[Array]:
     return [np.zeros_like(shots), *ring]
 
 
-def _foremost(hits: list[Hits]) -> Hits:
+def foremost(hits: list[Hits]) -> Hits:
     """The returned range: the foremost surface that at least two parts of the beam meet."""
     distances = np.stack([part.distance_m for part in hits])
     order = np.argsort(distances, axis=0)

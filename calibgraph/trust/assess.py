@@ -87,7 +87,7 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
     of_run = [check(evidence) for check in RUN_CHECKS]
     checks = concatenate([assess(evidence.solution), *of_run], cameras)
     convention = _intended_guess_checks(evidence, checks)
-    implausible = _implausible_checks(evidence.run.guess, checks)
+    implausible = implausible_checks(evidence.run.guess, checks)
     return concatenate([convention, implausible, checks], cameras)
 
 
@@ -107,7 +107,7 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
     return dict.fromkeys(failed, [check])
 
 
-def _implausible_checks(guess: Rig, checks: Checks) -> Checks:
+def implausible_checks(guess: Rig, checks: Checks) -> Checks:
     """Values of a rig that may explain why checks of a camera FAIL; they decide nothing."""
     found: dict[str, list[Check]] = {}
     for line in find_implausible(guess):

@@ -18,9 +18,9 @@ import yaml
 from calibgraph import Audit, CameraAudit, load_rig
 from calibgraph.audit import audit_summary
 from calibgraph.audit.result import AuditStatus
-from tests.audit.test_check import motion, with_camera_moved
+from tests.audit.deployed import motion, with_camera_moved
 from tests.conftest import ROOT, SAMPLE
-from tests.test_docs import resolve, takes
+from tests.docs_text import resolve, takes
 
 FOLDER = ROOT / "action"
 ACTION: dict[str, Any] = yaml.safe_load((FOLDER / "action.yml").read_text())

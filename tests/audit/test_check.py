@@ -8,28 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Audit, Rig, simulate_correspondences
 from calibgraph.matching.structure.matcher import StructureMatcher
+from tests.audit.deployed import TRUTH, motion, with_camera_moved
 from tests.conftest import SAMPLE, stereo_relative_pose
 from tests.matching.structure.data import with_noise_images
-
-TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-def motion(axis: int, degrees: float = 0.0, metres: float = 0.0) -> np.ndarray:
-    """(4, 4) about and along one axis."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
-    T[axis, 3] = metres
-    return T
-
-
-def with_camera_moved(rig: Rig, name: str, T: np.ndarray) -> Rig:
-    """The rig as deployed before this camera moved by T, in its own axes."""
-    return rig.moved_to({**rig.T_camera_lidar, name: T @ rig.T_camera_lidar[name]})
 
 
 def with_lidar_moved(rig: Rig, T: np.ndarray) -> Rig:

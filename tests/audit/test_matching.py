@@ -18,7 +18,7 @@ from calibgraph.matching.protocol import to_full_matcher
 from calibgraph.model.config import Config
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from tests.audit.test_check import TRUTH, motion, with_camera_moved
+from tests.audit.deployed import TRUTH, motion, with_camera_moved
 from tests.conftest import SAMPLE
 
 TABLE = simulate_correspondences(TRUTH, frames=6)

@@ -14,10 +14,10 @@ from calibgraph import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.page_camera import charts_of, measured_camera
 from calibgraph.audit.result import audit_of, audit_summary
 from calibgraph.model.geometry import twist_between
-from tests.audit.test_check import TRUTH
+from tests.audit.deployed import TRUTH
 from tests.conftest import ROOT, SAMPLE
+from tests.report.browsing import render
 from tests.report.conftest import read_page
-from tests.report.test_browser import render
 
 DEVIATION = np.array([0.001, 0.02, 0, 0.01, 0, -0.02])
 SIGMA = np.repeat([0.001, 0.01], 3)

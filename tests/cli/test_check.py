@@ -10,7 +10,7 @@ import pytest
 from calibgraph import Audit, CameraAudit, load_rig
 from calibgraph.audit import audit_summary
 from calibgraph.cli import remote
-from tests.audit.test_check import motion, with_camera_moved
+from tests.audit.deployed import motion, with_camera_moved
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
 
@@ -20,7 +20,7 @@ AXES = ("deviation_deg", "deviation_cm", "sigma_deg", "sigma_cm", "detectable_de
 
 def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> None:
     code, out, err = call("check", REFERENCE, SAMPLE, "--json")
-    assert (code, err) == (0, "")
+    assert code == 0, err  # after 5 s, on a busy machine, err has a line of progress
     content = json.loads(out)
     assert set(content) == {
         "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording", "cameras",

@@ -16,8 +16,7 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, make_pair
-from tests.io.formats.readers import READERS
-from tests.io.formats.test_import import (
+from tests.io.formats.calibration_files import (
     CAMERA_INFO,
     KALIBR,
     KOIDE,
@@ -26,6 +25,7 @@ from tests.io.formats.test_import import (
     URDF,
     write,
 )
+from tests.io.formats.readers import READERS
 
 
 def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> None:

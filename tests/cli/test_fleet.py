@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet.tables import write_fleet
 from calibgraph.fleet.rows import read_rows
+from calibgraph.simulation.fleet_tables import write_fleet
 from tests.cli.conftest import error_line
 from tests.conftest import Call
 

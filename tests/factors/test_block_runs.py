@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factors import ProjectionBlock, to_runs
-from tests.factors.test_block import LENSES, TRUTH, poses, with_loss, world
+from tests.factors.blocks import LENSES, TRUTH, poses, with_loss, world
 
 EDGES = np.array([0, 300, 300, 900, 1000])
 

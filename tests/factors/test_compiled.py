@@ -89,13 +89,16 @@ def test_a_second_process_does_not_compile_again(tmp_path: Path) -> None:
     assert second == (f"{HUBER} 1", "")
 
 
+@pytest.mark.slow
 def test_the_users_cache_folder_is_the_default(tmp_path: Path) -> None:
     found = [run(LENS, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) for _ in range(2)]
     assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
     assert [*(tmp_path / "calibgraph").rglob("*loss_and_weight*")]
 
 
-@pytest.mark.parametrize("variable", ["NUMBA_CACHE_DIR", "HOME"])
+@pytest.mark.parametrize(
+    "variable", ["NUMBA_CACHE_DIR", pytest.param("HOME", marks=pytest.mark.slow)]
+)
 def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_reports_it(
     variable: str, read_only: Path, tmp_path: Path
 ) -> None:

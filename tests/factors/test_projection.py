@@ -10,7 +10,7 @@ from factors import (
     projection_factor,
     projection_residual,
 )
-from tests.factors.test_block import KEY, LENSES, at, poses, world
+from tests.factors.blocks import KEY, LENSES, at, poses, world
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factors import Lens, ray_spreads, unproject
-from tests.factors.test_block import LENSES
+from tests.factors.blocks import LENSES
 
 WIDE = Lens.fisheye(
     fx=385.0, fy=384.0, cx=641.0, cy=478.0, distortion=(0.05, -0.015, 0.004, -0.001)

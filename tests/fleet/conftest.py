@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from benchmarks.fleet.vehicles import Fleet, simulate_fleet
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import observe
+from calibgraph.simulation.fleet_rows import Fleet, simulate_fleet
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.fleet.engines import kill_at_random
-from benchmarks.fleet.tables import write_fleet
 from calibgraph import CalibrationError
 from calibgraph.fleet.engines import ProcessEngine, open_engine
 from calibgraph.fleet.manifest import load_manifest
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.task import Limits, Outcome, Task, release
+from calibgraph.simulation.fleet_tables import write_fleet
+from tests.fleet.killing import kill_at_random
 
 MANY = 100
 

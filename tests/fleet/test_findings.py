@@ -6,11 +6,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from benchmarks.fleet.vehicles import CAMERAS, simulate_fleet
 from calibgraph.fleet.findings import find_changes, moved_lidars
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import retract_all
+from calibgraph.simulation.fleet_rows import CAMERAS, simulate_fleet
 from tests.fleet.conftest import Fitted
 
 

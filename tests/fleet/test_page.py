@@ -12,14 +12,14 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from benchmarks.fleet.vehicles import simulate_fleet
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import write_fleet_report
 from calibgraph.fleet.status import STATES, assess_status, changed_poses
 from calibgraph.model.geometry import retract_all
+from calibgraph.simulation.fleet_rows import simulate_fleet
 from tests.conftest import Call
-from tests.report.test_browser import browser, render
+from tests.report.browsing import browser, render
 
 HOSTILE = "</script><b>x"
 

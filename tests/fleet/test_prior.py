@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fleet.vehicles import CAMERAS, Fleet, simulate_fleet
 from calibgraph import Rig, load_rig
 from calibgraph.errors import RigError
 from calibgraph.fleet.model import FleetModel, fit_fleet
@@ -15,6 +14,7 @@ from calibgraph.fleet.model_files import write_fleet_model
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.prior import expected_pose, prior_rig
 from calibgraph.model.geometry import relative_transform, twists_between
+from calibgraph.simulation.fleet_rows import CAMERAS, Fleet, simulate_fleet
 from calibgraph.simulation.rigs import rig_of
 
 

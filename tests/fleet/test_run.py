@@ -10,13 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from benchmarks.fleet.tables import write_fleet
 from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.fleet.engines import ProcessEngine
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import Summary, run_fleet
 from calibgraph.fleet.task import RETRIES, Limits, Outcome, Task
+from calibgraph.simulation.fleet_tables import write_fleet
 
 POISON = Path(__file__).parent / "poison"
 GOOD, ILL = ("car-00000", "car-00001"), ("segfault", "hungry", "endless", "bug")

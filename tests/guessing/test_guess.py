@@ -18,7 +18,7 @@ from calibgraph.matching.structure.pose_search import PoseSearch
 from calibgraph.model.geometry import camera_center, pose_difference
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
-from tests.io.formats.test_import import KALIBR, URDF, write
+from tests.io.formats.calibration_files import KALIBR, URDF, write
 
 TRUTH = load_rig(SAMPLE / "reference.yaml")
 

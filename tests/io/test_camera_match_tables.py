@@ -12,7 +12,7 @@ from pyarrow import parquet
 from calibgraph import FileError
 from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.model.camera_matches import COLUMNS, CameraMatches
-from tests.model.test_camera_matches import camera_matches
+from tests.model.tables import camera_matches
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])

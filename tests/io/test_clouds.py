@@ -13,8 +13,7 @@ from pyarrow import feather
 
 from calibgraph import FileError
 from calibgraph.io.clouds import load_cloud
-
-CLOUD = np.random.default_rng(0).normal(size=(500, 4)).astype(np.float32)
+from tests.io.kitti_files import CLOUD
 
 
 def test_npy_and_bin_clouds_are_read(tmp_path: Path) -> None:

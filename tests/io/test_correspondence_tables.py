@@ -16,7 +16,7 @@ from calibgraph import (
     load_correspondences,
 )
 from calibgraph.io.correspondence_tables import from_arrow
-from tests.model.test_correspondences import table, to_arrow
+from tests.model.tables import table, to_arrow
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])

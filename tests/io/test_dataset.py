@@ -6,7 +6,7 @@ import pytest
 
 from calibgraph import DatasetError, FileError, Rig, load_dataset, load_rig
 from tests.conftest import SAMPLE
-from tests.io.test_kitti import written_kitti
+from tests.io.kitti_files import written_kitti
 
 
 def test_the_sample_is_read() -> None:

@@ -5,34 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from calibgraph import FileError, load_dataset, load_rig
 from tests.conftest import make_camera
-from tests.io.test_clouds import CLOUD
-
-
-def written_kitti(folder: Path, frames: int = 2) -> Path:
-    """A KITTI odometry sequence with two cameras and known numbers."""
-    (folder / "velodyne").mkdir(parents=True)
-    K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
-    lines = []
-    for k in range(4):
-        b = np.array([[-0.5 * k], [0.01 * k], [0.002 * k]])
-        lines.append(f"P{k}: " + " ".join(map(str, (K @ np.hstack([np.eye(3), b])).ravel())))
-    Tr = np.hstack([make_camera((0.27, 0.0, -0.08)).T_camera_lidar[:3]])
-    lines.append("Tr: " + " ".join(map(str, Tr.ravel())))
-    (folder / "calib.txt").write_text("\n".join(lines))
-    for k in (2, 3):
-        (folder / f"image_{k}").mkdir()
-        for i in range(frames):
-            image = np.full((370, 1226, 3), 40 * k, np.uint8)
-            cv2.imwrite(str(folder / f"image_{k}" / f"{i:06}.png"), image)
-    for i in range(frames):
-        CLOUD.tofile(folder / "velodyne" / f"{i:06}.bin")
-    return folder
+from tests.io.kitti_files import written_kitti
 
 
 def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:

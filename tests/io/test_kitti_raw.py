@@ -8,20 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from calibgraph import FileError, load_dataset, load_rig
-from tests.conftest import make_camera
-from tests.io.test_clouds import CLOUD
+from tests.io.kitti_files import BASELINES, CLOUD, RECTIFY, T_CAMERA0_LIDAR, text_of
 
 WIDTH, HEIGHT = 1242, 375
-RECTIFY = Rotation.from_euler("xyz", [0.4, -0.3, 0.5], degrees=True).as_matrix()
-T_CAMERA0_LIDAR = make_camera((0.27, 0.0, -0.08), yaw_deg=0.5).T_camera_lidar
-BASELINES = {"02": [0.06, 0.001, 0.003], "03": [-0.47, 0.002, 0.003]}
-
-
-def text_of(name: str, values: np.ndarray) -> str:
-    return f"{name}: " + " ".join(f"{value:.15e}" for value in np.ravel(values))
 
 
 def written_drive(date: Path, frames: int = 2) -> Path:

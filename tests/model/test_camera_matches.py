@@ -8,24 +8,7 @@ import pytest
 
 from calibgraph import CorrespondenceError
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
-
-CAMERAS = ("left", "right", "rear")
-NAN = np.nan
-
-
-def camera_matches(**changes: Any) -> CameraMatches:
-    """Three matches of two pairs; planes on both sides, one side, and none."""
-    planes = np.full((3, 2, 3), NAN)
-    planes[0], planes[1, 0] = [[0.1, 0, 0], [0.2, 0.01, 0]], [0.05, 0, 0.1]
-    columns: dict[str, Any] = {
-        "cameras": CAMERAS,
-        "camera_index": np.array([[0, 1], [0, 1], [1, 2]], np.int32),
-        "frame": np.array([4, 5, 5]),
-        "pixels_px": np.arange(12.0).reshape(3, 2, 2),
-        "planes_lidar_per_m": planes,
-        "metadata": {"camera_features": "sift"},
-    }
-    return CameraMatches(**(columns | changes))
+from tests.model.tables import CAMERAS, NAN, camera_matches
 
 
 def with_entry(name: str, place: tuple[int, ...], value: float) -> dict[str, Any]:

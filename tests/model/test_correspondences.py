@@ -8,23 +8,9 @@ import pytest
 
 from calibgraph import (
     CorrespondenceError,
-    Correspondences,
     concatenate,
 )
-
-to_arrow = Correspondences.to_arrow
-
-
-def table(**changes: Any) -> Correspondences:
-    """Four correspondences of two cameras and two frames."""
-    columns: dict[str, Any] = {
-        "camera": ["left", "left", "right", "left"],
-        "frame": [0, 1, 1, 1],
-        "pixels_px": [[600, 180], [610, 190], [500, 200], [610.4, 190.3]],
-        "points_lidar_m": [[10, 0, 0], [9, 0, 0], [10, -1, 0], [20, 0, 0]],
-        "confidence": [0.9, 0.8, 1.0, 0.7],
-    }
-    return Correspondences.from_arrays(**(columns | changes))
+from tests.model.tables import table
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
-
 import gtsam
 import numpy as np
 import pytest
 
-import calibgraph
 from calibgraph.model.geometry import (
     angle_deg,
     camera_center,
@@ -32,32 +28,6 @@ from tests.conftest import make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
-
-NO_TRANSFORM = "the inverse of an information matrix or a normal equation, not of a transform"
-INVERTING = {
-    "calibgraph/audit/common_pose.py": NO_TRANSFORM,
-    "calibgraph/audit/trend.py": NO_TRANSFORM,
-    "calibgraph/fleet/centers.py": NO_TRANSFORM,
-    "calibgraph/fleet/deviations.py": NO_TRANSFORM,
-    "calibgraph/fleet/findings.py": NO_TRANSFORM,
-    "calibgraph/fleet/fit.py": NO_TRANSFORM,
-    "calibgraph/fleet/status.py": NO_TRANSFORM,
-    "calibgraph/matching/cmrnext/training/samples.py": "a camera matrix K",
-    "calibgraph/solver/augmented_fit.py": NO_TRANSFORM,
-    "calibgraph/solver/hierarchy.py": NO_TRANSFORM,
-    "calibgraph/solver/hierarchy_fit.py": NO_TRANSFORM,
-    "calibgraph/solver/within_place.py": NO_TRANSFORM,
-    "calibgraph/tracking/assessment.py": NO_TRANSFORM,
-    "calibgraph/tracking/cause.py": NO_TRANSFORM,
-    "calibgraph/tracking/epoch_summary.py": NO_TRANSFORM,
-    "calibgraph/tracking/joint_estimate.py": NO_TRANSFORM,
-    "calibgraph/tracking/noise.py": NO_TRANSFORM,
-    "calibgraph/tracking/place_errors.py": NO_TRANSFORM,
-    "calibgraph/tracking/place_shift.py": NO_TRANSFORM,
-    "calibgraph/tracking/place_sizes.py": NO_TRANSFORM,
-    "calibgraph/tracking/posterior.py": NO_TRANSFORM,
-    "calibgraph/tracking/step_detection.py": NO_TRANSFORM,
-}
 
 
 def random_transform(seed: int, size: float = 1.0) -> np.ndarray:
@@ -149,21 +119,6 @@ def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
     np.testing.assert_allclose(
         relative_covariance(joint, 0, 1, T_b_a), expected, rtol=0, atol=tolerance
     )
-
-
-def test_only_the_geometry_inverts_transforms() -> None:
-    """Elsewhere ``inv`` and ``inverse`` occur in the listed files alone, each with its reason."""
-    package = Path(calibgraph.__file__).parent
-    found = set()
-    for path in package.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            called = node.func if isinstance(node, ast.Call) else None
-            if isinstance(called, ast.Attribute) and (
-                ast.unparse(called) == "np.linalg.inv" or called.attr == "inverse"
-            ):
-                found.add(path.relative_to(package.parent).as_posix())
-    assert "calibgraph/model/geometry.py" in found
-    assert found == {"calibgraph/model/geometry.py", *INVERTING}
 
 
 def test_many_rigid_transforms_are_inverted_as_any_matrix() -> None:

@@ -2,11 +2,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from calibgraph import (
     FileError,
@@ -17,23 +15,7 @@ from calibgraph import (
 )
 from calibgraph.model.rig import rigid_transform
 from tests.conftest import stereo_relative_pose
-
-
-def written(rig: Rig, folder: Path, **changes: Any) -> Path:
-    """A rig file with some keys of its camera `left` changed."""
-    content = rig.model_dump()
-    content["cameras"]["left"] |= changes
-    path = folder / "rig.yaml"
-    path.write_text(yaml.safe_dump(_plain(content)))
-    return path
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value.tolist() if isinstance(value, np.ndarray) else value
+from tests.model.rig_files import written
 
 
 def test_a_rig_file_returns_the_same_rig(pair: Rig, tmp_path: Path) -> None:

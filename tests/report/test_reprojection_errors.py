@@ -10,8 +10,8 @@ import pytest
 
 from calibgraph import Calibration
 from calibgraph.report.image_cells import mean_residuals
-from calibgraph.report.plots import _ARROW_COLUMNS, _arrow_factor
-from calibgraph.report.reprojection_errors import _constrained, errors_before_after
+from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor
+from calibgraph.report.reprojection_errors import constrained, errors_before_after
 from calibgraph.report.worked_point import worked_point
 from calibgraph.solver.whitening import constrained_error_px
 
@@ -22,9 +22,9 @@ def test_vectors_of_edges_have_the_length_that_the_gate_compares() -> None:
     edges = np.column_stack(
         [normals[:, 0] ** 2, normals[:, 0] * normals[:, 1], normals[:, 1] ** 2]
     ) + np.outer(rng.integers(0, 2, 50), [0.5, 0.1, 0.7])
-    lengths = np.hypot(*_constrained(residuals, edges).T)
+    lengths = np.hypot(*constrained(residuals, edges).T)
     np.testing.assert_allclose(lengths, constrained_error_px(residuals, edges), atol=1e-9)
-    np.testing.assert_array_equal(_constrained(residuals, None), residuals)
+    np.testing.assert_array_equal(constrained(residuals, None), residuals)
 
 
 def test_errors_are_those_at_the_guess_and_at_the_result(
@@ -43,10 +43,10 @@ def test_arrows_are_the_mean_of_their_cell(solved_pair: Calibration) -> None:
     after = errors_before_after(solved_pair)["left"].after
     shifted = replace(after, vectors_px=np.tile([0.5, -0.25], (len(after.frame), 1)))
     camera = solved_pair.rig.cameras["left"]
-    _, means, cell_px = mean_residuals(camera, shifted, _ARROW_COLUMNS)
+    _, means, cell_px = mean_residuals(camera, shifted, ARROW_COLUMNS)
     assert len(means) > 0
     np.testing.assert_allclose(means, np.tile([0.5, -0.25], (len(means), 1)))
-    assert 0.3 * cell_px < _arrow_factor(means, cell_px) * np.hypot(0.5, 0.25) <= 0.9 * cell_px
+    assert 0.3 * cell_px < arrow_factor(means, cell_px) * np.hypot(0.5, 0.25) <= 0.9 * cell_px
 
 
 def test_the_worked_point_is_right(pair_without_outliers: Calibration) -> None:

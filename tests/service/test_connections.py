@@ -13,7 +13,7 @@ import pytest
 
 from calibgraph.service import connections
 from calibgraph.service.settings import Settings
-from tests.service.test_faults import on_a_port
+from tests.service.ports import on_a_port
 
 SHORT_S = 0.5
 MANY = 900

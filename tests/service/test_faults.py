@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +17,9 @@ from calibgraph.errors import CalibrationError
 from calibgraph.service import submission
 from calibgraph.service.app import create_app
 from calibgraph.service.database import DATABASE
-from calibgraph.service.serve import Address, Server
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
-
-
-@contextmanager
-def on_a_port(settings: Settings) -> Iterator[tuple[str, int, Any]]:
-    """A server on loopback: its host, its port, its app."""
-    app = create_app(settings)
-    server = Server(app, Address(port=0))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield "127.0.0.1", server.servers[0].sockets[0].getsockname()[1], app
-    server.should_exit = True
-    thread.join()
+from tests.service.ports import on_a_port
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

@@ -18,7 +18,7 @@ from calibgraph.service.app import create_app
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, make_tokens, service_folder
 from tests.service.hostile import zipped
-from tests.service.test_faults import on_a_port
+from tests.service.ports import on_a_port
 
 MB = 10**6
 ROOM_BYTES = 300 * MB
@@ -108,7 +108,7 @@ BOMBS = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("name", [pytest.param("ratio", marks=pytest.mark.slow), "size"])
 def test_a_bomb_is_refused_before_it_is_unpacked_and_leaves_nothing(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

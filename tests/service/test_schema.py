@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from calibgraph.service.settings import Settings
-from tests.service.test_faults import on_a_port
+from tests.service.ports import on_a_port
 
 SCHEMATHESIS = shutil.which("schemathesis", path=Path(sys.executable).parent)
 CHECKS = (

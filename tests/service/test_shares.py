@@ -115,6 +115,7 @@ def test_trackers_are_counted_per_tenant_however_fast_they_are_asked_for(
     assert begin(client, small, second).status_code == 201
 
 
+@pytest.mark.slow
 def test_frames_of_a_busy_tenant_do_not_hold_up_another(tracking: Any, small: Problem) -> None:
     client, (first, second) = tracking
     begin(client, small, first)  # unless it has as many as it may

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import calibgraph
-from benchmarks.simulated_drive import simulate_drive
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.simulation.drive_matches import simulate_drive
 from calibgraph.simulation.matcher_errors import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 from calibgraph.solver.joint import solve_joint

@@ -11,7 +11,7 @@ import pytest
 from calibgraph import Rig, simulate_street
 from calibgraph.simulation.lidar import scan
 from calibgraph.simulation.recording import Drive
-from calibgraph.simulation.scan_errors import ScanErrors, _foremost, draw_scan_errors
+from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors, foremost
 from calibgraph.simulation.world import Hits, cast
 from tests.simulation.conftest import SCAN, small_camera
 
@@ -73,15 +73,15 @@ def hits(*distances: float) -> list[Hits]:
 
 
 def test_of_a_wide_beam_the_foremost_surface_returns_that_two_parts_meet() -> None:
-    both = _foremost(hits(20.0, 10.0, 10.1, 20.0, 20.1, 20.0, 20.0))
+    both = foremost(hits(20.0, 10.0, 10.1, 20.0, 20.1, 20.0, 20.0))
     assert both.distance_m[0] == pytest.approx(10.05) and both.triangle[0] in {1, 2}
-    one = _foremost(hits(20.0, 10.0, 20.1, 20.0, 20.1, 20.0, 20.0))
+    one = foremost(hits(20.0, 10.0, 20.1, 20.0, 20.1, 20.0, 20.0))
     assert one.distance_m[0] == pytest.approx(20.03, abs=0.01)
-    slanted = _foremost(hits(10.0, 10.4, 10.8, 11.2, 11.6, 12.0, 12.4))
+    slanted = foremost(hits(10.0, 10.4, 10.8, 11.2, 11.6, 12.0, 12.4))
     assert slanted.distance_m[0] == pytest.approx(11.2)
-    sky = _foremost(hits(*[np.inf] * 7))
+    sky = foremost(hits(*[np.inf] * 7))
     assert np.isinf(sky.distance_m[0])
-    edge = _foremost(hits(np.inf, 10.0, 10.0, *[np.inf] * 4))
+    edge = foremost(hits(np.inf, 10.0, 10.0, *[np.inf] * 4))
     assert edge.distance_m[0] == pytest.approx(10.0)
 
 

@@ -33,44 +33,12 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.solution import Solution
 from factors import EpipolarBlock, pose_sigmas
+from tests.solver.pairs import FRAMES, simulated_pairs
 
-FRAMES = 8
 
-
-def simulated_pairs(
-    rig: Rig, *, count: int = 150, noise_px: float = 0.3, outliers: float = 0.1, seed: int = 0
-) -> CameraMatches:
-    """Features of the first two cameras on random planes, per frame; some without a plane."""
-    rng, parts = np.random.default_rng(seed), []
-    a, b = list(rig.cameras.values())[:2]
-    for frame in range(FRAMES):
-        points = np.exp(rng.uniform(np.log(4), np.log(40), (3 * count, 1))) * np.column_stack(
-            [
-                np.ones(3 * count),
-                rng.uniform(-0.7, 0.7, 3 * count),
-                rng.uniform(-0.2, 0.2, 3 * count),
-            ]
-        )
-        normals = (
-            rng.normal(0, 0.4, points.shape) + points / np.linalg.norm(points, axis=1)[:, None]
-        )
-        planes = normals / (normals * points).sum(axis=1, keepdims=True)
-        pixels, seen = [], np.ones(len(points), np.bool_)
-        for camera in (a, b):
-            T = camera.T_camera_lidar
-            projected, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
-            pixels.append(projected + noise_px * rng.standard_normal(projected.shape))
-            seen &= valid & camera.in_image(projected)
-        rows = np.flatnonzero(seen)[:count]
-        both = np.stack(pixels, axis=1)[rows]
-        wrong = rng.random(len(rows)) < outliers
-        both[wrong, 1, 0] += rng.uniform(-80, 80, np.count_nonzero(wrong))  # along epipolar lines
-        sides = np.repeat(planes[rows, None], 2, axis=1)
-        sides[rng.random(len(rows)) < 0.3] = np.nan
-        parts.append((np.full(len(rows), frame), both, sides))
-    columns = [np.concatenate([part[k] for part in parts]) for k in range(3)]
-    index = np.tile(np.array([0, 1], np.int32), (len(columns[0]), 1))
-    return CameraMatches(tuple(rig.cameras), index, *columns)
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return calibgraph.load_rig(calibgraph.__path__[0] + "/../data/sample/reference.yaml")
 
 
 def solve_pair(rig: Rig, terms: tuple[PairTerm, ...], held: float) -> dict[str, np.ndarray]:
@@ -158,11 +126,6 @@ def test_sigma_and_gate_fit_the_noise(pair: Rig) -> None:
     kept = term.without_outliers(pair.T_camera_lidar, sigma)
     assert 0.8 < len(kept.frame) / len(term.frame) < 0.95
     assert np.median(kept.errors_px(pair.T_camera_lidar)) < 2 * sigma
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return calibgraph.load_rig(calibgraph.__path__[0] + "/../data/sample/reference.yaml")
 
 
 def solved(rig: Rig, with_pairs: bool, seed: int = 0) -> Solution:

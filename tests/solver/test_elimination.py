@@ -31,7 +31,7 @@ from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
-from tests.solver.test_camera_pairs import simulated_pairs
+from tests.solver.pairs import simulated_pairs
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 STATED = {

@@ -26,7 +26,7 @@ from calibgraph import (
 from calibgraph.io import correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
-from tests.model.test_correspondences import table
+from tests.model.tables import table
 
 to_arrow = Correspondences.to_arrow
 

@@ -21,7 +21,7 @@ from calibgraph.solver.shared_error import (
 )
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
-from tests.solver.test_camera_pairs import simulated_pairs
+from tests.solver.pairs import simulated_pairs
 
 FINDINGS = MatcherFindings(systematic_rotation_rad=2e-3, systematic_translation_m=0.03)
 EACH = pose_sigmas(rotation_rad=2e-3, translation_m=0.03) ** 2

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import chi2
 
 import calibgraph
-from benchmarks.accuracy.place_draws import draw_places
 from calibgraph import Config, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.geometry import relative_covariance
+from calibgraph.simulation.place_draws import draw_places
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.evidence import Evidence
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.uncertainty import displaced
 from calibgraph import MatcherErrors, Rig, concatenate, simulate_correspondences
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.simulation.place_draws import displaced
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.variance_components import VarianceRatios

@@ -8,7 +8,7 @@ from calibgraph import (
     Config,
 )
 from calibgraph.solver.whitening import constrained_error_px, sqrt_information
-from tests.model.test_correspondences import table
+from tests.model.tables import table
 
 
 def test_weights_are_the_papers() -> None:

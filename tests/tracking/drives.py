@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
+    Calibration,
+    Config,
     Correspondences,
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
 )
+from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.place_draws import Drawn
 from calibgraph.tracking.report import json_line
 from tests.conftest import make_camera
 
@@ -97,3 +100,11 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 class Crashed(BaseException):
     """As good as a kill: nothing is saved on the way out."""
+
+
+def track_draw(drawn: Drawn) -> Calibration:
+    """The last estimate of a tracker that is given the frames of a draw."""
+    tracker = IncrementalCalibrator(drawn.rig, Config())
+    for frame in np.unique(drawn.table.frame):
+        tracker.update(drawn.table.select(drawn.table.frame == frame))
+    return tracker.calibration()

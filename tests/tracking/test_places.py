@@ -10,9 +10,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.accuracy.place_draws import draw_places
-from benchmarks.accuracy.tracked_places import tracked
-from benchmarks.accuracy.uncertainty import Drawn, tied
 from calibgraph import (
     Config,
     CorrespondenceError,
@@ -23,6 +20,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.simulation.place_draws import Drawn, draw_places, tied
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.scan_distortion import distortions_at
@@ -40,7 +38,7 @@ from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
-from tests.tracking.drives import drive, pair_of
+from tests.tracking.drives import drive, pair_of, track_draw
 from tests.tracking.test_place_sums import part
 
 Array = np.ndarray
@@ -86,7 +84,7 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     """
     drawn = drawn_of(places, frames, rounds, tie=tie)
     T, joint = batch_of(drawn)
-    result, _ = tracked(drawn)
+    result = track_draw(drawn)
     found = result.joint_covariance
     assert found is not None
     apart = [twist_between(result.T_camera_lidar[name], T[name]) for name in T]

@@ -17,7 +17,7 @@ from calibgraph import (
     Rig,
 )
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from tests.tracking.test_tracker import drive, moved, step_of, tracked
+from tests.tracking.steps import drive, moved, step_of, tracked
 
 Array = np.ndarray
 

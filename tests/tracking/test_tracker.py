@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +10,11 @@ import numpy as np
 import pytest
 
 import calibgraph
-from benchmarks.simulated_drive import simulate_drive
 from calibgraph import (
-    Config,
     CorrespondenceError,
     Correspondences,
     Event,
     IncrementalCalibrator,
-    MatcherErrors,
     Rig,
     Update,
     perturb,
@@ -29,36 +25,12 @@ from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.restart import handle_small_step
 from calibgraph.tracking.step_detection import DetectedStep
 from tests.conftest import make_camera, stereo_relative_pose
-
-Array = np.ndarray
-
-ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
+from tests.tracking.steps import ERRORS, Array, drive, moved, step_of, tracked
 
 
 def difference(T: Array, other: Array) -> Array:
     """(6,) xi in T = exp(xi) other."""
     return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T @ np.linalg.inv(other))))
-
-
-def moved(rig: Rig, name: str, step: Array) -> Rig:
-    T = gtsam.Pose3.Expmap(step).matrix()
-    return rig.moved_to({name: T @ rig.T_camera_lidar[name]})
-
-
-def step_of(deg: float, cm: float) -> Array:
-    return np.array([0, np.radians(deg), 0, cm / 100, 0, 0])
-
-
-def drive(rig_at: Callable[[int], Rig], frames: int, **options: object) -> list[Correspondences]:
-    settings = {"matches": 100, "errors": ERRORS, "seed": 1, **options}
-    return list(simulate_drive(rig_at, frames=frames, **settings))  # type: ignore[arg-type]
-
-
-def tracked(
-    guess: Rig, tables: list[Correspondences], **tracking: int
-) -> tuple[IncrementalCalibrator, list[Update]]:
-    tracker = IncrementalCalibrator(guess, Config().changed(tracking=tracking))
-    return tracker, [tracker.update(table) for table in tables]
 
 
 def events_of(updates: list[Update]) -> list[Event]:

@@ -12,7 +12,7 @@ import pytest
 import calibgraph
 from calibgraph import Intrinsics, load_calibration, load_rig
 from calibgraph.model.verdict import Check
-from calibgraph.trust.assess import _implausible_checks
+from calibgraph.trust.assess import implausible_checks
 from calibgraph.trust.inputs import check_inputs
 from tests.conftest import SAMPLE, Call
 
@@ -80,6 +80,7 @@ def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_the_command_prints_warnings_once(folder: Path, call: Call, tmp_path: Path) -> None:
     with_principal_point(80, 45).save(folder / "rig.yaml")
     table = calibgraph.simulate_correspondences(RIG, frames=2, matches=200, seed=1)
@@ -98,8 +99,8 @@ def test_a_failure_is_explained_but_not_decided_by_values_of_the_rig(
 ) -> None:
     failed = Check("z-score", "FAIL", "", 3.0, *limits)
     rig = with_principal_point(80, 45)
-    ((name, (check,)),) = _implausible_checks(rig, {"left": [failed]}).items()
+    ((name, (check,)),) = implausible_checks(rig, {"left": [failed]}).items()
     assert (name, check.status) == ("left", expected)
     assert check.text.startswith("principal point (80, 45)")
     passed = Check("z-score", "PASS", "", 30.0)
-    assert _implausible_checks(rig, {"left": [passed]}) == {}
+    assert implausible_checks(rig, {"left": [passed]}) == {}

@@ -94,7 +94,7 @@ def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: 
     assert abs(found.parameters[0].values[0]) > 0.01  # noqa: PLR2004
 
 
-@pytest.mark.parametrize("skew", [-0.03, 0.03])
+@pytest.mark.parametrize("skew", [pytest.param(-0.03, marks=pytest.mark.slow), 0.03])
 def test_sheared_images_are_named_and_measured(truth: Camera, tmp_path: Path, skew: float) -> None:
     k = truth.intrinsics_px
     lean = skew * k.fx / k.fy

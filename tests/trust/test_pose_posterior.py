@@ -125,7 +125,7 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     solution = solve_joint(pair, simulated(pair, frames=20))
     evidence = Evidence(solution, pair, {name: 4 * WIDE for name in pair.cameras})
     found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
-    assert found.doubt is not None
-    assert found.doubt.by_error_bar > 0.9
-    assert found.doubt.by_checks < 0.01
+    assert found.error_probability is not None
+    assert found.error_probability.by_error_bar > 0.9
+    assert found.error_probability.by_checks < 0.01
     assert found.status == "WARN" and found.cannot_tell

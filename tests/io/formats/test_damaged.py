@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibgraph import CalibrationError, FileError, import_rig
-from tests.io.formats.test_import import (
+from tests.io.formats.calibration_files import (
     CAMERA_INFO,
     KALIBR,
     KOIDE,

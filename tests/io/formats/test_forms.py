@@ -21,8 +21,8 @@ from calibgraph import Rig, export_calibration, import_rig, load_rig
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.rig_import import read_rig_parts
 from tests.conftest import RADTAN5, make_camera
+from tests.io.formats.calibration_files import CAMERA_INFO, FRONT, SENSOR_KIT, URDF, write
 from tests.io.formats.conftest import rig_for
-from tests.io.formats.test_import import CAMERA_INFO, FRONT, SENSOR_KIT, URDF, write
 
 P_LIDAR, P_CAMERA = [10.4, -0.9, -2.2, 1.0], [1.0, 2.0, 10.0]
 T_LIDAR_CAMERA = np.linalg.inv(FRONT)

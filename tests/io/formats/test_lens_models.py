@@ -15,7 +15,7 @@ from calibgraph import Camera, import_rig
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
 from calibgraph.io.lenses import stated_model
-from tests.io.formats.test_import import FRONT
+from tests.io.formats.calibration_files import FRONT
 
 K = [320.0, 0.0, 640.0, 0.0, 320.0, 400.0, 0.0, 0.0, 1.0]
 FOUR = [0.08, -0.02, 0.004, -0.001]

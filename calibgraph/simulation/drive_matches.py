@@ -8,10 +8,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibgraph import Camera, Correspondences, MatcherErrors, Rig, concatenate
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.simulation.correspondences import matchers_of
+from calibgraph.simulation.matcher_errors import MatcherErrors
 
 Rng = np.random.Generator
+
+RANDOM_SHARE = 0.5
+"""Share of the failed frames whose pixels are random."""
 
 
 def simulate_drive(
@@ -47,7 +52,7 @@ def simulate_drive(
         for name, camera in rig_at(frame).cameras.items():
             if frame in (blind or {}).get(name, ()):
                 continue
-            failed, at_random = rng.random() < failed_share, rng.random() < 0.5
+            failed, at_random = rng.random() < failed_share, rng.random() < RANDOM_SHARE
             seen = _displace(rng, camera) if failed and not at_random else camera
             made = nonsense if failed and at_random else errors
             matcher = matchers[name]  # its shared errors stay where the camera moves

@@ -17,6 +17,7 @@ CAMERAS = ("front", "front_left", "front_right", "left", "rear", "right")
 MODELS = ("compact", "van")
 SPREAD = np.array([np.radians(0.15)] * 3 + [0.004] * 3)
 POOR = 0.3
+MID_YEAR = 182
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,12 @@ def simulate_fleet(
     model, batch, poor, day, mileage = plan
     v, c = np.repeat(np.arange(vehicles), 6), np.tile(np.arange(6), vehicles)
     nominal = np.array([_random_pose(rng) for _ in range(12)]).reshape(2, 6, 4, 4)
-    d = _regular(rng, model[v], batch[v], c, change_deg)
+    d = _regular(rng, model[v], batch[v], c, change_deg=change_deg)
     moved = rng.random(len(v)) < moved_share
-    d[moved] += _directions(rng, np.count_nonzero(moved)) * np.radians(1)
-    d[c == 4, 0] += np.radians(mileage_deg) * mileage[v[c == 4]] / 1e5
-    late = (c == 5) & (model[v] == 1) & (batch[v] == 0) & (day[v] > 182)
+    d[moved] += _directions(rng, int(np.count_nonzero(moved))) * np.radians(1)
+    rear, right = c == CAMERAS.index("rear"), c == CAMERAS.index("right")
+    d[rear, 0] += np.radians(mileage_deg) * mileage[v[rear]] / 1e5
+    late = right & (model[v] == 1) & (batch[v] == 0) & (day[v] > MID_YEAR)
     d[late, 1] += np.radians(step_deg)
     truth = retract_all(nominal[model[v], c], -d)
     covariance = _noise(rng, poor[v])
@@ -90,6 +92,7 @@ def _regular(
     model: NDArray[Any],
     batch: NDArray[Any],
     camera: NDArray[Any],
+    *,
     change_deg: float,
 ) -> Array:
     """(n, 6) deviations of vehicles and batches, and of the mount that was changed."""
@@ -129,7 +132,7 @@ def _lists(values: Array, size: int) -> pa.FixedSizeListArray:
 
 def _random_pose(rng: np.random.Generator) -> Array:
     twist = rng.normal(size=(1, 6)) * [1, 1, 1, 0.5, 0.5, 0.5]
-    return retract_all(np.eye(4)[None], twist)[0]
+    return np.asarray(retract_all(np.eye(4)[None], twist)[0], np.float64)
 
 
 def _correlation(rng: np.random.Generator) -> Array:
@@ -156,4 +159,5 @@ def _noise(rng: np.random.Generator, poor: NDArray[np.bool_]) -> Array:
 def errors_of(T_camera_lidar: Array, truth: Array) -> Array:
     """(n,) angle [rad] between estimates and truth."""
     R = relative_transform(T_camera_lidar, truth)[:, :3, :3]
-    return np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)), np.float64)

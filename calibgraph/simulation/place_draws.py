@@ -1,0 +1,131 @@
+"""Tables of several places that state the errors which were drawn, with the truth beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
+from calibgraph.simulation.correspondences import simulate_correspondences
+from calibgraph.simulation.matcher_errors import MatcherErrors
+from calibgraph.solver.scan_distortion import distortions_at
+from factors import ProjectionBlock
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+
+FRAMES = 3
+SIZES = error_components().matchers["structure"]
+FIFTH = MatcherErrors(noise_px=1.6**0.5, frame_noise_px=0.4**0.5, outlier_share=0.15)
+FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What one draw solves.
+
+    Attributes:
+        rig: the true extrinsics; relative poses, if any, as they were measured.
+        table: the correspondences.
+    """
+
+    rig: Rig
+    table: Correspondences
+
+
+def draw_places(
+    places: int, matches: int, rng: Rng, *, frames: int = FRAMES, rounds: int = 1
+) -> Drawn:
+    """A table of so many places, that states the errors which were drawn.
+
+    Args:
+        places: how many.
+        matches: of a camera in a frame.
+        rng: draws the errors.
+        frames: of a place in each round.
+        rounds: how often all places are visited, one after the other.
+    """
+    truth, there = stereo(), []
+    findings = MatcherFindings.from_metadata(vars(SIZES))
+    whole = np.repeat(findings.rigid_sigmas, 3)
+    bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
+    at_place = np.repeat([SIZES.place_rotation_rad, SIZES.place_translation_m], 3)
+    cloud = np.sqrt(1 - SIZES.camera_share) * whole * rng.standard_normal(6)
+    cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
+    everywhere = displaced(truth, cloud, cameras)
+    tables, names = [], [list[int]() for _ in range(places)]
+    for visit in range(places * rounds):
+        place = visit % places
+        if visit < places:
+            moved = displaced(everywhere, at_place * rng.standard_normal(6), np.zeros((2, 6)))
+            there.append(displaced(moved, np.zeros(6), draw_cameras(truth, matches, rng)))
+        table = simulate_correspondences(
+            there[place],
+            frames=frames,
+            matches=matches,
+            errors=FIFTH,
+            seed=int(rng.integers(2**31)),
+        )
+        points = table.points_lidar_m
+        bent = points + np.tensordot(bends, distortions_at(points), axes=1)
+        tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
+        names[place] += range(frames * visit, frames * (visit + 1))
+    stated = {name: value for name, value in vars(SIZES).items()}
+    joined = concatenate(tables)
+    metadata = {**joined.metadata, **stated, "places": names}
+    return Drawn(truth, replace(joined, metadata=metadata))
+
+
+def draw_cameras(truth: Rig, matches: int, rng: Rng) -> Array:
+    """(2, 6) displacement of each camera's matches at a place, in the shape of its information."""
+    table = simulate_correspondences(
+        truth, frames=1, matches=matches, errors=FIFTH, seed=int(rng.integers(2**31))
+    )
+    steps = []
+    for name, camera in truth.cameras.items():
+        rows = table.of_camera(name)
+        block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
+        hessian = block.sums(to_T_lidar_camera(camera.T_camera_lidar)).hessian
+        variance = SIZES.place_variance * FIFTH.noise_px**2
+        root = np.linalg.cholesky(variance * np.linalg.inv(hessian))
+        steps.append(root @ rng.standard_normal(6))
+    return np.array(steps)
+
+
+def displaced(rig: Rig, cloud: Array, cameras: Array) -> Rig:
+    """The rig with its cloud and its cameras displaced."""
+    T_cloud = gtsam.Pose3.Expmap(cloud).matrix()
+    return rig.moved_to(
+        {
+            name: gtsam.Pose3.Expmap(xi).matrix() @ T @ T_cloud
+            for (name, T), xi in zip(rig.T_camera_lidar.items(), cameras, strict=True)
+        }
+    )
+
+
+def stereo() -> Rig:
+    """A pair like KITTI's, half a metre apart."""
+    lens = Intrinsics(fx=718.0, fy=718.0, cx=607.0, cy=185.0)
+    cameras = {}
+    for name, y_m in (("left", 0.1), ("right", -0.44)):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = FORWARD, -FORWARD @ [0.3, y_m, -0.1]
+        cameras[name] = Camera(width_px=1241, height_px=376, intrinsics_px=lens, T_camera_lidar=T)
+    return Rig(cameras=cameras)
+
+
+def tied(drawn: Drawn, rng: Rng, *, deg: float, cm: float) -> Drawn:
+    """The relative pose of the cameras is measured, with an error of this size."""
+    sigmas = {"rotation_sigma_rad": np.radians(deg), "translation_sigma_m": cm / 100}
+    error = np.repeat([*sigmas.values()], 3) * rng.standard_normal(6)
+    T_left_right = relative_transform(*drawn.rig.T_camera_lidar.values())
+    measured = T_left_right @ gtsam.Pose3.Expmap(error).matrix()
+    pair = RelativePose(a="left", b="right", T_a_b=measured, **sigmas)
+    return replace(drawn, rig=drawn.rig.model_copy(update={"relative_poses": (pair,)}))
