@@ -34,6 +34,10 @@ from factors.compiled import one_at_a_time
 from factors.kernel import (
     accumulate_alone,
     accumulate_shared,
+    costs_alone,
+    gradients_alone,
+    linearize_alone,
+    norms_alone,
     residuals_alone,
     residuals_shared,
 )
@@ -139,9 +143,21 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         return unpack_sums(sums.sum(axis=0))
 
-    def sums_at_each(self, T_camera_lidar: Array) -> BlockSums:
-        """H, b and c of the whole block at each of (p, 4, 4) poses, stacked."""
-        return self.run_sums(T_camera_lidar, np.tile([0, len(self)], (len(T_camera_lidar), 1)))
+    def gradients_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
+        gradients: Array = gradients_alone(
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma,
+        )  # fmt: skip
+        return gradients / self.sigma**2
+
+    def costs_at_each(self, T_camera_lidar: Array) -> Array:
+        """(p,) c of the whole block at each of (p, 4, 4) poses."""
+        costs: Array = costs_alone(
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma,
+        )  # fmt: skip
+        return costs / self.sigma**2
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
@@ -195,9 +211,33 @@ class ProjectionBlock(RobustBlock):
         )  # fmt: skip
         return residuals, projectable
 
+    def run_norms(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
+    ) -> Array:
+        """(2, n) norms of the unweighted [px] and of the whitened residuals, times a factor.
+
+        One row if there is no whitening; infinite where a point is not projectable.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) as in :meth:`run_residuals`; None: one run.
+            factor: by which both are multiplied.
+        """
+        norms: Array = norms_alone(
+            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
+            self._whitening, factor, self._chunks if runs is None else contiguous(runs),
+        )  # fmt: skip
+        return norms
+
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        return square_root(self.sums(T_lidar_camera))
+        if len(self) >= _WORTH_SHARING:
+            return square_root(self.sums(T_lidar_camera))
+        error, jacobian = linearize_alone(
+            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
+            self._whitening, loss_id(self.loss), self.scale * self.sigma, self.sigma, self._chunks,
+        )  # fmt: skip
+        return error, jacobian.T
 
 
 def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import conditioning
+from factors.conditioning import compiled_square_root
 
 Array = NDArray[np.float64]
 
@@ -34,8 +34,10 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
     eigenvectors, and directions without information get a zero row.
     """
-    hessian, gradient = np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient)
-    return conditioning.square_root(hessian, gradient, float(sums.cost))
+    error, jacobian = compiled_square_root(
+        np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient), float(sums.cost)
+    )
+    return error, jacobian.T
 
 
 _PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]

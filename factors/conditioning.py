@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +10,6 @@ from factors.compiled import compiled
 Array = NDArray[np.float64]
 
 _REGULAR = 1e-10  # least share of an unknown that those before it leave, for a triangular root
-_SEEN = 1e-14  # of the largest eigenvalue: below, a direction has no information
 
 
 def unit_diagonal(hessian: Array) -> tuple[Array, Array]:
@@ -49,47 +46,58 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     return np.where(known, values[:, 0], 0.0)
 
 
-def square_root(hessian: Array, gradient: Array, cost: float) -> tuple[Array, Array]:
-    """(n + 1,) error and (n + 1, n) Jacobian of sums, see ``block_sums.square_root``."""
-    n = len(gradient)
-    error, jacobian, units = np.zeros(n + 1), np.zeros((n, n + 1)), np.ones(n)
-    if not _fill_triangular_root(hessian, gradient, units, jacobian, error):
-        jacobian[:], error[:] = 0.0, 0.0
-        values, vectors = np.linalg.eigh(unit_diagonal(hessian)[0])
-        seen = np.flatnonzero(values > _SEEN * max(values[-1], 0.0))
-        roots, vectors = np.sqrt(values[seen]), vectors[:, seen]
-        jacobian[:, seen] = roots * vectors
-        error[seen] = (gradient / units) @ vectors / roots
-    error[n] = math.sqrt(max(cost - float(error @ error), 0.0))
-    return error, (units[:, None] * jacobian).T
-
-
 @compiled()
-def _fill_triangular_root(hessian, gradient, units, jacobian, error):  # type: ignore[no-untyped-def]
+def _fill_triangular_root(scaled, along, jacobian, error):  # type: ignore[no-untyped-def]
     """Fill in Cholesky's root of a regular matrix, and the error; whether it is regular.
 
     Args:
-        hessian: (n, n).
-        gradient: (n,).
-        units: (n,), filled: of a unit diagonal.
-        jacobian: (n, n + 1), filled below the diagonal, in these units.
+        scaled: (n, n), of unit diagonal.
+        along: (n,) gradient in its units.
+        jacobian: (n, n + 1), filled below the diagonal.
         error: (n + 1,), all but the last filled.
     """
-    for i in range(len(gradient)):
-        if hessian[i, i] > 0.0:
-            units[i] = math.sqrt(hessian[i, i])
-    for i in range(len(gradient)):
-        error[i] = gradient[i] / units[i]
+    for i in range(len(along)):
+        error[i] = along[i]
         for j in range(i + 1):
-            rest = hessian[i, j] / (units[i] * units[j])
+            rest = scaled[i, j]
             for m in range(j):
                 rest -= jacobian[i, m] * jacobian[j, m]
             if j < i:
                 jacobian[i, j] = rest / jacobian[j, j]
                 error[i] -= jacobian[i, j] * error[j]
             elif rest > _REGULAR:
-                jacobian[i, i] = math.sqrt(rest)
+                jacobian[i, i] = np.sqrt(rest)
                 error[i] /= jacobian[i, i]
             else:
                 return False
     return True
+
+
+@compiled()
+def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
+    """(n + 1,) error and the transposed (n, n + 1) Jacobian, see ``block_sums.square_root``."""
+    n = len(gradient)
+    units, along, scaled = np.ones(n), np.empty(n), np.empty((n, n))
+    for i in range(n):
+        if hessian[i, i] > 0.0:
+            units[i] = np.sqrt(hessian[i, i])
+        along[i] = gradient[i] / units[i]
+        for j in range(i + 1):
+            scaled[i, j] = scaled[j, i] = hessian[i, j] / (units[i] * units[j])
+    jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
+    if not _fill_triangular_root(scaled, along, jacobian, error):
+        jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
+        values, vectors = np.linalg.eigh(scaled)
+        for k in range(n):
+            if values[k] > 1e-14 * max(values[n - 1], 0.0):
+                root = np.sqrt(values[k])
+                for i in range(n):
+                    jacobian[i, k] = root * vectors[i, k]
+                    error[k] += vectors[i, k] * along[i] / root
+    rest = cost
+    for i in range(n):
+        rest -= error[i] * error[i]
+        for k in range(n):
+            jacobian[i, k] *= units[i]
+    error[n] = np.sqrt(max(rest, 0.0))
+    return error, jacobian

@@ -231,3 +231,27 @@ def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
     sums = (b0, b1, b2, b3, b4, b5)
     for k in range(6):
         out[k] += sums[k]
+
+
+@compiled(fastmath=FAST)
+def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
+    """Add J^T psi r of a tile to 6 sums, see ``sum_tile``."""
+    rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    res_u, res_v = tile[RU], tile[RV]
+    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    for i in range(n):
+        pull_u, pull_v = rp[i] * res_u[i], rp[i] * res_v[i]
+        g3 = -(pull_u * ux[i] + pull_v * vx[i])
+        g4 = -(pull_u * uy[i] + pull_v * vy[i])
+        g5 = -(pull_u * uz[i] + pull_v * vz[i])
+        x, y, z = rx[i], ry[i], rz[i]
+        b0 += g5 * y - g4 * z
+        b1 += g3 * z - g5 * x
+        b2 += g4 * x - g3 * y
+        b3 += g3
+        b4 += g4
+        b5 += g5
+    sums = (b0, b1, b2, b3, b4, b5)
+    for k in range(6):
+        out[k] += sums[k]

@@ -23,13 +23,14 @@ from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
     FISHEYE,
-    MIN_DEPTH_M,
     OMNIDIRECTIONAL,
     PINHOLE,
     RADTAN,
+    is_in_cone,
+    is_projectable,
     project_one,
 )
-from factors.wide_lenses import MIN_POLAR_SHARE, check_mirror, omnidirectional_limit
+from factors.wide_lenses import check_mirror, omnidirectional_limit
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye", "omnidirectional", "equirectangular"]
@@ -142,28 +143,20 @@ class Lens:
             (n, 2) pixels, and (n,) whether each is a real projection (in front of the camera and
             inside the injective domain of the lens). It may still lie outside the image.
         """
-        points = np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
-        return self.project_with_jacobian(points)[0], self.sees(points)
+        points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
+        pixels, valid = _project_many(self.kind, self.packed, points)
+        return pixels, valid
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
-        return self.sees(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
-
-    def sees(self, points_camera_m: Array) -> NDArray[np.bool_]:
-        """(n,) whether (n, 3) points of the camera frame lie inside the injective domain."""
-        x, y, z = points_camera_m.T
-        if self.kind == EQUIRECTANGULAR:
-            return np.asarray(np.hypot(x, z) > MIN_POLAR_SHARE * np.abs(y))
-        limit, squared = self.packed[-1], x * x + y * y
-        if self.kind in (PINHOLE, RADTAN):
-            with np.errstate(invalid="ignore"):  # no limit, at depth 0
-                return np.asarray((z > MIN_DEPTH_M) & (squared <= (limit * z) ** 2))
-        return np.asarray((squared + z * z > 0) & (np.arctan2(np.sqrt(squared), z) < limit))
+        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
+        T = contiguous(T_camera_lidar)
+        return np.asarray(_are_projectable(self.kind, self.packed, T, points))
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, jacobians = _project_many(self.kind, self.packed, points)
+        pixels, jacobians = _project_many_with_jacobian(self.kind, self.packed, points)
         return pixels, jacobians
 
     def fill_twist_columns(
@@ -179,13 +172,11 @@ class Lens:
         Returns:
             (2, n) pixels.
         """
-        points = points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        pixels, jacobians = self.project_with_jacobian(points)
-        columns[3:] = gx, gy, gz = jacobians.transpose(2, 1, 0)
-        x, y, z = points.T
-        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
-        columns[:3] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
-        return pixels.T
+        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64).T)
+        pixels: Array = _fill_twist_columns(
+            self.kind, self.packed, contiguous(T_camera_lidar), points, columns
+        )
+        return pixels
 
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
@@ -229,15 +220,60 @@ def _fisheye_limit(coefficients: Array) -> float:
 
 
 @compiled()
+def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
+    valid = np.empty(len(points), dtype=np.bool_)
+    looks_ahead = kind in (PINHOLE, RADTAN)
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if looks_ahead:
+            valid[i] = is_in_cone(lens, x, y, z)
+        else:
+            valid[i] = is_projectable(kind, lens, x, y, z)
+    return valid
+
+
+@compiled()
 def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
-    """(n, 2) pixels of (n, 3) points, and (n, 2, 3) their derivatives."""
+    pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        projection = project_one(kind, lens, x, y, z)
+        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+        valid[k] = is_projectable(kind, lens, x, y, z)
+    return pixels, valid
+
+
+@compiled()
+def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-def]
     n = len(points)
-    pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
+    pixels = np.empty((n, 2))
+    jacobians = np.empty((n, 2, 3))
     for k in range(n):
-        u, v, ux, uy, uz, vx, vy, vz = project_one(
-            kind, lens, points[k, 0], points[k, 1], points[k, 2]
-        )
-        pixels[k, 0], pixels[k, 1] = u, v
-        jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = ux, uy, uz
-        jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = vx, vy, vz
+        projection = project_one(kind, lens, points[k, 0], points[k, 1], points[k, 2])
+        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+        jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
+        jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
     return pixels, jacobians
+
+
+@compiled()
+def _fill_twist_columns(kind, lens, T, points, columns):  # type: ignore[no-untyped-def]
+    n = points.shape[1]
+    pixels = np.empty((2, n))
+    for i in range(n):
+        px, py, pz = points[0, i], points[1, i], points[2, i]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
+        pixels[0, i], pixels[1, i] = u, v
+        columns[3, 0, i], columns[4, 0, i], columns[5, 0, i] = ux, uy, uz
+        columns[3, 1, i], columns[4, 1, i], columns[5, 1, i] = vx, vy, vz
+        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
+        columns[0, 0, i], columns[0, 1, i] = y * uz - z * uy, y * vz - z * vy
+        columns[1, 0, i], columns[1, 1, i] = z * ux - x * uz, z * vx - x * vz
+        columns[2, 0, i], columns[2, 1, i] = x * uy - y * ux, x * vy - y * vx
+    return pixels

@@ -1,4 +1,4 @@
-"""Exponential and logarithm of SE(3) for many poses at once.
+"""Exponential and logarithm of SE(3) for many poses at once, compiled.
 
 As GTSAM's, of twists (rotation [rad], translation [m]). Below a small angle, series of two terms
 are as exact as the closed formulas.
@@ -6,81 +6,161 @@ are as exact as the closed formulas.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+import math
 
-Array = NDArray[np.float64]
+import numpy as np
+
+from factors.compiled import compiled
 
 _SMALL_ANGLE = 1e-2  # rad
-_CROSS = np.zeros((3, 3, 3))  # the matrices of the cross products with the axes
-_CROSS[0, 2, 1] = _CROSS[1, 0, 2] = _CROSS[2, 1, 0] = 1.0
-_CROSS[0, 1, 2] = _CROSS[1, 2, 0] = _CROSS[2, 0, 1] = -1.0
 
 
-def exponential_times(twists: Array, T: Array, out: Array) -> None:
+@compiled()
+def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
     """Fill (f, 4, 4) ``out`` with exp(twist) T of (f, 6) twists and (f, 4, 4) transforms."""
-    squared = np.einsum("fi,fi->f", twists[:, :3], twists[:, :3])
-    angle, small = np.sqrt(squared), squared < _SMALL_ANGLE**2
-    safe = np.where(small, 1.0, angle)
-    by_sine = np.where(small, 1 - squared / 6 * (1 - squared / 20), np.sin(safe) / safe)
-    by_cosine = np.where(
-        small, 0.5 - squared / 24 * (1 - squared / 30), 2 * (np.sin(safe / 2) / safe) ** 2
-    )
-    rest = np.where(small, 1 / 6 - squared / 120, (1 - by_sine) / safe**2)
-    # R = I + by_sine [w]x + by_cosine [w]x^2,  t = (I + by_cosine [w]x + rest [w]x^2) v.
-    cross = np.tensordot(twists[:, :3], _CROSS, 1)
-    twice = cross @ cross
-    step = np.zeros((len(twists), 4, 4))
-    step[:, :3, :3] = _series(cross, twice, by_sine, by_cosine)
-    step[:, :3, 3:] = _series(cross, twice, by_cosine, rest) @ twists[:, 3:, None]
-    step[:, 3, 3] = 1.0
-    np.matmul(step, T, out=out)
+    for i in range(len(twists)):
+        x, y, z = twists[i, 0], twists[i, 1], twists[i, 2]
+        u, v, w = twists[i, 3], twists[i, 4], twists[i, 5]
+        angle = math.sqrt(x * x + y * y + z * z)
+        squared = angle * angle
+        if angle < _SMALL_ANGLE:
+            first = 1.0 - squared / 6.0 * (1.0 - squared / 20.0)
+            second = 0.5 - squared / 24.0 * (1.0 - squared / 30.0)
+            third = 1.0 / 6.0 - squared / 120.0
+        else:
+            first, half = math.sin(angle) / angle, math.sin(angle / 2.0) / angle
+            second, third = 2.0 * half * half, (1.0 - first) / squared
+        # R = I + first [w]x + second [w]x^2,  t = (I + second [w]x + third [w]x^2) v.
+        xy, xz, yz = second * x * y, second * x * z, second * y * z
+        p, q, r = first * x, first * y, first * z
+        r00, r01, r02 = 1.0 - second * (y * y + z * z), xy - r, xz + q
+        r10, r11, r12 = xy + r, 1.0 - second * (x * x + z * z), yz - p
+        r20, r21, r22 = xz - q, yz + p, 1.0 - second * (x * x + y * y)
+        a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+        for column in range(4):
+            t0, t1, t2 = T[i, 0, column], T[i, 1, column], T[i, 2, column]
+            out[i, 0, column] = r00 * t0 + r01 * t1 + r02 * t2
+            out[i, 1, column] = r10 * t0 + r11 * t1 + r12 * t2
+            out[i, 2, column] = r20 * t0 + r21 * t1 + r22 * t2
+            out[i, 3, column] = 1.0 if column == 3 else 0.0  # noqa: PLR2004
+        out[i, 0, 3] += u + second * a + third * (y * c - z * b)
+        out[i, 1, 3] += v + second * b + third * (z * a - x * c)
+        out[i, 2, 3] += w + second * c + third * (x * b - y * a)
 
 
-def logarithms(steps: Array) -> Array:
+@compiled()
+def _rotation_vector(R):  # type: ignore[no-untyped-def]
+    """The logarithm of a rotation matrix, by its quaternion."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    largest = np.argmax(np.array([R[0, 0], R[1, 1], R[2, 2], trace]))
+    if largest == 3:  # noqa: PLR2004 - the trace
+        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace])
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q = np.empty(4)
+        q[i] = 1.0 - trace + 2.0 * R[i, i]
+        q[j], q[k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    if q[3] < 0.0:
+        q = -q
+    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    if sine == 0.0:
+        return np.zeros(3)
+    return q[:3] * (2.0 * math.atan2(sine, q[3]) / sine)
+
+
+@compiled()
+def logarithms(steps):  # type: ignore[no-untyped-def]
     """(f, 6) twists of (f, 4, 4) transforms."""
-    if not len(steps):
-        return np.empty((0, 6))
-    turn = Rotation.from_matrix(steps[:, :3, :3]).as_rotvec()
-    squared = np.einsum("fi,fi->f", turn, turn)
-    small = squared < _SMALL_ANGLE**2
-    safe = np.where(small, 1.0, np.sqrt(squared))
-    inward = np.where(small, 1 / 12 + squared / 720, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
-    # The inverse of the left Jacobian: I - [w]x / 2 + inward [w]x^2.
-    cross = np.tensordot(turn, _CROSS, 1)
-    back = _series(cross, cross @ cross, np.full(len(turn), -0.5), inward)
-    return np.hstack([turn, (back @ steps[:, :3, 3:])[:, :, 0]])
+    out = np.empty((len(steps), 6))
+    for i in range(len(steps)):
+        x, y, z = _rotation_vector(steps[i, :3, :3])
+        u, v, w = steps[i, 0, 3], steps[i, 1, 3], steps[i, 2, 3]
+        angle = math.sqrt(x * x + y * y + z * z)
+        if angle < _SMALL_ANGLE:
+            inward = 1.0 / 12.0 + angle * angle / 720.0
+        else:
+            inward = (1.0 - angle / 2.0 / math.tan(angle / 2.0)) / (angle * angle)
+        # The inverse of the left Jacobian: I - [w]x / 2 + inward [w]x^2.
+        a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+        out[i] = (
+            x,
+            y,
+            z,
+            u - a / 2.0 + inward * (y * c - z * b),
+            v - b / 2.0 + inward * (z * a - x * c),
+            w - c / 2.0 + inward * (x * b - y * a),
+        )
+    return out
 
 
-def between_errors(one: Array, two: Array) -> tuple[Array, Array, Array]:
+@compiled()
+def _multiply(a, b, out):  # type: ignore[no-untyped-def]
+    """Fill (6, 6) ``out`` with a b."""
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+@compiled()
+def _fill_cross(x, y, z, out):  # type: ignore[no-untyped-def]
+    """Fill (3, 3) ``out`` with [v]x; its diagonal is zero already."""
+    out[0, 1], out[0, 2], out[1, 0] = -z, y, z
+    out[1, 2], out[2, 0], out[2, 1] = -x, -y, x
+
+
+@compiled()
+def _relative_poses(one, two):  # type: ignore[no-untyped-def]
+    """(n, 4, 4) one^-1 two of rigid transforms."""
+    out = np.zeros((len(one), 4, 4))
+    for n in range(len(one)):
+        for i in range(3):
+            for k in range(3):
+                for j in range(3):
+                    out[n, i, j] += one[n, k, i] * two[n, k, j]
+                out[n, i, 3] += one[n, k, i] * (two[n, k, 3] - one[n, k, 3])
+        out[n, 3, 3] = 1.0
+    return out
+
+
+@compiled()
+def _fill_inverse_adjoint(T, cross, out):  # type: ignore[no-untyped-def]
+    """Fill (6, 6) ``out`` with Ad(T^-1) = [R^T, 0; -R^T [t]x, R^T]; ``cross`` is (3, 3) scratch."""
+    _fill_cross(T[0, 3], T[1, 3], T[2, 3], cross)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = out[3 + i, 3 + j] = T[j, i]
+            out[i, 3 + j] = out[3 + i, j] = 0.0
+            for k in range(3):
+                out[3 + i, j] -= T[k, i] * cross[k, j]
+
+
+@compiled()
+def between_errors(one, two):  # type: ignore[no-untyped-def]
     """(n, 6) log(one^-1 two) of (n, 4, 4) transforms; (n, 6, 6) its derivatives by both tangents.
 
     That of the second is the inverse of the right Jacobian, by the series of Bernoulli numbers up
     to the fourth power: displacements are far below a radian. That of the first is minus it, times
     Ad(two^-1 one).
     """
-    relative = np.array(two)
-    relative[:, :3, :3] = one[:, :3, :3].transpose(0, 2, 1) @ two[:, :3, :3]
-    apart = two[:, :3, 3:] - one[:, :3, 3:]
-    relative[:, :3, 3:] = one[:, :3, :3].transpose(0, 2, 1) @ apart
-    errors = logarithms(relative)
-    ad = np.zeros((len(one), 6, 6))
-    ad[:, :3, :3] = ad[:, 3:, 3:] = np.tensordot(errors[:, :3], _CROSS, 1)
-    ad[:, 3:, :3] = np.tensordot(errors[:, 3:], _CROSS, 1)
-    squared = ad @ ad
-    by_two = np.eye(6) + ad / 2 + squared / 12 - squared @ squared / 720
-    return errors, -by_two @ _inverse_adjoints(relative), by_two
-
-
-def _series(cross: Array, twice: Array, first: Array, second: Array) -> Array:
-    """(f, 3, 3) I + first [w]x + second [w]x^2."""
-    return np.eye(3) + first[:, None, None] * cross + second[:, None, None] * twice
-
-
-def _inverse_adjoints(T: Array) -> Array:
-    """(f, 6, 6) Ad(T^-1) = [R^T, 0; -R^T [t]x, R^T]."""
-    out, back = np.zeros((len(T), 6, 6)), T[:, :3, :3].transpose(0, 2, 1)
-    out[:, :3, :3] = out[:, 3:, 3:] = back
-    out[:, 3:, :3] = -back @ np.tensordot(T[:, :3, 3], _CROSS, 1)
-    return out
+    relative = _relative_poses(one, two)
+    errors, by_one = logarithms(relative), np.empty((len(one), 6, 6))
+    by_two, ad, inverse = np.empty((len(one), 6, 6)), np.zeros((6, 6)), np.empty((6, 6))
+    squared, fourth, cross = np.empty((6, 6)), np.empty((6, 6)), np.zeros((3, 3))
+    for n in range(len(one)):
+        x, y, z, u, v, w = errors[n]
+        _fill_cross(x, y, z, ad[:3, :3])
+        _fill_cross(x, y, z, ad[3:, 3:])
+        _fill_cross(u, v, w, ad[3:, :3])
+        _multiply(ad, ad, squared)
+        _multiply(squared, squared, fourth)
+        for i in range(6):
+            for j in range(6):
+                by_two[n, i, j] = ad[i, j] / 2 + squared[i, j] / 12 - fourth[i, j] / 720
+            by_two[n, i, i] += 1.0
+        _fill_inverse_adjoint(relative[n], cross, inverse)
+        _multiply(by_two[n], -inverse, by_one[n])
+    return errors, by_one, by_two

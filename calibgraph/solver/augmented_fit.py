@@ -13,7 +13,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.normal_equations import (
+from calibgraph.solver.normal_kernel import (
     grouped_gradients,
     solve_reweighted,
     weighted_products,
@@ -24,6 +24,10 @@ from factors import ProjectionBlock, unit_diagonal
 Array = NDArray[np.float64]
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
+_MAX_ITERATIONS = 20
+_CONVERGED = 1e-4  # largest change of an error in a step, in units of the loss' scale
+_LEAST_SHARE = 1e-10  # of an unknown's column, squared; smaller ones are rounding errors
+_LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +87,7 @@ class LinearRows:
         if len(self.group) < MIN_ROWS:
             return None
         which = np.array([*range(6), *(6 + k for k in unknowns), len(self.columns) - 1])
-        solved = solve_reweighted(self.columns[which], loss_scale)
+        solved = self._solve_reweighted(which, loss_scale)
         if solved is None:
             return None
         solution, normal, weights, errors = solved
@@ -106,12 +110,30 @@ class LinearRows:
             (6, k); NaN where the rows do not determine the pose, as without any.
         """
         which = np.array([*range(6), *(6 + k for k in unknowns)])
-        products = weighted_products(self.columns[which], weights)
+        products = weighted_products(self.columns, which, weights)
         scaled, units = unit_diagonal(products[:6, :6])
         if np.linalg.matrix_rank(scaled, hermitian=True) < len(scaled):
             return np.full((6, len(unknowns)), np.nan)
         twists = np.linalg.solve(scaled, products[:6, 6:] / units[:, None])
         return np.asarray(twists / units[:, None])
+
+    def _solve_reweighted(
+        self, which: NDArray[np.intp], loss_scale: float | None
+    ) -> tuple[Array, Array, Array, Array] | None:
+        """Iteratively reweighted least squares with a Cauchy loss on the norm of each row.
+
+        Returns:
+            (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors. None if the
+            matrix is singular.
+        """
+        solution, normal, weights, errors, regular = solve_reweighted(
+            self.columns,
+            which,
+            0.0 if loss_scale is None else float(loss_scale),
+            _LOSS_MEDIANS,
+            (_MAX_ITERATIONS, _CONVERGED, _LEAST_SHARE),
+        )
+        return (solution, normal, weights, errors) if regular else None
 
     def _cluster_sigmas(
         self, which: NDArray[np.intp], normal: Array, inverse: Array, weights: Array, errors: Array
@@ -127,7 +149,7 @@ class LinearRows:
         """
         if self.groups < 2:  # noqa: PLR2004
             return np.full(len(normal), np.nan)
-        sums = grouped_gradients(self.columns[which], errors, weights, self.group)
+        sums = grouped_gradients(self.columns, which, errors, weights, self.group, self.groups)
         scatter = with_pseudo_frames(
             sums.T @ sums, normal, np.full(len(normal), float(self.groups))
         )

@@ -17,8 +17,8 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.quantiles import median, medians
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
+from calibgraph.solver.spread_kernel import median, medians
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
@@ -140,15 +140,14 @@ class CameraBlock:
             projectable.
         """
         medians = median_norm(self.information)
+        if self.information is None:
+            norms = self.block.run_norms(T_camera_lidar, runs, factor=1.0 / float(medians))
+            return norms[0], norms[-1]
         runs = np.array([[0, len(self.frame)]]) if runs is None else runs
         residuals, projectable = self.block.run_residuals(T_camera_lidar, runs)
         sizes_px = constrained_error_px(residuals, self.information) / medians
-        sizes_px[~projectable] = np.inf
-        if self.information is None and self.block.sqrt_information is None:
-            return sizes_px, sizes_px
         sizes = whitened_norm(self.block.sqrt_information, residuals) / medians
-        sizes[~projectable] = np.inf
-        return sizes_px, sizes
+        return np.where(projectable, sizes_px, np.inf), np.where(projectable, sizes, np.inf)
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] along constrained directions; (n,) whether projectable."""
@@ -161,6 +160,8 @@ class CameraBlock:
 
     def within_gate(self, T_camera_lidar: Array, gate_px: float) -> NDArray[np.bool_]:
         """(n,) which are projectable, with an error of at most so many pixels."""
+        if self.information is None:
+            return np.asarray(self.block.run_norms(T_camera_lidar[None])[0] <= gate_px)
         errors_px, projectable = self.errors_px(T_camera_lidar)
         return np.asarray(projectable & (errors_px <= gate_px))
 
@@ -177,7 +178,7 @@ class CameraBlock:
         errors = sample.block.rewhiten(root).rescale(scale=scale_px)
         if errors.loss != "cauchy":
             errors = replace(errors, loss="cauchy")
-        return int(np.argmin(errors.sums_at_each(np.array(candidates)).cost))
+        return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
         """The configured scales, or those of the residuals' own spread at a T_camera_lidar."""

@@ -164,7 +164,7 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         T_lidar_camera: where; the Hessian is in its tangent.
     """
     near = np.tile(to_T_camera_lidar(T_lidar_camera), (12, 1, 1))
-    gradients = block.sums_at_each(retract_all(near, _STEPS)).gradient
+    gradients = block.gradients_at_each(retract_all(near, _STEPS))
     hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
     hessian = (hessian + hessian.T) / 2
     if np.linalg.eigvalsh(hessian)[0] > 0:

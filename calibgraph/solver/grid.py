@@ -12,9 +12,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from factors.compiled import compiled
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
 _MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, a hash table holds those that are taken
 _ROWS_OF_RUN = 4  # of one camera and frame, at least, in a table that is worth taking run by run
 
@@ -82,11 +79,16 @@ def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> N
     return np.concatenate([[0], np.flatnonzero(new) + 1, [len(frame)]])
 
 
-def _cells(camera: Rows, pixels: Array, sizes: Array, shape: Array) -> NDArray[np.int64]:
+@compiled()
+def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
     """(n,) number of the cell that each pixel lies in; pixels outside belong to the edge cells."""
-    places = np.clip((pixels + 0.5) / sizes[camera] * shape, 0, shape - 1)
-    column, row = places.astype(np.int64).T
-    return np.asarray(row * int(shape[0]) + column)
+    cells, columns = np.empty(len(camera), dtype=np.int64), np.int64(shape[0])
+    for i in range(len(camera)):
+        width, height = sizes[camera[i], 0], sizes[camera[i], 1]
+        column = min(max((pixels[i, 0] + 0.5) / width * shape[0], 0.0), shape[0] - 1.0)
+        row = min(max((pixels[i, 1] + 0.5) / height * shape[1], 0.0), shape[1] - 1.0)
+        cells[i] = np.int64(row) * columns + np.int64(column)
+    return cells
 
 
 @compiled()

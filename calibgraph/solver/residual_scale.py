@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
-from calibgraph.solver.quantiles import quantile_of_ordered
+from calibgraph.solver.spread_kernel import spreads_alone, spreads_shared
+from factors.block_arrays import contiguous
+from factors.compiled import one_at_a_time
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,7 @@ MIN_SIGMA_PX = 0.05
 
 _START_QUANTILE, _START_FACTOR = 0.2, 1.762  # median of a Rayleigh distribution over that quantile
 _HALF = 0.5
+_WORTH_SHARING = 2_000_000  # values (6 ms): below, waiting for busy cores costs more
 _CUT = 4.0  # medians, 4.7 sigma in two dimensions: inliers lie below
 
 
@@ -75,20 +78,21 @@ def robust_spread(values: Array) -> float:
     it is constant: clean values give their median; a broad background, up to three quarters of all,
     hardly changes it; and values without a core give a large spread, since their median then grows.
     """
-    ordered = np.sort(values[values < math.inf])
-    if not len(ordered):
-        return math.inf
-
-    def quantile_below(limit: float, share: float) -> float:
-        count = int(np.searchsorted(ordered, limit, side="right"))
-        return quantile_of_ordered(ordered, count, share) if count else math.nan
-
-    return iterate_spread(quantile_below)
+    return float(robust_spreads(values, np.array([[0, len(values)]]))[0])
 
 
 def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
     """(r,) :func:`robust_spread` of the finite values in each of (r, 2) runs of (n,) values."""
-    return np.array([robust_spread(values[first:end]) for first, end in runs])
+    shared = len(values) >= _WORTH_SHARING
+    run = one_at_a_time(spreads_shared) if shared else spreads_alone
+    spreads: Array = run(
+        np.ascontiguousarray(values),
+        contiguous(runs),
+        (_START_QUANTILE, _START_FACTOR),
+        _HALF,
+        _CUT,
+    )
+    return spreads
 
 
 def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:

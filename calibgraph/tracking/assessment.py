@@ -12,8 +12,8 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.quantiles import median
 from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, joint_estimate
+from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.state import CameraState, State

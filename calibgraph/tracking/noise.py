@@ -50,6 +50,12 @@ class ResidualHistogram:
         return scale_from(sigma_px, max(spread, self.least), config)
 
 
+def median(values: Array) -> float:
+    """The median of at least one number; ``np.median`` takes ten times as long for some hundred."""
+    ordered, half = np.sort(values), len(values) // 2
+    return float(ordered[half] if len(values) % 2 else (ordered[half - 1] + ordered[half]) / 2)
+
+
 def _counted(sizes: Array) -> Array:
     places = np.searchsorted(_EDGES, sizes, side="right") - 1
     counts = np.bincount(np.minimum(places, len(_EDGES) - 2), minlength=len(_EDGES) - 1)

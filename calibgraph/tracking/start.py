@@ -20,9 +20,8 @@ from calibgraph.solver.camera_block import (
     camera_blocks,
 )
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.quantiles import median
 from calibgraph.tracking.live_frames import Epoch, LiveFrame
-from calibgraph.tracking.noise import ResidualHistogram
+from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 

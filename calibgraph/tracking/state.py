@@ -14,7 +14,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.quantiles import median
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.bends import BendSums
@@ -24,6 +23,7 @@ from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
     inflation,
+    median,
     no_groups,
     widening,
 )

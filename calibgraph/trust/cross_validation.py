@@ -16,8 +16,8 @@ from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock, camera_block
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
-from calibgraph.solver.quantiles import median
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
 

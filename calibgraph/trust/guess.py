@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
 from calibgraph.model.verdict import Check
-from calibgraph.solver.quantiles import median
+from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
 from calibgraph.trust.thresholds import limit, threshold

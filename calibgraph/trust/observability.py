@@ -11,8 +11,8 @@ from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.curvature import pose_hessian
-from calibgraph.solver.quantiles import quantile
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.spread_kernel import quantile
 
 Array = NDArray[np.float64]
 

@@ -136,7 +136,7 @@ def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
 def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
     block = world(LENSES["pinhole"], count).rescale(scale=3.0, sigma=0.7)
     poses = [TRUTH.retract(np.full(6, step)) for step in (0.0, 1e-3, -0.02)]
-    found = block.sums_at_each(np.array([p.inverse().matrix() for p in poses])).gradient
+    found = block.gradients_at_each(np.array([pose.inverse().matrix() for pose in poses]))
     for gradient, pose in zip(found, poses, strict=True):
         expected = block.sums(pose).gradient
         scale = np.abs(expected).max() or 1.0  # sums in another order: rounding alone
@@ -338,5 +338,9 @@ def test_kernels_are_compiled_once_whether_or_not_their_arrays_can_be_written() 
         runs.flags.writeable = pose.flags.writeable
         block.run_sums(pose[None], runs)
         block.run_residuals(pose[None], runs)
-    for one in (kernel.accumulate_alone, kernel.residuals_alone):
+        block.run_norms(pose[None], runs)
+        block.costs_at_each(pose[None])
+        block.lens.are_projectable(block.points_lidar_m, pose)
+    for one in (kernel.accumulate_alone, kernel.residuals_alone, kernel.norms_alone,
+                kernel.costs_alone):  # fmt: skip
         assert len(one.signatures) == 1, one.signatures

@@ -42,11 +42,32 @@ def test_runs_at_poses_of_their_own_have_the_sums_of_their_blocks(lens: str) -> 
 def test_a_block_at_many_poses_has_the_gradients_and_costs_of_each(lens: str) -> None:
     for block in blocks(lens):
         each = [block.sums(pose) for pose in poses()[1:]]
-        found = block.sums_at_each(T_camera_lidar())
-        np.testing.assert_allclose(found.cost, [one.cost for one in each], rtol=1e-12)
         gradients = np.array([one.gradient for one in each])
         most = np.abs(gradients).max()  # sums in another order: rounding alone
-        np.testing.assert_allclose(found.gradient, gradients, rtol=0, atol=1e-13 * most)
+        found = block.gradients_at_each(T_camera_lidar())
+        np.testing.assert_allclose(found, gradients, rtol=0, atol=1e-13 * most)
+        costs = block.costs_at_each(T_camera_lidar())
+        np.testing.assert_allclose(costs, [one.cost for one in each], rtol=1e-12)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: str) -> None:
+    T = T_camera_lidar()
+    T[3] = np.diag([-1.0, 1, -1, 1]) @ T[0]
+    for block in blocks(lens):
+        norms = block.run_norms(T, to_runs(EDGES), factor=0.5)
+        residuals, projectable = block.run_residuals(T, to_runs(EDGES))
+        assert (np.isfinite(norms) == projectable).all()
+        assert projectable.all() == (lens == "equirectangular")  # a panorama sees behind
+        x, y = residuals.T
+        a, b, c = (np.ones((1000, 3)) * [1, 0, 1] if block.sqrt_information is None
+                   else block.sqrt_information).T  # fmt: skip
+        for found, expected in zip(
+            norms, (np.hypot(x, y), np.hypot(a * x + b * y, c * y)), strict=False
+        ):
+            np.testing.assert_allclose(
+                found[projectable], 0.5 * expected[projectable], rtol=1e-12, atol=1e-12
+            )
 
 
 def test_error_and_jacobian_are_the_root_of_the_sums() -> None:

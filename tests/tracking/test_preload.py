@@ -7,7 +7,7 @@ import sys
 
 PROGRAM = """
 import sys
-from numba.extending import is_jitted
+from numba.core.dispatcher import Dispatcher
 from calibgraph import IncrementalCalibrator, perturb
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
@@ -15,7 +15,7 @@ from calibgraph.tracking import warm_up_tracker
 
 def loaded():
     modules = [m for n, m in sys.modules.items() if n.startswith(("calibgraph.", "factors."))]
-    kernels = {id(v): v for m in modules for v in vars(m).values() if is_jitted(v)}
+    kernels = {id(v): v for m in modules for v in vars(m).values() if isinstance(v, Dispatcher)}
     return sum(len(kernel.overloads) for kernel in kernels.values())
 
 before = loaded()

@@ -1,16 +1,26 @@
 """The kernel that scores windows against an image at every shift of a grid.
 
-Where the time of a calibration goes. The sums over a window's points are taken for a row of shifts
-at once, and for a few points at once, so that a sum is loaded and stored once for all of them;
-``benchmarks.speed.kernel`` compares it with a matrix product. The image has zero mean, which keeps
-single precision: its sum of squares is then not the difference of two large numbers.
+Where the time of a calibration goes. What makes it fast, measured against a matrix product by
+``benchmarks.speed.kernel``: the sums over a window's points are taken for a block of shifts at
+once, in registers, so that a pixel is loaded for all products that it is in, and no sum is loaded
+or stored in between. The image has zero mean, which keeps single precision: its sum of squares is
+then not the difference of two large numbers.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.matching.structure.registers import (
+    LANES,
+    ROWS,
+    fill_block,
+    load_block,
+    store_block,
+)
 from factors.compiled import compiled
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
@@ -23,8 +33,7 @@ CHANCE_DEPTH, CHANCE_INTENSITY = 0.13, 0.05
 """Shares of a structured image's variation that an unrelated window explains. Without them,
 windows would rather lie on any structure than on the flat image that they belong to."""
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
-_BLOCK, _WIDTH = 16, 128  # shifts of a row that are scored at once
-_A, _B, _C, _D, _E = (_WIDTH * np.arange(1, 6)).tolist()
+UNCOUNTED = {"_nrt": False}  # arrays of callers: to count references takes as long as short loops
 
 
 def score_windows(
@@ -58,122 +67,122 @@ def score_windows(
         chance: how much of an unrelated window's share to subtract.
     """
     height, width = image.shape
-    pixels = np.zeros((height, width + _BLOCK), np.float32)  # rows of shifts come in whole blocks
-    pixels[:, :width] = image - image.mean()
-    room = np.empty(6 * _WIDTH, np.float32)
-    totals = np.full(grids.shape[1:], likelihood, np.float32)
+    pixels = np.zeros((height + ROWS, width + LANES), np.float32)  # blocks may begin anywhere
+    pixels[:height, :width] = image - image.mean()
+    rows, columns = grids.shape[1:]
+    padded = math.ceil(columns / LANES) * LANES
+    room = (
+        np.empty(places.shape[1], np.int64),
+        np.empty(ROWS * padded, np.float32),
+        np.full((rows + ROWS) * padded, likelihood, np.float32),
+    )
     _score_windows(
-        pixels.ravel(), image.shape, places, counts, basis, group, origin, likelihood, room, totals,
+        pixels.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
         grids, (chance * CHANCE_DEPTH, chance * CHANCE_INTENSITY),
     )  # fmt: skip
 
 
-@compiled(fastmath=True)
-def _score_windows(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
-    pixels, shape, places, counts, basis, group, origin, likelihood, room, totals, grids, by_chance
-):
+@compiled(fastmath=True, **UNCOUNTED)
+def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_chance):  # type: ignore[no-untyped-def]
     """See :func:`score_windows`.
 
-    room: for sums; totals: the scores of a group, of likelihoods as factors.
+    room: for the place in pixels of each point of a window, the scores of a row of blocks, and the
+    scores of a group, in rows as long as whole blocks; of likelihoods they are factors.
     """
     height, width = shape
-    stride = width + _BLOCK
-    rows, columns = totals.shape
-    start = np.empty(places.shape[1], np.int64)
+    places, counts, basis, group = windows
+    start, scores, totals = room
+    stride, padded = width + LANES, len(scores) // ROWS
+    rows, columns = grids.shape[1], grids.shape[2]
     held = 0  # windows whose scores are in the totals
     for w in range(len(places)):
         n = counts[w]
         if held > 0 and (group[w] != group[w - 1] or (likelihood and held == FACTORS)):
-            _take_totals(totals, likelihood, grids[group[w - 1]])
+            _take_totals(totals, padded, likelihood, grids[group[w - 1]])
             held = 0
         held += 1
-        left, top = places[w, 0, 0], places[w, 0, 1]
-        right, bottom, chance = left, top, np.float32(0)
+        left, right, top, bottom = _find_extent(places[w], n)
+        first, above = max(origin[0], -left), max(origin[1], -top)
+        size = min(origin[0] + columns, width - right) - first
+        end = min(origin[1] + rows, height - bottom)
+        chance = 0.0
         for p in range(n):
-            u, v = places[w, p, 0], places[w, p, 1]
-            left, right = u if u < left else left, u if u > right else right
-            top, bottom = v if v < top else top, v if v > bottom else bottom
             chance += by_chance[0] * basis[w, p, 0] ** 2 + by_chance[1] * basis[w, p, 1] ** 2
-            start[p] = v * stride + u
-        first, end = max(origin[0], -left), min(origin[0] + columns, width - right)
-        for shift in range(max(origin[1], -top), min(origin[1] + rows, height - bottom)):
-            for k in range(first, end, _WIDTH):
-                size = end - k if end - k < _WIDTH else _WIDTH
-                blocks = (size + _BLOCK - 1) // _BLOCK
-                at = shift * stride + k
-                _sum_points(pixels, start, at, n, basis[w], likelihood, blocks, room)
-                total = totals[shift - origin[1], k - origin[0] :]
-                _add_scores(room, size, n, chance, likelihood, total)
+            start[p] = (places[w, p, 1] + above) * stride + places[w, p, 0] + first
+        for shift in range(above, end, ROWS):
+            for k in range(0, size, LANES):
+                at = (shift - above) * stride + k
+                score = _score_block(pixels, start, at, stride, n, basis[w], chance, likelihood)
+                store_block(scores, k, padded, score)
+            at = (shift - origin[1]) * padded + first - origin[0]
+            length = size if size < columns else padded  # of whole vectors where it can be
+            _add_scores(scores, padded, min(ROWS, end - shift), length, likelihood, totals[at:])
     if held:
-        _take_totals(totals, likelihood, grids[group[-1]])
+        _take_totals(totals, padded, likelihood, grids[group[-1]])
 
 
-@compiled(fastmath=True)
-def _sum_points(pixels, start, at, n, basis, likelihood, blocks, room):  # type: ignore[no-untyped-def]
-    """Fill in the sums over a window's points at a row of shifts, some points at a time.
+@compiled(**UNCOUNTED)
+def _find_extent(places, n):  # type: ignore[no-untyped-def]
+    """The least and largest u, then v, of the first n places."""
+    left, top = places[0, 0], places[0, 1]
+    right, bottom = left, top
+    for p in range(1, n):
+        left, right = min(left, places[p, 0]), max(right, places[p, 0])
+        top, bottom = min(top, places[p, 1]), max(bottom, places[p, 1])
+    return left, right, top, bottom
 
-    At the first shift, point p lies at pixels[start[p] + at].
+
+@compiled(fastmath=True, **UNCOUNTED)
+def _score_block(pixels, start, at, stride, n, basis, chance, likelihood):  # type: ignore[no-untyped-def]
+    """The score of a window of n points at a block of shifts; of a likelihood, the factor.
+
+    At the first of the shifts, point p lies at pixels[start[p] + at].
     """
-    width = _BLOCK * blocks
-    for k in range(width):
-        room[k] = room[_A + k] = room[_B + k] = room[_C + k] = room[_D + k] = room[_E + k] = 0
-    whole = n - n % 5
-    for p in range(0, whole, 5):
-        r, s, t = pixels[start[p] + at :], pixels[start[p + 1] + at :], pixels[start[p + 2] + at :]
-        q, o = pixels[start[p + 3] + at :], pixels[start[p + 4] + at :]
-        b = basis[p:]
-        if likelihood:
-            for k in range(width):
-                v, w, x, y, z = r[k], s[k], t[k], q[k], o[k]
-                room[k] += b[0, 0] * v + b[1, 0] * w + b[2, 0] * x + b[3, 0] * y + b[4, 0] * z
-                room[_A + k] += b[0, 1] * v + b[1, 1] * w + b[2, 1] * x + b[3, 1] * y + b[4, 1] * z
-                room[_B + k] += v + w + x + y + z
-                room[_C + k] += v * v + w * w + x * x + y * y + z * z
-        else:
-            for k in range(width):
-                v, w, x, y, z = r[k], s[k], t[k], q[k], o[k]
-                room[k] += b[0, 0] * v + b[1, 0] * w + b[2, 0] * x + b[3, 0] * y + b[4, 0] * z
-                room[_A + k] += b[0, 1] * v + b[1, 1] * w + b[2, 1] * x + b[3, 1] * y + b[4, 1] * z
-                room[_B + k] += v + w + x + y + z
-                room[_C + k] += v * v + w * w + x * x + y * y + z * z
-                room[_D + k] += b[0, 2] * v + b[1, 2] * w + b[2, 2] * x + b[3, 2] * y + b[4, 2] * z
-                room[_E + k] += b[0, 3] * v + b[1, 3] * w + b[2, 3] * x + b[3, 3] * y + b[4, 3] * z
-    for p in range(whole, n):
-        seen = pixels[start[p] + at :]
-        for k in range(width):
-            x = seen[k]
-            room[k] += basis[p, 0] * x
-            room[_A + k] += basis[p, 1] * x
-            room[_B + k] += x
-            room[_C + k] += x * x
-            room[_D + k] += basis[p, 2] * x
-            room[_E + k] += basis[p, 3] * x
-
-
-@compiled(fastmath=True)
-def _add_scores(room, width, n, chance, likelihood, totals):  # type: ignore[no-untyped-def]
-    """Add the scores of a row of shifts to the totals, or multiply factors."""
-    noise, mean = np.float32(n * GRAY_NOISE**2), np.float32(1.0 / n)
-    over = np.float32(1 / (1 + MIN_RESIDUAL_SHARE))
-    for k in range(width):
-        shade, total = room[_A + k], room[_B + k]
-        explained = room[k] * room[k] + shade * (shade if shade > 0 else OPPOSITE * shade)
-        trend = room[_D + k] * room[_D + k] + room[_E + k] * room[_E + k]
-        varied = room[_C + k] + noise - total * total * mean - trend
-        room[k] = (explained + chance * noise) / varied - chance
+    noise = n * GRAY_NOISE**2
+    depth, intensity, total = fill_block(0.0), fill_block(0.0), fill_block(0.0)
+    variation = fill_block(noise)
+    for p in range(n):
+        seen = load_block(pixels, start[p] + at, stride)
+        depth += basis[p, 0] * seen
+        intensity += basis[p, 1] * seen
+        total += seen
+        variation += seen * seen
+    variation -= total * total * (1.0 / n)
+    explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
     if likelihood:
-        for k in range(width):
-            totals[k] *= np.float32(1) - room[k] * over
-    else:
-        for k in range(width):
-            totals[k] += room[k]
+        share = (explained + chance * noise) / variation - chance
+        return 1.0 - share * (1 / (1 + MIN_RESIDUAL_SHARE))
+    trend_u, trend_v = fill_block(0.0), fill_block(0.0)
+    for p in range(n):
+        seen = load_block(pixels, start[p] + at, stride)
+        trend_u += basis[p, 2] * seen
+        trend_v += basis[p, 3] * seen
+    variation -= trend_u * trend_u + trend_v * trend_v
+    return (explained + chance * noise) / variation - chance
 
 
-@compiled(fastmath=True)
-def _take_totals(totals, likelihood, grid):  # type: ignore[no-untyped-def]
+@compiled(fastmath=True, **UNCOUNTED)
+def _add_scores(scores, padded, lines, size, likelihood, totals):  # type: ignore[no-untyped-def]
+    """Add lines of scores to the totals, or multiply factors."""
+    for line in range(lines):
+        of_line, out = scores[line * padded :], totals[line * padded :]
+        if likelihood:
+            for k in range(size):
+                out[k] *= of_line[k]
+        else:
+            for k in range(size):
+                out[k] += of_line[k]
+
+
+@compiled(fastmath=True, **UNCOUNTED)
+def _take_totals(totals, padded, likelihood, grid):  # type: ignore[no-untyped-def]
     """Add the totals to a grid, of factors the negative logarithms, and clear them."""
     for row in range(grid.shape[0]):
-        of_row, out = totals[row], grid[row]
-        for column in range(len(out)):
-            out[column] += -np.log(of_row[column]) if likelihood else of_row[column]
+        of_row = totals[row * padded :]
+        if likelihood:
+            for column in range(grid.shape[1]):
+                grid[row, column] -= np.log(of_row[column])
+        else:
+            for column in range(grid.shape[1]):
+                grid[row, column] += of_row[column]
     totals[:] = np.float32(likelihood)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.structure.directions import view_angles
 from calibgraph.model.rig import Camera
 from factors import unproject
-from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE, RADTAN
+from factors.block_arrays import contiguous
+from factors.compiled import compiled
+from factors.lens_kernels import (
+    EQUIRECTANGULAR,
+    PINHOLE,
+    RADTAN,
+    is_projectable,
+    project_one,
+    subtract_columns,
+)
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -29,15 +39,15 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
         (k,) their rows; (k, 2) view angles [rad], see :func:`directions.view_angles`; (k,)
         distances from the camera [m].
     """
-    T, least = camera.T_camera_lidar, _least_cosine(camera)
-    points = np.asarray(points_lidar_m) @ T[:3, :3].T + T[:3, 3]
-    distance_m = np.sqrt(np.einsum("ij,ij->i", points, points))
-    rows = np.flatnonzero(points[:, 2] >= least * distance_m)
-    pixels, valid = camera.lens.project(points[rows])
-    places = pixels + 0.5
-    inside = (places >= 0) & (places < (camera.width_px, camera.height_px))
-    rows = rows[valid & inside.all(axis=1)]
-    return rows, view_angles(points[rows]), distance_m[rows]
+    lens, T = camera.lens, contiguous(camera.T_camera_lidar)
+    points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
+    rows = np.empty(len(points), np.intp)
+    views = np.empty((len(points), 3))
+    count = _find_in_view(
+        lens.kind, lens.packed, T, points, camera.width_px, camera.height_px, _least_cosine(camera),
+        rows, views,
+    )  # fmt: skip
+    return rows[:count], views[:count, :2], views[:count, 2]
 
 
 def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
@@ -50,26 +60,41 @@ def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
     """
     if not len(angles):
         return np.empty(0, np.bool_)
-    columns, rows = (angles - angles.min(axis=0)).T
-    columns, rows = (columns / cell_rad).astype(np.intp), (rows / cell_rad).astype(np.intp)
-    cell = columns * (rows.max() + 1) + rows
-    nearest_m = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(nearest_m, cell, distance_m)
-    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[cell] + HIDDEN_M)
+    least, most = _range(angles)
+    rows, columns = np.floor((most - least) / cell_rad).astype(np.int64) + 1
+    nearest_m, cell = np.full(rows * columns, np.inf), np.empty(len(angles), np.int64)
+    visible = np.empty(len(angles), np.bool_)
+    _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible)
+    return visible
 
 
 def find_places(
     rays_m: NDArray[np.float32], viewpoint_lidar_m: Array, camera: Camera, scale: Array
 ) -> NDArray[np.int32]:
     """(w, l, 2) nearest pixels, of an image scaled by (2,), to the ends of rays (w, l, 3)."""
-    T = camera.T_camera_lidar
-    points = (rays_m.reshape(-1, 3) + viewpoint_lidar_m) @ T[:3, :3].T + T[:3, 3]
-    pixels = camera.lens.project_with_jacobian(points)[0]
-    if camera.lens.kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
-        centres = pixels.reshape(rays_m.shape[:2] + (2,))[:, :1].repeat(rays_m.shape[1], axis=1)
-        pixels = centres.reshape(-1, 2) + camera.lens.subtract(pixels, centres.reshape(-1, 2))
-    places = np.rint((pixels + 0.5) * scale - 0.5).astype(np.int32)
-    return places.reshape(rays_m.shape[:2] + (2,))
+    lens, T = camera.lens, contiguous(camera.T_camera_lidar)
+    places = np.empty((*rays_m.shape[:2], 2), np.int32)
+    _find_places(lens.kind, lens.packed, T, viewpoint_lidar_m, scale, rays_m, places)
+    return places
+
+
+@compiled()
+def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
+    for w in range(rays_m.shape[0]):
+        for p in range(rays_m.shape[1]):
+            px, py = rays_m[w, p, 0] + viewpoint[0], rays_m[w, p, 1] + viewpoint[1]
+            pz = rays_m[w, p, 2] + viewpoint[2]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            projection = project_one(kind, lens, x, y, z)
+            u = projection[0]
+            if p == 0:
+                centre = u
+            elif kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
+                u = centre + subtract_columns(kind, lens, u, centre)
+            places[w, p, 0] = round((u + 0.5) * scale[0] - 0.5)
+            places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
 
 def _least_cosine(camera: Camera) -> float:
@@ -82,3 +107,49 @@ def _least_cosine(camera: Camera) -> float:
     if not valid.all() or camera.lens.kind not in (PINHOLE, RADTAN):
         return -1.0
     return float(rays[:, 2].min()) * _COSINE_MARGIN
+
+
+@compiled()
+def _range(angles):  # type: ignore[no-untyped-def]
+    """The least and the greatest of each column; NumPy is slow with columns."""
+    least, most = angles[0].copy(), angles[0].copy()
+    for i in range(len(angles)):
+        for k in range(2):
+            least[k], most[k] = min(least[k], angles[i, k]), max(most[k], angles[i, k])
+    return least, most
+
+
+@compiled()
+def _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible):  # type: ignore[no-untyped-def]
+    for i in range(len(angles)):
+        row = np.int64((angles[i, 0] - least[0]) / cell_rad)
+        column = np.int64((angles[i, 1] - least[1]) / cell_rad)
+        cell[i] = row * columns + column
+        nearest_m[cell[i]] = min(nearest_m[cell[i]], distance_m[i])
+    for i in range(len(angles)):
+        visible[i] = distance_m[i] < HIDDEN_RATIO * nearest_m[cell[i]] + HIDDEN_M
+
+
+@compiled()
+def _find_in_view(kind, lens, T, points, width, height, least_cosine, rows, views):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        squared = x * x + y * y + z * z
+        if least_cosine > 0 and (z <= 0 or z * z < least_cosine * least_cosine * squared):
+            continue
+        if not is_projectable(kind, lens, x, y, z):
+            continue
+        projection = project_one(kind, lens, x, y, z)
+        u, v = projection[0] + 0.5, projection[1] + 0.5
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        rows[count] = i
+        views[count, 0] = math.atan2(x, z)
+        views[count, 1] = math.atan2(y, math.sqrt(x * x + z * z))
+        views[count, 2] = math.sqrt(squared)
+        count += 1
+    return count
