@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -22,7 +23,9 @@ from calibgraph import (
     perturb,
     simulate_correspondences,
 )
-from calibgraph.model.geometry import relative_transform, twist_between
+from calibgraph.graph.variables import MOST_CAMERAS, camera_key
+from calibgraph.model.config import preset
+from calibgraph.model.geometry import invert, relative_transform, twist_between
 from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call
 from tests.matching.structure.data import with_noise_images
@@ -223,3 +226,65 @@ def test_the_commands_solve_what_calibrate_saved(
 def test_an_excluded_camera_that_the_rig_lacks_is_refused(guess: Rig, truth: Rig) -> None:
     with pytest.raises(ValueError, match=r"excluded_cameras names 'rear'; the rig has front_left"):
         calibgraph.solve(guess, table_of(truth), Config(excluded_cameras=("rear",)))
+
+
+@pytest.mark.parametrize("config", [Config(), preset("kitti")], ids=["auto", "kitti"])
+def test_the_result_is_the_optimum_of_its_graph(truth: Rig, guess: Rig, config: Config) -> None:
+    """GTSAM's Levenberg-Marquardt, from where all poses of a camera are equal."""
+    table = table_of(truth).with_places(Places(places=((0, 1, 2), (3, 4, 5))))
+    result = calibgraph.solve(guess.moved_to(truth.T_camera_lidar), table, config)
+    values = values_of(result)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(0.0)
+    values = gtsam.LevenbergMarquardtOptimizer(result.graph, values, parameters).optimize()
+    covariance = result.joint_covariance
+    assert covariance is not None
+    for number, (name, T) in enumerate(result.T_camera_lidar.items()):
+        found = invert(values.atPose3(camera_key(number)).matrix())
+        sigmas = np.sqrt(np.diag(covariance))[6 * number : 6 * number + 6]
+        assert np.abs(twist_between(found, T) / sigmas).max() < 0.01, name
+    if config.preset == "auto":
+        keys = [camera_key(number) for number in range(len(truth.cameras))]
+        marginals = gtsam.Marginals(result.graph, values)
+        expected = marginals.jointMarginalCovariance(keys).fullMatrix()
+        np.testing.assert_allclose(np.diag(covariance), np.diag(expected), rtol=0.01)
+
+
+def values_of(result: Calibration) -> gtsam.Values:
+    """All poses of a camera at the result, the cloud where it is, no distortion."""
+    poses = [invert(T) for T in result.T_camera_lidar.values()]
+    values = gtsam.Values()
+    for key in result.graph.keyVector():
+        letter, index = chr(gtsam.symbolChr(key)), gtsam.symbolIndex(key)
+        if letter == "d":
+            values.insert(key, np.zeros(3))
+        elif letter in "op":
+            values.insert(key, gtsam.Pose3())
+        else:
+            values.insert(key, gtsam.Pose3(poses[index % MOST_CAMERAS]))
+    return values
+
+
+def test_the_graph_is_printed_and_drawn(truth: Rig, call: Call, tmp_path: Path) -> None:
+    table_of(truth).save(tmp_path / "table.parquet")
+    truth.save(tmp_path / "rig.yaml")
+    inputs = tmp_path / "rig.yaml", tmp_path / "table.parquet", "--out", tmp_path / "out"
+    drawing = tmp_path / "graph.dot"
+    code, out, _ = call("solve", *inputs, "--print-graph", "--graph", drawing)
+    assert code == 0
+    assert "PriorFactor on o0" in out and "BetweenFactor(o0,p0)" in out
+    assert 'label="a0"' in drawing.read_text()
+    assert call("solve", *inputs, "--graph", drawing)[0] == 0  # its own file is replaced
+    other = tmp_path / "other.dot"
+    other.write_text("mine")
+    code, _, error = call("solve", *inputs, "--graph", other)
+    assert code == 2 and "other.dot" in error and other.read_text() == "mine"
+    code, _, error = call("solve", *inputs, "--print-graph", "--json")
+    assert code == 2 and "choose one" in error
+
+
+def test_a_result_from_a_file_has_no_graph(truth: Rig, tmp_path: Path) -> None:
+    calibgraph.solve(truth, table_of(truth)).save(tmp_path)
+    with pytest.raises(ValueError, match="solve it again"):
+        _ = calibgraph.load_calibration(tmp_path).graph

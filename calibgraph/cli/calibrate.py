@@ -107,13 +107,17 @@ def solve(
     tolerance_cm: options.ToleratedCmOption = None,
     common_deg: options.CommonDegOption = None,
     common_cm: options.CommonCmOption = None,
+    print_graph: options.PrintGraphOption = False,
+    graph: options.GraphOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
-    from calibgraph.files import sha256
+    from calibgraph.files import sha256, write_text
+    from calibgraph.graph.variables import DOT_MARK, to_dot
     from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
+    from calibgraph.outputs import Output, require_writable
     from calibgraph.pipeline import solve
     from calibgraph.report.result_files import write_result
 
@@ -128,6 +132,13 @@ def solve(
         checked_terms = terms_from(terms)
         if camera_matches is not None and remote.SERVER.get() is not None:
             raise ValueError("--camera-matches stays here: a server takes correspondences alone")
+        if (print_graph or graph is not None) and remote.SERVER.get() is not None:
+            raise ValueError("a server returns no graph; leave --print-graph and --graph out")
+        if print_graph and as_json:
+            raise ValueError("--print-graph and --json both print; choose one")
+        if graph is not None:
+            drawing = Output(graph, "solve --graph", (DOT_MARK.encode(),), (".dot",))
+            require_writable([drawing], [rig, correspondences])
     if remote.SERVER.get() is not None:
         remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
         _print_and_exit(*remote_result, as_json=as_json)
@@ -138,6 +149,11 @@ def solve(
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
         written = write_result(result, out)
+        if graph is not None:
+            write_text(graph, to_dot(result.graph))
+    if print_graph:
+        print(result.graph)
+        raise typer.Exit(1 if result.verdict.status == "FAIL" else 0)
     _print_and_exit(result, written, as_json=as_json)
 
 

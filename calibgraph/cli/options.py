@@ -231,6 +231,18 @@ def _require_stdout(as_json: bool) -> bool:
     return as_json
 
 
+PrintGraphOption = Annotated[
+    bool,
+    typer.Option(
+        "--print-graph",
+        callback=_require_stdout,
+        help="Print every factor of the graph whose optimum is the result, in place of tables.",
+    ),
+]
+GraphOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.dot", help="Write the graph in Graphviz's language to FILE.dot."),
+]
 JsonOption = Annotated[
     bool, typer.Option("--json", callback=_require_stdout, help="Print JSON on stdout.")
 ]

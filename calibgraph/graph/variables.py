@@ -16,8 +16,11 @@ import gtsam
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
-MOST_CAMERAS = 2**16
-"""The numbers of camera and place share an index of 56 bits."""
+DOT_MARK = "// calibgraph graph"
+"""First line of a graph in Graphviz's language."""
+
+MOST_CAMERAS = 1000
+"""``a3002`` is camera 2 at place 3."""
 
 
 def camera_key(camera: int) -> int:
@@ -43,3 +46,11 @@ def cloud_at_key(place: int) -> int:
 def matched_at_key(place: int, camera: int) -> int:
     """Key of ``a_cp``."""
     return int(gtsam.symbol("a", place * MOST_CAMERAS + camera))
+
+
+def to_dot(graph: gtsam.NonlinearFactorGraph) -> str:
+    """A graph in Graphviz's language."""
+    values = gtsam.Values()
+    for key in graph.keyVector():
+        values.insert(key, gtsam.Pose3())
+    return f"{DOT_MARK}\n{graph.dot(values)}"

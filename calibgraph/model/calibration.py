@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -12,6 +12,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,6 +115,7 @@ class Calibration:
         camera_matches: what cameras see in common, with the surfaces that were used; None if it was
             not looked for.
         inputs: SHA-256 of the input files, by path.
+        build_graph: see :attr:`graph`; None in a result that was read from a file.
         versions: of this package and the libraries that matter.
         date: day of the solve (UTC), YYYY-MM-DD; empty in results of earlier versions.
     """
@@ -139,8 +141,23 @@ class Calibration:
     correspondences: Correspondences | None = None
     camera_matches: CameraMatches | None = None
     inputs: dict[str, str] = field(default_factory=dict)
+    build_graph: Callable[[], gtsam.NonlinearFactorGraph] | None = field(default=None, repr=False)
     versions: dict[str, str] = field(default_factory=package_versions)
     date: str = field(default_factory=lambda: datetime.now(UTC).date().isoformat())
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factor graph whose optimum is the result and whose marginal is its covariance.
+
+        ``print(result.graph)`` lists every factor; ``calibgraph.graph.variables`` names the
+        variables. With the paper's presets it is Eq. 5, and the covariance is clustered by frames.
+
+        Raises:
+            ValueError: if the result was read from a file.
+        """
+        if self.build_graph is None:
+            raise ValueError("a result that was read from a file has no graph; solve it again")
+        return self.build_graph()
 
     @property
     def verdict(self) -> Verdict:

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
@@ -163,6 +164,12 @@ class Evidence:
         return (
             self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
         )
+
+    def build_graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph whose optimum and marginal are reported; with the paper's presets, Eq. 5."""
+        if self.errors is not None:
+            return latent_pose_graph(self.errors.model)
+        return self.solution.inliers.graph(self.solution.scales)
 
     @cached_property
     def error_sources(self) -> dict[str, ErrorSources]:
