@@ -30,7 +30,7 @@ run: $(VENV)/base ## Calibrate the sample rig: three cameras, six frames
 test: $(VENV)/test ## Run the tests
 	$(PYTEST)
 
-coverage: $(VENV)/test ## Measure the branches of solver, trust and factors that their tests reach
+coverage: $(VENV)/test ## Measure the branches of graph, solver, trust and factors that their tests reach
 	$(PYTEST) --cov --cov-report term tests/factors tests/solver tests/trust
 
 test-ci: $(VENV)/test ## Run a short choice of the slow tests (about 3 minutes)

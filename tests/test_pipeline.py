@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -285,6 +286,8 @@ def test_the_graph_is_printed_and_drawn(truth: Rig, call: Call, tmp_path: Path) 
 
 
 def test_a_result_from_a_file_has_no_graph(truth: Rig, tmp_path: Path) -> None:
-    calibgraph.solve(truth, table_of(truth)).save(tmp_path)
-    with pytest.raises(ValueError, match="solve it again"):
-        _ = calibgraph.load_calibration(tmp_path).graph
+    result = calibgraph.solve(truth, table_of(truth))
+    result.save(tmp_path)
+    for other in (calibgraph.load_calibration(tmp_path), pickle.loads(pickle.dumps(result))):
+        with pytest.raises(ValueError, match="solve its table again"):
+            _ = other.graph

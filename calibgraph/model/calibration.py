@@ -115,7 +115,7 @@ class Calibration:
         camera_matches: what cameras see in common, with the surfaces that were used; None if it was
             not looked for.
         inputs: SHA-256 of the input files, by path.
-        build_graph: see :attr:`graph`; None in a result that was read from a file.
+        build_graph: see :attr:`graph`; None in a result from a file or another process.
         versions: of this package and the libraries that matter.
         date: day of the solve (UTC), YYYY-MM-DD; empty in results of earlier versions.
     """
@@ -145,6 +145,10 @@ class Calibration:
     versions: dict[str, str] = field(default_factory=package_versions)
     date: str = field(default_factory=lambda: datetime.now(UTC).date().isoformat())
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the graph, which does not leave its process."""
+        return {**self.__dict__, "build_graph": None}
+
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The factor graph whose optimum is the result and whose marginal is its covariance.
@@ -153,10 +157,12 @@ class Calibration:
         variables. With the paper's presets it is Eq. 5, and the covariance is clustered by frames.
 
         Raises:
-            ValueError: if the result was read from a file.
+            ValueError: if the result was read from a file, or comes from another process.
         """
         if self.build_graph is None:
-            raise ValueError("a result that was read from a file has no graph; solve it again")
+            raise ValueError(
+                "a result from a file or another process has no graph; solve its table again"
+            )
         return self.build_graph()
 
     @property
