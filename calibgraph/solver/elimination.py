@@ -7,7 +7,7 @@ Schur complement per place.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -88,7 +88,10 @@ class Linearization:
     @cached_property
     def information(self) -> Array:
         """(6 N, 6 N) marginal information of all x_c."""
-        return marginal_information(self.graph, self.model)
+        model = self.model
+        return marginal_information(
+            self.graph, model.place_keys + model.shared_keys, model.camera_keys
+        )
 
     @cached_property
     def covariance(self) -> Array:
@@ -114,7 +117,7 @@ class Linearization:
     @cached_property
     def step(self) -> gtsam.VectorValues:
         """The step of Gauss-Newton."""
-        return self.graph.optimize(self.model.ordering)
+        return self.graph.eliminateSequential(self.model.ordering).optimize()
 
     def descend(self) -> Linearization | None:
         """The graph after a step, shortened until it descends; None if no step does."""
@@ -182,8 +185,9 @@ class LatentPoseFit:
         if not self.linear.model.is_distorted:
             size = self.linear.model.components.distortion_jacobian.shape[2]
             return np.zeros(size), np.eye(size)
-        marginals = gtsam.Marginals(self.linear.graph, self.linear.values)
-        covariance = np.asarray(marginals.marginalCovariance(DISTORTION))
+        keys = self.linear.model.place_keys + self.linear.model.shared_keys
+        information = marginal_information(self.linear.graph, keys, [DISTORTION])
+        covariance = np.asarray(np.linalg.inv(information))
         return self.linear.values.atVector(DISTORTION), covariance
 
     def place_weights(self, robust_scale: float) -> Array:
@@ -251,18 +255,25 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
     return values
 
 
-def marginal_information(graph: gtsam.GaussianFactorGraph, model: LatentPoseModel) -> Array:
-    """(6 N, 6 N) of all x_c.
+def marginal_information(
+    graph: gtsam.GaussianFactorGraph, keys: Sequence[int], kept: Sequence[int]
+) -> Array:
+    """The marginal information of some variables.
+
+    Variables are eliminated one by one: with several at a time GTSAM takes a graph for
+    indeterminate as soon as two standard deviations differ by a factor of 4096.
 
     Args:
-        graph: linear factors, over the variables of the model or some of them.
-        model: for its cameras.
+        graph: linear factors.
+        keys: of all its variables, in the order of elimination.
+        kept: keys of these variables.
 
     Raises:
-        RuntimeError: if a variable besides the cameras is not determined.
+        RuntimeError: if one of the others is not determined.
     """
-    keys = model.camera_keys
-    return np.asarray(graph.marginal(keys).hessian(to_ordering(keys))[0])
+    others = to_ordering(key for key in keys if key not in kept)
+    left = graph.eliminatePartialSequential(others)[1]
+    return np.asarray(left.hessian(to_ordering(kept))[0])
 
 
 def join_linear(*graphs: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:

@@ -82,7 +82,7 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     """
     linear = errors.fit.linear
     model = linear.model
-    summary = linear.placed.eliminatePartialMultifrontal(to_ordering(model.place_keys))[1]
+    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
     found = {}
     for times in TIMES:
         shown = times * model.components.distortion_information
@@ -90,7 +90,9 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
         parts = replace(model.components, distortion_information=shown, distortion_vector=vector)
         shared = replace(model, components=parts).shared_graph.linearize(linear.values)
         graph = join_linear(shared, *times * [summary])
-        found[times] = np.diag(np.linalg.inv(marginal_information(graph, model)))
+        found[times] = np.diag(
+            np.linalg.inv(marginal_information(graph, model.shared_keys, model.camera_keys))
+        )
     return found
 
 
@@ -105,7 +107,7 @@ def _of_shared(linear: Linearization) -> Variances:
     A factor with the whitened Jacobian A adds C A^T A C.
     """
     model = linear.model
-    summary = linear.placed.eliminatePartialMultifrontal(to_ordering(model.place_keys))[1]
+    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
     keys = model.camera_keys + model.shared_keys[: -len(model.cameras)]
     sizes = [len(_DISTORTIONS) if key == DISTORTION else 6 for key in keys]
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))

@@ -140,7 +140,7 @@ def undetermined(linear: Linearization) -> dict[Component, float]:
         linear: with quadratic losses of places.
     """
     model, values = linear.model, linear.values
-    summary = linear.placed.eliminatePartialMultifrontal(to_ordering(model.place_keys))[1]
+    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
 
     def shared(ratio: float) -> float:
         parts = VarianceRatios(shared=ratio).scale(model.components)
@@ -165,7 +165,7 @@ def undetermined(linear: Linearization) -> dict[Component, float]:
 
 def log_determinant(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> float:
     """The log of the determinant of the graph's Hessian."""
-    return 2.0 * float(graph.eliminateMultifrontal(ordering).logDeterminant())
+    return 2.0 * float(graph.eliminateSequential(ordering).logDeterminant())
 
 
 def _with_fixed_weights(fit: LatentPoseFit) -> Linearization:

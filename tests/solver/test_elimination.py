@@ -267,3 +267,13 @@ def with_distortion(parts: VarianceComponents) -> np.ndarray:
     covariance = np.linalg.inv(np.eye(len(shown)) / parts.distortion_size + shown)
     jacobian = parts.distortion_jacobian[0]
     return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def test_data_that_determine_far_less_than_exact_ties_have_an_error_bar(pair: Rig) -> None:
+    """Nine of ten matches are wrong; cloud and camera are stated to be exact."""
+    table = simulate_correspondences(pair, errors=MatcherErrors(outlier_share=0.9), seed=0)
+    assert table.metadata["systematic_translation_m"] == 0.0
+    solution = solve_joint(pair, table, Config(learnt_weights=False))
+    errors = fit_errors(solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+    assert errors is not None and errors.fit.converged
+    assert np.isfinite(errors.fit.covariance).all()
