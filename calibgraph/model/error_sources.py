@@ -27,6 +27,7 @@ TIMES = (2, 3, 5, 10, 20, 1000)
 MOST_TIMES = TIMES[-1]
 """Stands for any number of frames, and is no advice."""
 
+_MOST = 0.5  # share of a source that is most of the error bar
 _MENTIONED = 0.05  # share of a source: smaller ones are left out of the sentence
 
 
@@ -68,6 +69,11 @@ class ErrorSources:
         bar = self._larger(tolerance)
         if bar.sigma <= NEEDED * bar.tolerance:
             return ""
+        if bar.shares.get(FLAT, 0.0) > _MOST:  # more frames of the same scenes are as flat
+            return (
+                "Record frames at more places, of walls, poles or vehicles: these images hardly "
+                f"tell poses {in_unit(bar.sigma, bar.unit, 2)} apart."
+            )
         enough = (times for times, both in self.forecast.items() if _is_enough(both, tolerance))
         times = next(enough, MOST_TIMES)
         if times < MOST_TIMES:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import calibgraph
 from calibgraph import Dataset, Rig
 from calibgraph.audit.judgement import Tolerance, judge_camera
-from calibgraph.model.error_sources import FLAT
+from calibgraph.model.error_sources import FLAT, MATCHES, ErrorSources
 from calibgraph.model.perturbation import perturb
 from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
@@ -129,3 +129,12 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     assert found.error_probability.by_error_bar > 0.9
     assert found.error_probability.by_checks < 0.01
     assert found.status == "WARN" and found.cannot_tell
+
+
+def test_where_the_images_are_flat_other_scenes_are_advised_and_not_more_of_the_same() -> None:
+    shares = {FLAT: 0.9, MATCHES: 0.1}
+    sources = ErrorSources(0.9, 50.0, shares, shares, {2: (0.01, 0.1), 1000: (0.01, 0.1)})
+    assert sources.action((0.5, 10.0)) == (
+        "Record frames at more places, of walls, poles or vehicles: these images hardly tell poses "
+        "50 cm apart."
+    )
