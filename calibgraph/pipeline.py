@@ -24,9 +24,10 @@ from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
+from calibgraph.trust.run_evidence import RunEvidence
 
 _log = logging.getLogger(__name__)
 

@@ -26,13 +26,14 @@ from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places
 from calibgraph.trust.cross_validation import competing_solution_checks
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.rematch_checks import last_round_checks
+from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
 

@@ -208,22 +208,22 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     if model.is_distorted:
         graph.push_back(_distortion_graph(parts))
     for number in model.matched:
-        graph.add(_to_shown(model, number, matched_key(number), "camera"))
+        edge = camera_key(number), matched_key(number)
+        graph.add(_displaced(model, edge, parts.distortion_jacobian[number], parts.camera))
     for number in model.paired:
-        graph.add(_to_shown(model, number, paired_key(number), "pairs"))
+        edge = camera_key(number), paired_key(number)
+        graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))
     return graph
 
 
-def _to_shown(model: LatentPoseModel, number: int, key: int, kind: str) -> gtsam.NonlinearFactor:
-    """From a camera to its pose as its matches or its pairs show it."""
-    parts = model.components
-    noise = _noise(parts.camera if kind == "camera" else parts.pairs)
+def _displaced(
+    model: LatentPoseModel, edge: tuple[int, int], jacobian: Array, covariance: Array
+) -> gtsam.NonlinearFactor:
+    """From a camera to its pose as its data show it, displaced by the scan distortion."""
+    noise = _noise(covariance)
     if not model.is_distorted:
-        return gtsam.BetweenFactorPose3(camera_key(number), key, gtsam.Pose3(), noise)
-    jacobians = {"camera": parts.distortion_jacobian, "pairs": parts.pair_distortion_jacobian}
-    return biased_between_factor(
-        camera_key(number), DISTORTION, key, jacobians[kind][number], noise
-    )
+        return gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise)
+    return biased_between_factor(edge[0], DISTORTION, edge[1], jacobian, noise)
 
 
 def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:

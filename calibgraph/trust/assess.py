@@ -18,7 +18,7 @@ from calibgraph.trust.cross_validation import (
     held_out_checks,
     restart_checks,
 )
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import (
     guess_checks,
     point_distance_checks,
@@ -36,6 +36,7 @@ from calibgraph.trust.rematch_checks import (
     repeated_cloud_checks,
     time_limit_checks,
 )
+from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.solution_checks import (
     assumed_spread_checks,
     bootstrap_checks,

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.objective import relative_pose_graph
-from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
-from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
@@ -37,7 +35,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import measure_posteriors, widen
+from calibgraph.trust.pose_posterior import widen
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -408,29 +406,6 @@ class Evidence:
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class RunEvidence:
-    """All rounds of matching and solving, and the SHA-256 of the files they read."""
-
-    run: MatchingRun
-    hashes: Mapping[str, str]
-    progress: Progress = no_progress
-
-    @cached_property
-    def solution(self) -> Evidence:
-        """The evidence of the last round's solution."""
-        return Evidence(self.run.solution, self.run.guess, self._posteriors)
-
-    @property
-    def _posteriors(self) -> Mapping[str, Array]:
-        """By the images; empty with matchers that may use what these scores do not."""
-        run = self.run
-        if run.out_of_time or not run.matcher.image_checks_can_fail:
-            return {}
-        solution = run.solution
-        return measure_posteriors(run.dataset, solution.solved_rig, seed=solution.config.seed)
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:

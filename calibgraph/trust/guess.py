@@ -15,7 +15,8 @@ from calibgraph.model.geometry import angle_deg, pose_difference, relative_trans
 from calibgraph.model.verdict import Check
 from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.conventions import convention_error_between
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 
 Array = NDArray[np.float64]

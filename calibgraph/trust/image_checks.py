@@ -12,9 +12,10 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress
-from calibgraph.trust.evidence import Checks, RunEvidence
+from calibgraph.trust.evidence import Checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_parameter import IMAGES, LensParameter, check_parameter
+from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
 

@@ -8,7 +8,8 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import TOLERANCE, Check
-from calibgraph.trust.evidence import Checks, RunEvidence
+from calibgraph.trust.evidence import Checks
+from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import threshold
 
 REMATCH_DEG, REMATCH_M = 0.5, 0.08

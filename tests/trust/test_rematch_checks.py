@@ -12,8 +12,8 @@ import calibgraph
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.config import Config
 from calibgraph.rounds import match_in_rounds
-from calibgraph.trust.evidence import RunEvidence
 from calibgraph.trust.rematch_checks import compare_ends, last_round_checks
+from calibgraph.trust.run_evidence import RunEvidence
 from tests.conftest import SAMPLE
 
 

@@ -1,0 +1,40 @@
+"""A whole run of matching and solving, and the values that its checks compute from the images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.matching.run import MatchingRun
+from calibgraph.progress import Progress, no_progress
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.pose_posterior import measure_posteriors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RunEvidence:
+    """All rounds of matching and solving, and the SHA-256 of the files they read."""
+
+    run: MatchingRun
+    hashes: Mapping[str, str]
+    progress: Progress = no_progress
+
+    @cached_property
+    def solution(self) -> Evidence:
+        """The evidence of the last round's solution."""
+        return Evidence(self.run.solution, self.run.guess, self._posteriors)
+
+    @property
+    def _posteriors(self) -> Mapping[str, Array]:
+        """By the images; empty with matchers that may use what these scores do not."""
+        run = self.run
+        if run.out_of_time or not run.matcher.image_checks_can_fail:
+            return {}
+        solution = run.solution
+        return measure_posteriors(run.dataset, solution.solved_rig, seed=solution.config.seed)
