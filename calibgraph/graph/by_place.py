@@ -84,7 +84,7 @@ class PairByPlace:
         b: name of the second camera.
         block: the features.
         places: (r,) the places that have features, in rising order.
-        edges: (r + 1,) first row of each of these, and the end.
+        edges: (r + 1,) first row of every such place, and the end.
     """
 
     a: str

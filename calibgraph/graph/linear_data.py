@@ -38,7 +38,7 @@ class LinearData:
         """Linearize the data.
 
         Args:
-            model: of which the data are.
+            model: whose data are linearized.
             values: of all poses.
         """
         data = LinearData()

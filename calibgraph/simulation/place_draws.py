@@ -43,7 +43,7 @@ class Drawn:
 def draw_places(
     places: int, matches: int, rng: Rng, *, frames: int = FRAMES, rounds: int = 1
 ) -> Drawn:
-    """A table of so many places, that states the errors which were drawn.
+    """A table of several places that states the sizes of its errors.
 
     Args:
         places: how many.

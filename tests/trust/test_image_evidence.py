@@ -14,7 +14,6 @@ from calibgraph.trust import image_checks, image_evidence
 from calibgraph.trust.image_checks import check_images, evidence_checks, pairing_checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_evidence import LensEvidence
-from tests.conftest import SAMPLE
 
 NAME = "front_left"
 
@@ -25,18 +24,6 @@ EMPTY = Correspondences.from_arrays(
     pixels_px=np.empty((0, 2)),
     points_lidar_m=np.empty((0, 3)),
 )
-
-
-@pytest.fixture(scope="module")
-def truth() -> Rig:
-    """One camera of the sample at its true pose."""
-    whole = calibgraph.load_rig(SAMPLE / "reference.yaml")
-    return Rig(cameras={NAME: whole.cameras[NAME]})
-
-
-@pytest.fixture(scope="module")
-def dataset(truth: Rig) -> Dataset:
-    return calibgraph.load_dataset(SAMPLE, truth)
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import calibgraph
 from calibgraph import Dataset, Rig
 from calibgraph.audit.judgement import Tolerance, judge_camera
 from calibgraph.model.error_sources import FLAT, MATCHES, ErrorSources
@@ -20,24 +19,11 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.pose_posterior import REACH, measure_posteriors, widen
-from tests.conftest import SAMPLE
 from tests.trust.conftest import simulated
 
 Array = NDArray[np.float64]
 NAME = "front_left"
 WIDE = np.diag((REACH / 2) ** 2)
-
-
-@pytest.fixture(scope="module")
-def truth() -> Rig:
-    """One camera of the sample at its true pose."""
-    whole = calibgraph.load_rig(SAMPLE / "reference.yaml")
-    return Rig(cameras={NAME: whole.cameras[NAME]})
-
-
-@pytest.fixture(scope="module")
-def dataset(truth: Rig) -> Dataset:
-    return calibgraph.load_dataset(SAMPLE, truth)
 
 
 def with_images_of(dataset: Dataset, folder: Path) -> Dataset:
