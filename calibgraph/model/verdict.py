@@ -187,7 +187,7 @@ class Verdict:
 
     @property
     def status(self) -> Status:
-        """PASS if every check and the probability are; FAIL if the probability is.
+        """That of the probability; a check that data are missing, or a FAIL, turns PASS into WARN.
 
         Without a probability, the worst status of the checks; PASS without any.
         """
@@ -196,9 +196,15 @@ class Verdict:
         )
         if self.error_probability is None:
             return worst
-        if self.error_probability.status == "PASS" and worst != "PASS":
+        unmeasured = not self._kinds_beyond.isdisjoint(ABOUT_THE_DATA)
+        if self.error_probability.status == "PASS" and (unmeasured or worst == "FAIL"):
             return "WARN"
         return self.error_probability.status
+
+    @property
+    def _kinds_beyond(self) -> set[str]:
+        """The kinds of the checks that are beyond a limit."""
+        return {check.kind or check.name for check in self.checks if check.status != "PASS"}
 
     @property
     def doubt(self) -> ErrorProbability | None:
@@ -219,8 +225,7 @@ class Verdict:
             return all(each.cannot_tell for each in self.cameras if each.status != "PASS")
         if self.error_probability is not None and self.error_probability.of_error_bar:
             return True
-        beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
-        return bool(beyond) and beyond <= ABOUT_THE_DATA
+        return bool(self._kinds_beyond) and self._kinds_beyond <= ABOUT_THE_DATA
 
     @property
     def reasons(self) -> tuple[str, ...]:

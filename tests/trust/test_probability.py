@@ -108,10 +108,19 @@ def test_the_status_is_a_cut_of_the_probability() -> None:
     )
 
 
-def test_a_check_beyond_its_limit_is_a_warning_and_no_more_where_the_probability_is_small() -> None:
-    for status in ("WARN", "FAIL"):
-        verdict = Verdict((Check("x", status, "a reason"),), ErrorProbability(0.1 * PASS_BELOW))
-        assert (verdict.status, verdict.reasons) == ("WARN", ("a reason",))
+@pytest.mark.parametrize(
+    ("check", "status"),
+    [
+        (Check("x", "WARN", "a reason", 1.1, 1.0, 2.0), "PASS"),
+        (Check("frames", "WARN", "a reason", 4, 5, 2), "WARN"),  # the error bar is a default
+        (Check("x", "FAIL", "a reason", 2.1, 1.0, 2.0), "WARN"),
+    ],
+)
+def test_a_small_probability_is_a_pass_but_for_missing_data_or_a_failed_check(
+    check: Check, status: str
+) -> None:
+    verdict = Verdict((check,), ErrorProbability(0.1 * PASS_BELOW))
+    assert (verdict.status, verdict.reasons) == (status, ("a reason",))
 
 
 def test_a_wide_error_bar_is_no_fail_but_named() -> None:
