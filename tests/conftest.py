@@ -21,6 +21,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.cli import app as cli
+from calibgraph.report import plots
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -128,6 +129,15 @@ def calibrated_sample(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
     return run_command(
         "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result
     )
+
+
+@pytest.fixture
+def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Build the diagrams of reports without drawing them, for tests of all else.
+
+    Session fixtures such as ``calibrated_sample`` are made before, with drawn ones.
+    """
+    monkeypatch.setattr(plots, "to_data_uri", lambda figure: "data:image/png;base64,")
 
 
 def make_pair() -> Rig:

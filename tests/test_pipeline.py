@@ -31,6 +31,8 @@ from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call
 from tests.matching.structure.data import with_noise_images
 
+pytestmark = pytest.mark.usefixtures("blank_diagrams")
+
 FRAMES = 6
 STATED = {
     "systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.01,

@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
@@ -167,10 +168,16 @@ def _require_utf8(arguments: list[str]) -> None:
             raise CalibrationError(message) from error
 
 
+@cache
+def _parser() -> typer.core.TyperGroup:
+    """All commands with their options, read from the signatures once per process."""
+    return typer.main.get_group(app)
+
+
 def _run_app() -> int:
     """The exit code of the command."""
     try:
-        return app(standalone_mode=False, prog_name="calibgraph") or 0
+        return _parser()(standalone_mode=False, prog_name="calibgraph") or 0
     except SystemExit:  # of typer and rich when the reader of the help has gone: 1, our FAIL
         return 0
 

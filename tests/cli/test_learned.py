@@ -91,9 +91,10 @@ def test_missing_torch_is_reported_in_one_line(call: Call, monkeypatch: pytest.M
 
 
 def test_training_runs_on_the_command_line(tmp_path: Path, call: Call) -> None:
-    out, settings = tmp_path / "net.tar", tmp_path / "small.yaml"
+    out, settings, rig = tmp_path / "net.tar", tmp_path / "small.yaml", tmp_path / "rig.yaml"
     settings.write_text("steps: 1\nwidth: 8\ncrop_px: [128, 192]\niterations: 1\nbatch: 1\n")
-    given = ("train", SAMPLE, "--out", out, "--config", settings)
+    Rig(cameras={"left": load_rig(SAMPLE / "reference.yaml").cameras["left"]}).save(rig)
+    given = ("train", SAMPLE, "--rig", rig, "--out", out, "--config", settings)
     code, _, text = call(*given, "--seed", 3)
     assert code == 0
     assert "held out: flow error" in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -36,28 +35,31 @@ WRONG: dict[str, Any] = {
 
 @pytest.mark.parametrize("key", WRONG)
 def test_a_wrong_part_is_named(key: str, calibrated_sample: CommandRun, tmp_path: Path) -> None:
-    path = Path(shutil.copy(calibrated_sample.folder / "calibration.yaml", tmp_path))
-    content = yaml.safe_load(path.read_text())
-    path.write_text(yaml.safe_dump({**content, key: WRONG[key]}, sort_keys=False))
+    path = edited({key: WRONG[key]}, calibrated_sample, tmp_path)
     with pytest.raises(FileError, match=key) as caught:
         load_calibration(path)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_part_is_named(calibrated_sample: CommandRun, tmp_path: Path) -> None:
-    path = Path(shutil.copy(calibrated_sample.folder / "calibration.yaml", tmp_path))
-    content = yaml.safe_load(path.read_text())
+    path, content = tmp_path / "calibration.yaml", content_of(calibrated_sample)
     del content["covariance"]
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    path.write_text(yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False))
     with pytest.raises(FileError, match="'covariance' is missing"):
         load_calibration(path)
 
 
+def content_of(result: CommandRun) -> dict[str, Any]:
+    """The sample's result, as its file holds it."""
+    text = (result.folder / "calibration.yaml").read_text()
+    content: dict[str, Any] = yaml.load(text, Loader=yaml.CSafeLoader)
+    return content
+
+
 def edited(change: dict[str, Any], result: CommandRun, folder: Path) -> Path:
     """The sample's result with some keys replaced."""
-    path = Path(shutil.copy(result.folder / "calibration.yaml", folder))
-    content = yaml.safe_load(path.read_text())
-    path.write_text(yaml.safe_dump({**content, **change}, sort_keys=False))
+    path, content = folder / "calibration.yaml", content_of(result) | change
+    path.write_text(yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False))
     return path
 
 
@@ -69,9 +71,7 @@ def edited(change: dict[str, Any], result: CommandRun, folder: Path) -> Path:
 def test_a_covariance_that_is_none_is_refused(
     place: tuple[int, int], value: Any, words: str, calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
-    covariance = yaml.safe_load((calibrated_sample.folder / "calibration.yaml").read_text())[
-        "covariance"
-    ]
+    covariance = content_of(calibrated_sample)["covariance"]
     covariance["left"][place[0]][place[1]] = value
     path = edited({"covariance": covariance}, calibrated_sample, tmp_path)
     for read in (load_calibration, error_bars):
@@ -82,7 +82,7 @@ def test_a_covariance_that_is_none_is_refused(
 def test_a_camera_whose_verdict_was_edited_is_named(
     calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
-    content = yaml.safe_load((calibrated_sample.folder / "calibration.yaml").read_text())
+    content = content_of(calibrated_sample)
     verdicts = content["camera_verdicts"]
     verdicts["left"]["status"] = {"PASS": "WARN"}.get(verdicts["left"]["status"], "PASS")
     with pytest.raises(FileError, match="of camera 'left', its checks give .* edited"):
@@ -101,7 +101,7 @@ def test_the_former_key_of_an_error_probability_is_read(
     calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
     path = calibrated_sample.folder / "calibration.yaml"
-    verdicts = yaml.safe_load(path.read_text())["camera_verdicts"]
+    verdicts = content_of(calibrated_sample)["camera_verdicts"]
     former = {
         name: {**verdict, "doubt": verdict.pop("error_probability")}
         for name, verdict in verdicts.items()

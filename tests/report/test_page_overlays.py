@@ -6,10 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from calibgraph import Calibration
 from tests.conftest import CommandRun
 from tests.report.conftest import read_page, write_page
+
+pytestmark = pytest.mark.usefixtures("blank_diagrams")
 
 
 def test_images_before_and_after_are_in_the_page(

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from matplotlib.figure import Figure
 
+from calibgraph import Rig
 from calibgraph.report import plots
+from tests.conftest import make_camera
+from tests.report.conftest import solve_simulated, write_page
+
+NASTY = "<b>x&\"y'<b>"
 
 
 def test_the_legend_of_the_convergence_covers_no_point(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,3 +30,11 @@ def test_the_legend_of_the_convergence_covers_no_point(monkeypatch: pytest.Monke
         assert not any(
             box.contains(*point) for point in line.get_transform().transform(line.get_xydata())
         )
+
+
+def test_names_of_cameras_are_escaped_and_drawn_as_they_are(tmp_path: Path) -> None:
+    rig = Rig(cameras={NASTY: make_camera(), "$x_1$": make_camera((0, 0.5, 0))})
+    text = write_page(solve_simulated(rig), tmp_path)
+    assert "<b>x" not in text
+    assert "&lt;b&gt;x&amp;&#34;y&#39;&lt;b&gt;" in text
+    assert "$x_1$" in text

@@ -104,7 +104,7 @@ def test_frames_of_one_tenant_leave_memory_to_others(
 
 BOMBS = {
     "ratio": {"lidar/000000.npy": bytes(300 * MB)},
-    "size": {f"lidar/{i}.npy": bytes(90 * MB) for i in range(3)},
+    "size": {f"lidar/{i}.npy": bytes(30 * MB) for i in range(3)},
 }
 
 
@@ -112,7 +112,7 @@ BOMBS = {
 def test_a_bomb_is_refused_before_it_is_unpacked_and_leaves_nothing(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    limit = 1000 * MB if name == "ratio" else 200 * MB
+    limit = 1000 * MB if name == "ratio" else 70 * MB
     settings = Settings(
         data=tmp_path / "data", jobs_at_once=1, tracker_processes=0, free_bytes=0,
         upload_bytes=limit,

@@ -41,6 +41,16 @@ def T_world_lidar(seconds: float) -> np.ndarray:
     return np.asarray(T_world_base @ T_BASE_LIDAR)
 
 
+def world_to_base(seconds: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) inverses of the exponential of TWIST: an arc about z."""
+    turn, speed = TWIST[2], TWIST[3]
+    cos, sin = np.cos(turn * seconds), np.sin(turn * seconds)
+    T = np.tile(np.eye(4), (len(seconds), 1, 1))
+    T[:, 0, 0], T[:, 0, 1], T[:, 0, 3] = cos, sin, -speed / turn * sin
+    T[:, 1, 0], T[:, 1, 1], T[:, 1, 3] = -sin, cos, speed / turn * (1 - cos)
+    return T
+
+
 def world(seed: int, count: int = 12_000) -> np.ndarray:
     """(n, 3) a road between walls and boxes; other points of the same surfaces with each seed."""
     rng = np.random.default_rng(seed)
@@ -59,12 +69,10 @@ def world(seed: int, count: int = 12_000) -> np.ndarray:
 def scan(start_s: float, points: np.ndarray) -> np.ndarray:
     """(n,) points that are taken one after another in 0.1 s, as a LiDAR turns."""
     times = np.linspace(0, 0.1, len(points))
-    seen = np.array([
-        inverse[:3, :3] @ p + inverse[:3, 3]
-        for inverse, p in (
-            (invert(T_world_lidar(start_s + t)), p) for t, p in zip(times, points, strict=True)
-        )
-    ])  # fmt: skip
+    T_base_world = world_to_base(start_s + times)
+    in_base = np.einsum("nij,nj->ni", T_base_world[:, :3, :3], points) + T_base_world[:, :3, 3]
+    T_lidar_base = invert(T_BASE_LIDAR)
+    seen = in_base @ T_lidar_base[:3, :3].T + T_lidar_base[:3, 3]
     kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
     rows = np.zeros(len(points), kind)
     rows["x"], rows["y"], rows["z"] = seen.T
