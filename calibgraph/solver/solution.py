@@ -11,6 +11,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
 
@@ -53,6 +54,11 @@ class Solution:
     def T_camera_lidar(self) -> Transforms:
         """Per camera, the (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
         return dict(self.optimum.T_camera_lidar)
+
+    @cached_property
+    def fitted(self) -> FittedObjective:
+        """The objective that it was fitted to, with its scales, at the estimate."""
+        return FittedObjective(self.inliers, self.scales, self.T_camera_lidar, tuple(self.held))
 
     @property
     def T_hat(self) -> Transforms:

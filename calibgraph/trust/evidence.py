@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import latent_pose_graph
-from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
@@ -21,7 +20,7 @@ from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
+from calibgraph.solver.curvature import Curvature, curvature_at, robust_hessians
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,
@@ -112,31 +111,17 @@ class Evidence:
     @cached_property
     def curvature(self) -> Curvature:
         """The curvature of all terms at the solution."""
-        solution = self.solution
-        return curvature_at(
-            solution.inliers, solution.T_camera_lidar, self.robust_hessians, solution.held
-        )
+        return curvature_at(self.solution.fitted, self.robust_hessians)
 
     @cached_property
     def scatter(self) -> Array | None:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
-        solution = self.solution
-        return cluster_robust_covariance(
-            solution.inliers,
-            solution.T_camera_lidar,
-            solution.scales,
-            self.curvature,
-            held=solution.held,
-        )
+        return cluster_robust_covariance(self.solution.fitted, self.curvature)
 
     @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
         """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences:
-            return {}
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
-        return hessians_of_blocks(blocks, solution.T_camera_lidar)
+        return robust_hessians(self.solution.fitted)
 
     @cached_property
     def joint_covariance(self) -> Array | None:
@@ -211,11 +196,7 @@ class Evidence:
         """
         solution = self.solution
         found = solution.errors or fit_errors(
-            solution.inliers,
-            solution.T_camera_lidar,
-            solution.scales,
-            solution.correspondences.metadata,
-            solution.held,
+            solution.fitted, self.findings, solution.correspondences.places
         )
         return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
 
@@ -290,9 +271,7 @@ class Evidence:
         solution = self.solution
         if not solution.inliers.uses_correspondences:
             return None
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
-        known = relative_pose_graph(solution.inliers.cameras, solution.rig.relative_poses)
-        return data_sigmas(blocks, known, solution.T_camera_lidar, solution.inliers.pairs)
+        return data_sigmas(solution.fitted)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:
@@ -326,18 +305,16 @@ class Evidence:
             return None
         if (found := self._data_only_by_errors) is not None:
             return found
-        free = solution.inliers.data_only()
-        start = {name: solution.T_camera_lidar[name] for name in free.cameras}
-        T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
+        free = solution.fitted.data_only()
         if solution.config.preset == "auto":
-            return DataOnly(T_camera_lidar, None)
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
-        curvature = curvature_at(free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar))
-        scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
+            return DataOnly(free.T_camera_lidar, None)
+        curvature = curvature_at(free, robust_hessians(free))
+        scatter = cluster_robust_covariance(free, curvature)
         if scatter is None:
-            return DataOnly(T_camera_lidar, None)
-        shared = self._shared(free, curvature) + error_between(T_camera_lidar, free.pairs)
-        return DataOnly(T_camera_lidar, scatter + shared)
+            return DataOnly(free.T_camera_lidar, None)
+        shared = self._shared(free.objective, curvature)
+        between = error_between(free.T_camera_lidar, free.objective.pairs)
+        return DataOnly(free.T_camera_lidar, scatter + (shared + between))
 
     @property
     def _data_only_by_errors(self) -> DataOnly | None:
@@ -349,8 +326,8 @@ class Evidence:
                 return DataOnly(fit.T_camera_lidar, fit.covariance)
         alone = None if errors is None else errors.without_priors
         if alone is None:
-            metadata, T = solution.correspondences.metadata, solution.T_camera_lidar
-            alone = fit_without_priors(solution.inliers, T, solution.scales, metadata)
+            places = solution.correspondences.places
+            alone = fit_without_priors(solution.fitted, self.findings, places)
         return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
 
     @cached_property
