@@ -73,7 +73,7 @@ def calibrate(
         checks = assess_run(evidence)
     report("done", 1, 1)
     return replace(
-        to_calibration(evidence.solution, checks, model_of(run.correspondences.metadata)),
+        to_calibration(evidence.solution, checks, model_of(run.correspondences.matcher)),
         correspondences=run.correspondences,
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,

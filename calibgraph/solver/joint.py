@@ -131,7 +131,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     stops = solution.correspondences.places
     by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
-        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_stop)
+        refined = refine_with_pairs(alone.fitted, by_stop)
+        inliers, optimum = refined or (alone.inliers, alone.optimum)
     with watch("error_model"):
         at = FittedObjective(inliers, alone.scales, optimum.T_camera_lidar, alone.held)
         table = solution.correspondences
