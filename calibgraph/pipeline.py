@@ -132,7 +132,10 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
     solution, cameras = evidence.solution, evidence.cameras
     verdicts = {
         name: judge(
-            checks.get(name, ()), evidence.covariance_of(name), solution.config.tolerance, model
+            checks.get(name, ()),
+            evidence.probability_beyond(name),
+            solution.config.tolerance,
+            model,
         )
         for name in cameras
     }

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -14,7 +14,7 @@ from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_difference, relative_transform
+from calibgraph.model.geometry import pose_difference, pose_rows, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
@@ -34,7 +34,8 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import widen
+from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors, widen
+from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
 
@@ -66,13 +67,13 @@ class Evidence:
     Attributes:
         solution: of the joint solve.
         guess: the rig as it was first guessed.
-        posteriors: per camera, (6, 6) second moments of its pose by the images' evidence; empty
-            where nothing but correspondences is known.
+        measure_posteriors: of the (6, 6) covariances by the matches, per camera, the posteriors by
+            the images' evidence; none where nothing but correspondences is known.
     """
 
     solution: Solution
     guess: Rig
-    posteriors: Mapping[str, Array] = field(default_factory=dict)
+    measure_posteriors: Callable[[Mapping[str, Array]], Mapping[str, PosePosterior]] = no_posteriors
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -131,9 +132,28 @@ class Evidence:
         """
         if self.covariance_of_matches is None:
             return None
-        free = [name for name in self.posteriors if name not in self.solution.held]
-        posteriors = {self.cameras.index(name): self.posteriors[name] for name in free}
-        return widen(self.covariance_of_matches, posteriors)
+        posteriors = self.posteriors.items()
+        moments = {self.cameras.index(name): found.moments for name, found in posteriors}
+        return widen(self.covariance_of_matches, moments)
+
+    @cached_property
+    def posteriors(self) -> Mapping[str, PosePosterior]:
+        """Per free camera, its posterior by the images' evidence."""
+        if self.covariance_of_matches is None:
+            return {}
+        free = [name for name in self.cameras if name not in self.solution.held]
+        known = self.covariance_of_matches
+        return self.measure_posteriors({name: self._rows_of(known, name) for name in free})
+
+    def probability_beyond(self, camera: str) -> float:
+        """The probability that its error is beyond the tolerance, by its posterior."""
+        known = None if camera in self.solution.held else self.covariance_of_matches
+        if known is None:
+            return 0.0
+        tolerance, own = self.solution.config.tolerance, self._rows_of(known, camera)
+        if camera not in self.posteriors:
+            return probability_beyond(own, tolerance)
+        return self.posteriors[camera].probability_beyond(own, tolerance)
 
     @cached_property
     def covariance_of_matches(self) -> Array | None:
@@ -250,8 +270,12 @@ class Evidence:
         return self._block(joint, camera)
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
-        rows = slice(6 * self.cameras.index(camera), 6 * self.cameras.index(camera) + 6)
-        return None if joint is None else joint[rows, rows]
+        return None if joint is None else self._rows_of(joint, camera)
+
+    def _rows_of(self, joint: Array, camera: str) -> Array:
+        """(6, 6) of one camera, of the (6 N, 6 N) of all."""
+        rows = pose_rows(self.cameras.index(camera))
+        return joint[rows, rows]
 
     @cached_property
     def bootstrap(self) -> dict[str, Array]:

@@ -1,16 +1,20 @@
 """The posterior of a pose by the images' evidence, sampled: how far it could be from the result.
 
 The error bar of a solution is that of its matches, which were made near one pose. Where the images
-tell poses a degree apart as little as chance does, matches agree all the same, and are wrong.
+tell poses a degree apart as little as chance does, matches agree all the same, and are wrong. So
+either the rounds ended where the matches say, by ``NEAR`` times their error bar, or ``ELSEWHERE``;
+the evidence of both, the likelihood's mean over their priors, tells how likely each is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
@@ -18,6 +22,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.frame_scores import FrameScorer
+from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.tempering import sample_posterior
 from factors import pose_sigmas
 
@@ -25,32 +30,88 @@ Array = NDArray[np.float64]
 
 MAX_FRAMES = 10  # evenly spread over the dataset: bounds the time
 SAMPLES = 1000
+NEAR = 3.0  # the prior of a result that is right, in standard deviations of its matches
+ELSEWHERE = 0.1  # how often rounds end elsewhere, before the images are asked
 REACH = pose_sigmas(rotation_rad=np.radians(1.0), translation_m=0.25)
-"""(6,) standard deviations of the prior: how far off the rounds may end."""
+"""(6,) standard deviations of the prior of rounds that ended elsewhere."""
 
 
-def measure_posteriors(dataset: Dataset, rig: Rig, *, seed: int = 0) -> dict[str, Array]:
-    """Per camera, (6, 6) second moments of the posterior about a result.
+@dataclass(frozen=True, eq=False)
+class PosePosterior:
+    """The posterior of a camera's pose about a result, as twists from it.
+
+    Attributes:
+        near: (n, 6) samples, if the rounds ended where the matches say.
+        elsewhere: (n, 6) samples, if they ended elsewhere.
+        share: the probability that they ended elsewhere.
+    """
+
+    near: Array
+    elsewhere: Array
+    share: float
+
+    @property
+    def moments(self) -> Array:
+        """(6, 6) second moments of both together."""
+        near, elsewhere = (_moments(samples) for samples in (self.near, self.elsewhere))
+        return (1.0 - self.share) * near + self.share * elsewhere
+
+    def probability_beyond(self, by_matches: Array, tolerance: tuple[float, float]) -> float:
+        """The probability of an error beyond the tolerance.
+
+        Args:
+            by_matches: (6, 6) covariance; near the result the error is at least as wide.
+            tolerance: rotation [deg] and distance [cm].
+        """
+        widened = widen(by_matches, {0: _moments(self.near)})
+        near = max(probability_beyond(widened, tolerance), _share_beyond(self.near, tolerance))
+        elsewhere = _share_beyond(self.elsewhere, tolerance)
+        return (1.0 - self.share) * near + self.share * elsewhere
+
+
+def _moments(samples: Array) -> Array:
+    return np.asarray(samples.T @ samples / len(samples))
+
+
+def _share_beyond(samples: Array, tolerance: tuple[float, float]) -> float:
+    rotation, distance = np.linalg.norm(samples.reshape(-1, 2, 3), axis=2).T
+    off = (rotation > np.radians(tolerance[0])) | (distance > tolerance[1] / 100)
+    return float(off.mean())
+
+
+def measure_posteriors(
+    dataset: Dataset, rig: Rig, covariances: Mapping[str, Array], *, seed: int = 0
+) -> dict[str, PosePosterior]:
+    """Per camera that has a covariance, the posterior about a result.
 
     Args:
         dataset: images and clouds.
         rig: the result.
+        covariances: per camera, (6, 6) of the result by its matches.
         seed: of the samples.
     """
-    with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+    with core_pool() as cores, ThreadPoolExecutor(max(len(covariances), 1)) as pool:
         scorer = FrameScorer(dataset, spread_out(dataset.frames, MAX_FRAMES), cores)
 
-        def measure(name: str, camera: Camera) -> Array:
+        def measure(name: str, covariance: Array) -> PosePosterior:
+            camera: Camera = rig.cameras[name]
             scores = scorer.score_together(scorer.load_images(name, camera), camera, FAR)
-            likelihood = log_likelihood(scores)
-            twists = sample_posterior(likelihood, REACH, samples=SAMPLES, seed=seed)
-            return np.asarray(twists.T @ twists / SAMPLES)
+            likelihood, options = log_likelihood(scores), {"samples": SAMPLES, "seed": seed}
+            near, of_near = sample_posterior(likelihood, NEAR**2 * covariance, **options)
+            far, of_far = sample_posterior(likelihood, np.diag(REACH**2), **options)
+            share = float(expit(logit(ELSEWHERE) + of_far - of_near))
+            return PosePosterior(near, far, share)
 
-        moments = pool.map(measure, rig.cameras, rig.cameras.values())
-        return dict(zip(rig.cameras, moments, strict=True))
+        found = pool.map(measure, covariances, covariances.values())
+        return dict(zip(covariances, found, strict=True))
 
 
-def widen(joint: Array, posteriors: Mapping[int, Array]) -> Array:
+def no_posteriors(_: Mapping[str, Array]) -> dict[str, PosePosterior]:
+    """Of no camera: where there are no images."""
+    return {}
+
+
+def widen(joint: Array, moments: Mapping[int, Array]) -> Array:
     """A covariance that is at least that of the posteriors, in every direction of each camera.
 
     Cameras stay correlated as they are: of a pair that the images tie to each other, the relative
@@ -58,12 +119,12 @@ def widen(joint: Array, posteriors: Mapping[int, Array]) -> Array:
 
     Args:
         joint: (6 N, 6 N) of all cameras.
-        posteriors: per number of a camera, (6, 6) second moments.
+        moments: per number of a camera, (6, 6) second moments.
     """
     factor = np.eye(len(joint))
-    for camera, moments in posteriors.items():
+    for camera, own in moments.items():
         rows = pose_rows(camera)
-        factor[rows, rows] = _factor(joint[rows, rows], moments)
+        factor[rows, rows] = _factor(joint[rows, rows], own)
     return np.asarray(factor @ joint @ factor.T)
 
 

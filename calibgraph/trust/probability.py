@@ -32,19 +32,18 @@ _DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probab
 
 
 def judge(
-    checks: Sequence[Check], covariance: Array | None, tolerance: tuple[float, float], model: str
+    checks: Sequence[Check], beyond: float, tolerance: tuple[float, float], model: str
 ) -> Verdict:
     """The verdict of one camera's result.
 
     Args:
         checks: of the camera.
-        covariance: (6, 6) of its error, rotation [rad] and translation [m]; None if there is none.
+        beyond: the probability that its error is beyond the tolerance, by its posterior.
         tolerance: rotation [deg] and distance [cm].
         model: TABLES or STRUCTURE.
     """
     of_checks = probability_of_checks(checks, model)
-    of_error_bar = probability_beyond(covariance, tolerance)
-    return Verdict(tuple(checks), ErrorProbability(of_checks, of_error_bar, *tolerance))
+    return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance))
 
 
 def model_of(matcher: str) -> str:

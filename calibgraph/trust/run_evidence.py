@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibgraph.matching.run import MatchingRun
 from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.pose_posterior import measure_posteriors
+from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
 Array = NDArray[np.float64]
 
@@ -28,13 +28,12 @@ class RunEvidence:
     @cached_property
     def solution(self) -> Evidence:
         """The evidence of the last round's solution."""
-        return Evidence(self.run.solution, self.run.guess, self._posteriors)
+        return Evidence(self.run.solution, self.run.guess, self._measure_posteriors)
 
-    @property
-    def _posteriors(self) -> Mapping[str, Array]:
+    def _measure_posteriors(self, covariances: Mapping[str, Array]) -> Mapping[str, PosePosterior]:
         """By the images; empty with matchers that may use what these scores do not."""
         run = self.run
         if run.out_of_time or not run.matcher.image_checks_can_fail:
             return {}
-        solution = run.solution
-        return measure_posteriors(run.dataset, solution.solved_rig, seed=solution.config.seed)
+        seed = run.solution.config.seed
+        return measure_posteriors(run.dataset, run.solution.solved_rig, covariances, seed=seed)

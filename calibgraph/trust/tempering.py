@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from scipy.special import logsumexp
 
 Array = NDArray[np.float64]
 
@@ -22,31 +23,32 @@ _NARROW = 0.3  # every other move is so much of that, for modes narrower than al
 
 
 def sample_posterior(
-    log_likelihood: Callable[[Array], Array], sigmas: Array, *, samples: int, seed: int
-) -> Array:
-    """Draw (n, k) samples of prior times likelihood.
+    log_likelihood: Callable[[Array], Array], prior: Array, *, samples: int, seed: int
+) -> tuple[Array, float]:
+    """Draw (n, k) samples of prior times likelihood; with the log of the integral, the evidence.
 
     Args:
         log_likelihood: (n,) of (n, k) points.
-        sigmas: (k,) of the prior, a Gaussian about 0.
+        prior: (k, k) covariance of the prior, a Gaussian about 0.
         samples: their number n.
         seed: of the draws.
     """
-    rng = np.random.default_rng(seed)
-    points = rng.standard_normal((samples, len(sigmas))) * sigmas
-    values, exponent = log_likelihood(points), 0.0
+    rng, root = np.random.default_rng(seed), np.linalg.cholesky(prior)
+    points = rng.standard_normal((samples, len(prior)))  # in standard deviations of the prior
+    values, exponent, evidence = log_likelihood(points @ root.T), 0.0, 0.0
     while exponent < 1.0:
         step = _next_step(values, 1.0 - exponent)
         exponent += step
+        evidence += float(logsumexp(step * values)) - np.log(samples)
         drawn = rng.choice(samples, samples, p=_weights(values, step))
         points, values = points[drawn], values[drawn]
         for _ in range(_MOVES):
             proposed = points + _draw_moves(points, rng)
-            found = log_likelihood(proposed)
-            odds = exponent * (found - values) + _log_prior(proposed / sigmas)
-            accepted = np.log(rng.random(samples)) < odds - _log_prior(points / sigmas)
+            found = log_likelihood(proposed @ root.T)
+            odds = exponent * (found - values) + _log_prior(proposed) - _log_prior(points)
+            accepted = np.log(rng.random(samples)) < odds
             points[accepted], values[accepted] = proposed[accepted], found[accepted]
-    return points
+    return points @ root.T, evidence
 
 
 def _next_step(values: Array, left: float) -> float:

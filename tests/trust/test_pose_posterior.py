@@ -18,12 +18,24 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.pose_posterior import REACH, measure_posteriors, widen
+from calibgraph.trust.pose_posterior import REACH, PosePosterior, measure_posteriors, widen
 from tests.trust.conftest import simulated
 
 Array = NDArray[np.float64]
 NAME = "front_left"
 WIDE = np.diag((REACH / 2) ** 2)
+BY_MATCHES = np.diag((REACH / 10) ** 2)  # 0.1 deg and 2.5 cm
+TOLERANCE = 0.5, 10.0
+
+
+def certain(covariance: Array) -> PosePosterior:
+    """The rounds ended where the matches say, no doubt; samples of exactly this covariance."""
+    near = np.sqrt(6) * np.linalg.cholesky(covariance).T
+    return PosePosterior(np.concatenate([near, -near]), np.zeros((1, 6)), 0.0)
+
+
+def posterior_of(dataset: Dataset, rig: Rig) -> PosePosterior:
+    return measure_posteriors(dataset, rig, {NAME: BY_MATCHES})[NAME]
 
 
 def with_images_of(dataset: Dataset, folder: Path) -> Dataset:
@@ -45,22 +57,38 @@ def random_covariance(size: int, seed: int) -> Array:
 def test_images_with_structure_tell_the_pose_to_a_tenth_of_a_degree(
     dataset: Dataset, truth: Rig
 ) -> None:
-    sigmas = np.sqrt(np.diag(measure_posteriors(dataset, truth)[NAME]))
+    found = posterior_of(dataset, truth)
+    sigmas = np.sqrt(np.diag(found.moments))
     assert np.degrees(sigmas[:3].max()) < 0.1
     assert 100 * sigmas[3:].max() < 4
+    assert found.share < 1e-3
 
 
 def test_images_that_show_nothing_leave_all_poses_open(
     dataset: Dataset, truth: Rig, tmp_path: Path
 ) -> None:
-    found = measure_posteriors(with_images_of(dataset, tmp_path), truth)[NAME]
-    assert (np.sqrt(np.diag(found)) > 0.5 * REACH).all()
+    found = posterior_of(with_images_of(dataset, tmp_path), truth)
+    assert (np.std(found.near, axis=0) > 2 * REACH / 10).all()
+    assert (np.std(found.elsewhere, axis=0) > 0.5 * REACH).all()
+    assert 0.02 < found.share < 0.5  # what was assumed before
 
 
 def test_about_a_wrong_result_it_reaches_as_far_as_the_truth(dataset: Dataset, truth: Rig) -> None:
-    wrong = perturb(truth, rotation_deg=0.8, translation_m=0.1, seed=3)
-    turned = np.degrees(np.sqrt(np.trace(measure_posteriors(dataset, wrong)[NAME][:3, :3])))
-    assert turned > 0.5
+    found = posterior_of(dataset, perturb(truth, rotation_deg=0.8, translation_m=0.1, seed=3))
+    assert np.degrees(np.sqrt(np.trace(found.moments[:3, :3]))) > 0.5
+    assert found.probability_beyond(BY_MATCHES, TOLERANCE) > 0.9
+
+
+def test_the_verdict_counts_the_mass_beyond_the_tolerance() -> None:
+    turned, moved, inside = np.zeros((3, 6))
+    turned[0], moved[5], inside[2] = np.radians(0.6), 0.11, np.radians(0.4)
+    elsewhere = np.array([turned, moved, inside, inside])
+    posterior = PosePosterior(1e-3 * elsewhere, elsewhere, 0.2)
+    assert posterior.probability_beyond(1e-9 * np.eye(6), TOLERANCE) == pytest.approx(0.2 * 0.5)
+    assert posterior.probability_beyond(1e-9 * np.eye(6), (0.7, 12.0)) == pytest.approx(0)
+    assert posterior.moments[5, 5] == pytest.approx(0.2 * 0.11**2 / 4, rel=1e-4)
+    both = replace(posterior, near=elsewhere)
+    assert both.probability_beyond(1e-9 * np.eye(6), TOLERANCE) >= 0.5
 
 
 def test_a_narrower_posterior_leaves_the_covariance_as_it_is() -> None:
@@ -88,7 +116,8 @@ def test_the_relative_pose_of_tied_cameras_stays_known_where_both_are_widened_al
 
 def test_flat_evidence_widens_the_error_bar_and_is_named_as_its_source(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
-    plain, flat = Evidence(solution, pair), Evidence(solution, pair, {"left": WIDE})
+    plain = Evidence(solution, pair)
+    flat = Evidence(solution, pair, lambda _: {"left": certain(WIDE)})
     narrow, wide = (np.sqrt(np.diag(each.covariance_of("left"))) for each in (plain, flat))
     assert (wide > 3 * narrow).all()
     sources = flat.error_sources["left"]
@@ -102,14 +131,15 @@ def test_a_deployed_pose_is_not_wrong_where_the_images_allow_it(pair: Rig) -> No
     deployed = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1)
     solution = solve_joint(pair, simulated(pair, frames=20))
     tolerance = Tolerance(0.5, 10.0)
-    plain, flat = Evidence(solution, deployed), Evidence(solution, deployed, {"left": WIDE})
+    plain = Evidence(solution, deployed)
+    flat = Evidence(solution, deployed, lambda _: {"left": certain(WIDE)})
     assert judge_camera(plain, "left", "", tolerance).status == "WRONG"
     assert judge_camera(flat, "left", "", tolerance).status == "CANNOT TELL"
 
 
 def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
-    evidence = Evidence(solution, pair, {name: 4 * WIDE for name in pair.cameras})
+    evidence = Evidence(solution, pair, lambda _: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
     found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
     assert found.error_probability is not None
     assert found.error_probability.by_error_bar > 0.9

@@ -71,11 +71,11 @@ def test_a_worse_check_never_makes_a_result_more_probable(model: str, kind: str)
 
 @pytest.mark.parametrize("model", [TABLES, STRUCTURE])
 def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(model: str) -> None:
-    assert judge([], None, (0.5, 10.0), model).status == "PASS"
+    assert judge([], 0.0, (0.5, 10.0), model).status == "PASS"
     new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
-    assert judge([new], None, (0.5, 10.0), model).status == "FAIL"
+    assert judge([new], 0.0, (0.5, 10.0), model).status == "FAIL"
     assert judge(
-        [Check("search", "FAIL", "not found")], None, (0.5, 10.0), model
+        [Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model
     ).error_probability == ErrorProbability(1)
 
 
@@ -92,8 +92,8 @@ def test_a_wide_error_bar_is_as_probably_off_as_draws_from_it() -> None:
     expected = turned.mean() + moved.mean()
     assert probability_beyond(WIDE, (0.5, 10.0)) == pytest.approx(expected, rel=0.02)
     assert probability_beyond(None, (0.5, 10.0)) == 0.0
-    assert judge([], WIDE, (0.5, 10.0), TABLES).status != "PASS"
-    assert judge([], WIDE, (5.0, 100.0), TABLES).status == "PASS"
+    assert probability_beyond(WIDE, (5.0, 100.0)) < 1e-3
+    assert judge([], expected, (0.5, 10.0), TABLES).status != "PASS"
 
 
 def test_the_status_is_a_cut_of_the_probability() -> None:
