@@ -157,7 +157,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
-        build_graph=evidence.build_graph,
+        build_graph=solution.graph,
     )
     if _log.isEnabledFor(logging.INFO):
         verdict = result.verdict

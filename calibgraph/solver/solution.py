@@ -6,14 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +87,29 @@ class Solution:
         """The rig with the estimated extrinsics."""
         return self.rig.moved_to(self.T_camera_lidar)
 
+    @cached_property
+    def marginals(self) -> Marginals:
+        """Its covariance, and all that it is made of."""
+        return Marginals(self)
+
+    @property
+    def covariance(self) -> Array | None:
+        """(6 N, 6 N) of all extrinsics, in the rig's order; None if a direction is undetermined.
+
+        Of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation [rad], translation [m]).
+        """
+        return self.marginals.covariance
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph whose optimum and marginal are reported."""
+        return self.marginals.graph
+
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
-        if self.before_pairs is None:
-            return self
+        return self if self.before_pairs is None else self._alone
+
+    @cached_property
+    def _alone(self) -> Solution:
         alone = replace(self.inliers, pairs=())
         return replace(
             self,
