@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import latent_pose_graph
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
@@ -28,13 +29,11 @@ from calibgraph.solver.error_shares import (
     sources_of_error,
     variances_by_source,
 )
+from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
 from factors import pose_sigmas
-
-if TYPE_CHECKING:
-    from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
 
@@ -59,32 +58,39 @@ class Marginals:
     """The covariance of a solution and its parts, each computed once, when it is needed.
 
     Attributes:
-        solution: of the joint solve.
+        at: the solution's objective, at its estimate.
+        table: the correspondences, with the matcher's error and the places.
+        fit: the error model that the estimate is of; None where it is that of the objective.
+        camera_matches: what cameras see in common.
+        alone: those of the solution without camera pairs; None where there are none.
     """
 
-    solution: Solution
+    at: FittedObjective
+    table: Correspondences
+    fit: ErrorFit | None = None
+    camera_matches: CameraMatches | None = None
+    alone: Marginals | None = None
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Their names, in the rig's order."""
-        return tuple(self.solution.T_camera_lidar)
+        return self.at.cameras
 
     @property
     def findings(self) -> MatcherFindings:
         """The findings of the matcher."""
-        return self.solution.correspondences.findings
+        return self.table.findings
 
     @cached_property
     def covariance(self) -> Array | None:
         """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
-        solution = self.solution
-        if solution.config.preset == "auto":
+        if self.at.objective.config.preset == "auto":
             return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.shared_variance_ratio * self._shared(solution.inliers, self.curvature)
+        shared = self.shared_variance_ratio * self._shared(self.at.objective, self.curvature)
         return (
-            self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
+            self.scatter + shared + error_between(self.at.T_camera_lidar, self.at.objective.pairs)
         )
 
     @cached_property
@@ -92,7 +98,7 @@ class Marginals:
         """The graph whose optimum and marginal they are; with the paper's presets, Eq. 5."""
         if self.errors is not None:
             return latent_pose_graph(self.errors.model)
-        return self.solution.inliers.graph(self.solution.scales)
+        return self.at.objective.graph(self.at.scales)
 
     @cached_property
     def errors(self) -> ErrorFit | None:
@@ -101,34 +107,30 @@ class Marginals:
         The shared error is at least as large as pairs of images show, even if the loss rejects
         them.
         """
-        solution = self.solution
-        found = solution.errors or fit_errors(
-            solution.fitted, self.findings, solution.correspondences.places
-        )
+        found = self.fit or fit_errors(self.at, self.findings, self.table.places)
         return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
 
     @cached_property
     def curvature(self) -> Curvature:
         """The curvature of all terms at the solution."""
-        return curvature_at(self.solution.fitted, self.robust_hessians)
+        return curvature_at(self.at, self.robust_hessians)
 
     @cached_property
     def scatter(self) -> Array | None:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
-        return cluster_robust_covariance(self.solution.fitted, self.curvature)
+        return cluster_robust_covariance(self.at, self.curvature)
 
     @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
         """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
-        return robust_hessians(self.solution.fitted)
+        return robust_hessians(self.at)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
         """(N, 6) standard deviations if every correspondence were independent."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences:
+        if not self.at.objective.uses_correspondences:
             return None
-        return data_sigmas(solution.fitted)
+        return data_sigmas(self.at)
 
     def error_sources(self, joint: Array) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources.
@@ -138,7 +140,7 @@ class Marginals:
         """
         if self.covariance is None:
             return {}
-        total, held = np.diag(self.covariance), self.solution.held
+        total, held = np.diag(self.covariance), self.at.held
         if self.errors is None:
             parts = self._sandwich_parts
             fixed = parts[COMMON] + parts[PAIRS]
@@ -157,7 +159,7 @@ class Marginals:
     @property
     def _sandwich_parts(self) -> dict[str, Array]:
         """Per source but the matches, (6 N,) variances, with the paper's presets."""
-        inliers, T_camera_lidar = self.solution.inliers, self.solution.T_camera_lidar
+        inliers, T_camera_lidar = self.at.objective, self.at.T_camera_lidar
         no_places = replace(self.findings, place_variance=0.0)
         every, common = (
             self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
@@ -169,10 +171,10 @@ class Marginals:
     @cached_property
     def shared_variance_ratio(self) -> float:
         """Variance of the shared error relative to its prior, from co-visible features."""
-        own = self.solution.without_pairs().marginals
-        if own is self or own.covariance is None:
+        own = self.alone
+        if own is None or own.covariance is None:
             return 1.0
-        return shared_variance_ratio(own.solution.T_camera_lidar, own.covariance, own.pair_fits)
+        return shared_variance_ratio(own.at.T_camera_lidar, own.covariance, own.pair_fits)
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
@@ -181,13 +183,12 @@ class Marginals:
 
     def fit_pairs_near(self, joint: Array | None) -> list[PairFit]:
         """The same, the first camera held by some (6 N, 6 N) covariance."""
-        solution = self.solution
-        if solution.camera_matches is None:
+        if self.camera_matches is None:
             return []
         known = self.known_or_prior(joint)
         held = [known[pose_rows(number), pose_rows(number)] for number in range(len(self.cameras))]
-        matches = solution.camera_matches
-        return fit_pairs(solution.solved_rig, matches, solution.config, np.array(held))
+        rig = self.at.objective.rig.moved_to(self.at.T_camera_lidar)
+        return fit_pairs(rig, self.camera_matches, self.at.objective.config, np.array(held))
 
     def known_or_prior(self, joint: Array | None) -> Array:
         """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
@@ -200,25 +201,24 @@ class Marginals:
         self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
     ) -> Array:
         """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
-        places = self.solution.correspondences.places
+        places = self.table.places
         repeats = {
             name: places.frames_per_place(block.frame_numbers)
             for name, block in inliers.blocks.items()
         }
-        T_camera_lidar = {name: self.solution.T_camera_lidar[name] for name in inliers.cameras}
+        T_camera_lidar = {name: self.at.T_camera_lidar[name] for name in inliers.cameras}
         scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
         return curvature.sandwich(scatter)
 
     @cached_property
     def data_only(self) -> DataOnly | None:
         """The solution of the correspondences alone; None where there is nothing else."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
+        if not self.at.objective.uses_correspondences or not self.at.objective.pose_graph.size():
             return None
         if (found := self._data_only_by_errors) is not None:
             return found
-        free = solution.fitted.data_only()
-        if solution.config.preset == "auto":
+        free = self.at.data_only()
+        if self.at.objective.config.preset == "auto":
             return DataOnly(free.T_camera_lidar, None)
         curvature = curvature_at(free, robust_hessians(free))
         scatter = cluster_robust_covariance(free, curvature)
@@ -231,25 +231,29 @@ class Marginals:
     @property
     def _data_only_by_errors(self) -> DataOnly | None:
         """The same by the error model, None where there is none."""
-        solution, errors = self.solution, self.errors
-        if errors is not None and errors.without_priors is None and not solution.rig.relative_poses:
+        errors = self.errors
+        if (
+            errors is not None
+            and errors.without_priors is None
+            and not self.at.objective.rig.relative_poses
+        ):
             fit = errors.drop_pose_graph()  # near its minimum already
             if fit is not None and len(errors.model.blocks) == len(self.cameras):
                 return DataOnly(fit.T_camera_lidar, fit.covariance)
         alone = None if errors is None else errors.without_priors
         if alone is None:
-            places = solution.correspondences.places
-            alone = fit_without_priors(solution.fitted, self.findings, places)
+            places = self.table.places
+            alone = fit_without_priors(self.at, self.findings, places)
         return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
         """The factors of relative poses between cameras that both have correspondences."""
-        free, cameras = self.data_only, tuple(self.solution.inliers.blocks)
+        free, cameras = self.data_only, tuple(self.at.objective.blocks)
         if free is None:
             return ()
         return tuple(
             relative_pose_conflict(pair, cameras, free.T_camera_lidar, free.covariance)
-            for pair in self.solution.rig.relative_poses
+            for pair in self.at.objective.rig.relative_poses
             if pair.a in cameras and pair.b in cameras
         )

@@ -90,7 +90,8 @@ class Solution:
     @cached_property
     def marginals(self) -> Marginals:
         """Its covariance, and all that it is made of."""
-        return Marginals(self)
+        alone = None if self.before_pairs is None else self.without_pairs().marginals
+        return Marginals(self.fitted, self.correspondences, self.errors, self.camera_matches, alone)
 
     @property
     def covariance(self) -> Array | None:
@@ -106,10 +107,12 @@ class Solution:
 
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
-        return self if self.before_pairs is None else self._alone
+        return self._alone
 
     @cached_property
     def _alone(self) -> Solution:
+        if self.before_pairs is None:
+            return self
         alone = replace(self.inliers, pairs=())
         return replace(
             self,

@@ -216,7 +216,8 @@ class Evidence:
         Of the matches alone: where the images are flat, the error bar says so, and no check fails.
         """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
-        sigmas, held = solution.marginals.data_sigmas, camera in solution.held
+        sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
+        held = camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
@@ -225,9 +226,7 @@ class Evidence:
             covariance=None if held else self._block(self.covariance_of_matches, camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
-            conflicts=tuple(
-                c for c in solution.marginals.conflicts if camera in (c.pair.a, c.pair.b)
-            ),
+            conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
