@@ -43,12 +43,7 @@ class Curvature:
     @cached_property
     def inverse(self) -> Array | None:
         """None where a direction is not determined."""
-        scaled, units = unit_diagonal(self.whole)
-        values, vectors = np.linalg.eigh(scaled)
-        if values[0] <= _SINGULAR * values[-1]:
-            return None
-        inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
-        return inverse
+        return invert_or_none(self.whole)
 
     def sandwich(self, scatter: Array) -> Array:
         """``H^-1 S H^-1`` for a positive semidefinite S, which it is as well, in spite of rounding.
@@ -62,6 +57,16 @@ class Curvature:
         root = self.inverse @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         covariance: Array = root @ root.T
         return covariance
+
+
+def invert_or_none(hessian: Array) -> Array | None:
+    """The inverse of a positive semidefinite matrix, None where a direction is not determined."""
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] <= _SINGULAR * values[-1]:
+        return None
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
+    return inverse
 
 
 def curvature_at(at: FittedObjective, robust_hessians: Mapping[str, Array]) -> Curvature:
