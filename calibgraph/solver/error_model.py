@@ -9,22 +9,19 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
 from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert
 from calibgraph.model.places import Places
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.conflicts import relative_pose_conflict
+from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.pair_refinement import pair_sigmas
-from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.solver.within_place import WEAK, within_place
@@ -257,26 +254,7 @@ def error_model(
         robust_scale=prior.robust_sigmas if len(places) >= prior.robust_places else np.inf,
     )
     graph = join(inliers.pose_graph, _held_graph(at))
-    return LatentPoseModel(cameras, blocks, _pairs_by_place(pairs, places), graph, components)
-
-
-def block_by_place(
-    camera: CameraBlock, scale: ResidualScale, places: Sequence[Numbers]
-) -> BlockByPlace:
-    """The correspondences of a camera, sorted by place.
-
-    Args:
-        camera: its correspondences.
-        scale: of their residuals.
-        places: the frame numbers of each place.
-    """
-    of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
-    if len(places) == 1:
-        return BlockByPlace(camera.with_scale(scale), np.array([0, len(camera)]), of_frame, counts)
-    edges = np.zeros(len(places) + 1, dtype=np.int64)
-    np.add.at(edges[1:], of_frame, counts)
-    block = camera.sorted_by(of_frame).with_scale(scale)
-    return BlockByPlace(block, edges.cumsum(), of_frame, counts)
+    return LatentPoseModel(cameras, blocks, pairs_by_place(pairs, places), graph, components)
 
 
 def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
@@ -288,17 +266,3 @@ def _held_graph(at: FittedObjective) -> gtsam.NonlinearFactorGraph:
     for name in at.held:
         graph.add(gtsam.PriorFactorPose3(pose_key(at.cameras, name), at.pose(name), unit))
     return graph
-
-
-def _pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PairByPlace]:
-    """Each term with the information of features that err as usual in a frame."""
-    found = []
-    for pair in pairs:
-        own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
-        term = pair.deflate(usual_excess(own))
-        of_row = place_of(term.frame, places)
-        rows = np.argsort(of_row, kind="stable")
-        present, first = np.unique(of_row[rows], return_index=True)
-        edges = np.append(first, len(rows))
-        found.append(PairByPlace(term.a, term.b, term.block.select(rows), present, edges))
-    return found
