@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.fitted import FittedObjective
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
@@ -67,23 +65,19 @@ class WithinPlace:
         return (covariance + covariance.transpose(0, 2, 1)) / 2
 
 
-def within_place(
-    inliers: Objective, name: str, T_camera_lidar: Array, scale: ResidualScale, placed: BlockByPlace
-) -> WithinPlace:
+def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> WithinPlace:
     """What a camera's matches share.
 
     Args:
-        inliers: after the gate.
+        at: the minimum for independent matches.
         name: of the camera.
-        T_camera_lidar: (4, 4) its minimum.
-        scale: of its residuals.
         placed: its matches.
     """
-    block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
-    hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
+    block, pose, scale = at.objective.blocks[name], at.pose(name), at.scales[name]
+    hessians = placed.sums(np.tile(at.T_camera_lidar[name], (len(placed.frames), 1, 1))).hessian
     root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
-    robust = robust_hessian(block.with_scale(scale), pose)
-    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + WEAK
+    robust = robust_hessian(at.projections[name], pose)
+    true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     inverse = np.linalg.inv(true)
     covariance = root.T @ inverse @ scatter @ inverse @ root
