@@ -25,9 +25,13 @@ from calibgraph.solver.objective import Objective, Scales
 from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
+from calibgraph.solver.scan_distortion import (
+    DistortionEvidence,
+    distortion_evidence,
+    pair_jacobians,
+)
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
-from calibgraph.solver.within_place import WEAK, within_place
+from calibgraph.solver.within_place import WEAK, WithinPlace, within_place
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -215,55 +219,93 @@ def error_model(
     held: Sequence[str] = (),
 ) -> LatentPoseModel:
     """The model with prior variance components; arguments as of :func:`fit_errors`."""
-    findings, prior = MatcherFindings.from_metadata(metadata), error_components()
-    cameras = tuple(T_camera_lidar)
-    whole, share = np.square(findings.rigid_sigmas), findings.camera_share
-    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = prior.matchers[UNKNOWN]
-        whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
-        share = unknown.camera_share
-    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
-    at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    scatter_at_place = at_place.copy()
-    sigmas = np.asarray(findings.bend_sigmas)
-    blocks, jacobian = {}, np.zeros((len(cameras), 6, len(sigmas)))
-    shape = len(places), len(cameras), len(sigmas)
-    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    findings, cameras = MatcherFindings.from_metadata(metadata), tuple(T_camera_lidar)
+    blocks, shown = {}, {}
     for name, block in inliers.blocks.items():
-        number, by_place = cameras.index(name), block_by_place(block, scales[name], places)
+        by_place = block_by_place(block, scales[name], places)
         within = within_place(inliers, name, T_camera_lidar[name], scales[name], by_place)
-        at_place[:, number] = within.at_place(findings.place_variance)
-        scatter_at_place[:, number] = within.at_place(0.0)
-        blocks[name] = by_place.with_variance(within.least)
-        if sigmas.any():
+        blocks[name], evidence = by_place.with_variance(within.least), None
+        if any(findings.bend_sigmas):
             pose = to_T_lidar_camera(T_camera_lidar[name])
             evidence = distortion_evidence(block, scales[name], pose, WEAK, places=places)
-            jacobian[number] = evidence.jacobian * sigmas
-            weight = 1.0 / within.mean_variance(findings.place_variance)
-            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
-            vector[:, number] = weight * sigmas * evidence.vector
+        shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
-    components = VarianceComponents(
-        cloud=_covariance(*((1.0 - share) * whole)),
-        cloud_at_place=_covariance(*of_place),
-        camera=_covariance(*(share * whole)),
-        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
-        at_place=at_place,
-        scatter_at_place=scatter_at_place,
-        distortion_jacobian=jacobian,
+    components = variance_components(findings, cameras, shown, places=len(places))
+    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
+        unknown = error_components().matchers[UNKNOWN]
+        whole = unknown.systematic_rotation_rad, unknown.systematic_translation_m
+        components = _with_common_error(components, whole, unknown.camera_share)
+    components = replace(
+        components,
         pair_distortion_jacobian=pair_jacobians(
-            jacobian,
+            components.distortion_jacobian,
             np.isin(cameras, list(inliers.blocks)),
             invert(np.stack([T_camera_lidar[name] for name in cameras])),
             sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
         ),
+    )
+    graph = join(inliers.pose_graph, held_graph(cameras, T_camera_lidar, held))
+    return LatentPoseModel(cameras, blocks, _pairs_by_place(pairs, places), graph, components)
+
+
+def variance_components(
+    findings: MatcherFindings,
+    cameras: Sequence[str],
+    shown: Mapping[str, tuple[WithinPlace, DistortionEvidence | None]],
+    *,
+    places: int,
+) -> VarianceComponents:
+    """The prior components, but for the pairs' part of the scan distortion.
+
+    Args:
+        findings: of the matcher, with the sizes of its errors.
+        cameras: of the rig.
+        shown: per camera that has correspondences, what these share by the scatter of frames, and
+            their quadratics in the scan distortion.
+        places: number of places.
+    """
+    prior, sigmas = error_components(), np.asarray(findings.bend_sigmas)
+    at_place = np.tile(np.eye(6), (places, len(cameras), 1, 1))
+    scatter_at_place, jacobian = at_place.copy(), np.zeros((len(cameras), 6, len(sigmas)))
+    shape = places, len(cameras), len(sigmas)
+    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    for name, (within, evidence) in shown.items():
+        number = cameras.index(name)
+        at_place[:, number] = within.at_place(findings.place_variance)
+        scatter_at_place[:, number] = within.at_place(0.0)
+        if evidence is not None:
+            jacobian[number] = evidence.jacobian * sigmas
+            weight = 1.0 / within.mean_variance(findings.place_variance)
+            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
+            vector[:, number] = weight * sigmas * evidence.vector
+    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
+    components = VarianceComponents(
+        cloud=np.eye(6),
+        cloud_at_place=pose_covariance(*of_place),
+        camera=np.eye(6),
+        pairs=pose_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
+        at_place=at_place,
+        scatter_at_place=scatter_at_place,
+        distortion_jacobian=jacobian,
+        pair_distortion_jacobian=np.zeros_like(jacobian),
         distortion_information=information,
         distortion_vector=vector,
         distortion_weight=np.ones(shape[:2]),
-        robust_scale=prior.robust_sigmas if len(places) >= prior.robust_places else np.inf,
+        robust_scale=prior.robust_sigmas if places >= prior.robust_places else np.inf,
     )
-    graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
-    return LatentPoseModel(cameras, blocks, _pairs_by_place(pairs, places), graph, components)
+    return _with_common_error(components, findings.rigid_sigmas, findings.camera_share)
+
+
+def _with_common_error(
+    components: VarianceComponents, sigmas: tuple[float, float], camera_share: float
+) -> VarianceComponents:
+    """With a rigid error that all frames share, of the cloud and of each camera."""
+    whole = np.square(sigmas)
+    return replace(
+        components,
+        cloud=pose_covariance(*((1.0 - camera_share) * whole)),
+        camera=pose_covariance(*(camera_share * whole)),
+    )
 
 
 def block_by_place(
@@ -285,13 +327,15 @@ def block_by_place(
     return BlockByPlace(block, edges.cumsum(), of_frame, counts)
 
 
-def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
+def pose_covariance(rotation_rad2: float, translation_m2: float) -> Array:
+    """(6, 6), positive definite, from the variance per axis."""
     return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
 
 
-def _held_graph(
+def held_graph(
     cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Sequence[str]
 ) -> gtsam.NonlinearFactorGraph:
+    """Priors of some cameras, to a radian and a metre."""
     graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
     for name in held:
         pose = to_T_lidar_camera(T_camera_lidar[name])
