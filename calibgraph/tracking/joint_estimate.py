@@ -56,7 +56,7 @@ NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 3  # of fits and estimates of the variance ratios, as in a batch
-_TOLERANCE = 1e-4  # relative change of the cost, of which the residuals of matches are no part
+_TOLERANCE = 1e-3  # relative change of the cost, of which the residuals of matches are no part
 
 
 @dataclass(frozen=True, eq=False)
