@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents
+from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
@@ -21,7 +21,7 @@ from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.prior_components import common_error, variance_components
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.solver.within_place import WEAK, within_place
@@ -29,7 +29,6 @@ from calibgraph.solver.within_place import WEAK, within_place
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
 _ROUNDS = 3  # of fits and estimates of the variance ratios
 _COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
 
@@ -206,63 +205,42 @@ def error_model(
         findings: the matcher's error.
         places: the frame numbers of each place.
     """
-    inliers, cameras, prior = at.objective, at.cameras, error_components()
-    whole, share = np.square(findings.rigid_sigmas), findings.camera_share
-    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = prior.matchers[UNKNOWN]
-        whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
-        share = unknown.camera_share
-    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
-    at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    scatter_at_place = at_place.copy()
-    sigmas = np.asarray(findings.bend_sigmas)
-    blocks, jacobian = {}, np.zeros((len(cameras), 6, len(sigmas)))
-    shape = len(places), len(cameras), len(sigmas)
-    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    inliers, cameras = at.objective, at.cameras
+    blocks, shown = {}, {}
     for name, block in inliers.blocks.items():
-        number, by_place = cameras.index(name), block_by_place(block, at.scales[name], places)
+        by_place = block_by_place(block, at.scales[name], places)
         within = within_place(at, name, by_place)
-        at_place[:, number] = within.at_place(findings.place_variance)
-        scatter_at_place[:, number] = within.at_place(0.0)
-        blocks[name] = by_place.with_variance(within.least)
-        if sigmas.any():
+        blocks[name], evidence = by_place.with_variance(within.least), None
+        if any(findings.bend_sigmas):
             evidence = distortion_evidence(
                 block, at.scales[name], at.pose(name), WEAK, places=places
             )
-            jacobian[number] = evidence.jacobian * sigmas
-            weight = 1.0 / within.mean_variance(findings.place_variance)
-            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
-            vector[:, number] = weight * sigmas * evidence.vector
+        shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
-    components = VarianceComponents(
-        cloud=_covariance(*((1.0 - share) * whole)),
-        cloud_at_place=_covariance(*of_place),
-        camera=_covariance(*(share * whole)),
-        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
-        at_place=at_place,
-        scatter_at_place=scatter_at_place,
-        distortion_jacobian=jacobian,
+    components = variance_components(findings, cameras, shown, places=len(places))
+    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
+        unknown = error_components().matchers[UNKNOWN]
+        whole = unknown.systematic_rotation_rad, unknown.systematic_translation_m
+        components = common_error(components, whole, unknown.camera_share)
+    components = replace(
+        components,
         pair_distortion_jacobian=pair_jacobians(
-            jacobian,
+            components.distortion_jacobian,
             np.isin(cameras, list(inliers.blocks)),
             invert(np.stack([*at.T_camera_lidar.values()])),
             sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
         ),
-        distortion_information=information,
-        distortion_vector=vector,
-        distortion_weight=np.ones(shape[:2]),
-        robust_scale=prior.robust_sigmas if len(places) >= prior.robust_places else np.inf,
     )
-    graph = join(inliers.pose_graph, _held_graph(at))
+    graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
     return LatentPoseModel(cameras, blocks, pairs_by_place(pairs, places), graph, components)
 
 
-def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
-    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
-
-
-def _held_graph(at: FittedObjective) -> gtsam.NonlinearFactorGraph:
+def held_graph(
+    cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Iterable[str]
+) -> gtsam.NonlinearFactorGraph:
+    """Priors of some cameras, to a radian and a metre."""
     graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
-    for name in at.held:
-        graph.add(gtsam.PriorFactorPose3(pose_key(at.cameras, name), at.pose(name), unit))
+    for name in held:
+        pose = to_T_lidar_camera(T_camera_lidar[name])
+        graph.add(gtsam.PriorFactorPose3(pose_key(cameras, name), pose, unit))
     return graph

@@ -26,7 +26,6 @@ from calibgraph.solver.fitted import FittedObjective
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
@@ -43,19 +42,30 @@ class WithinPlace:
         efficiency: of independent matches: their true variance over that of H, in the mean.
         roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
         frames: (P,) of each place.
+        alike: frames of a place, in the mean over frames.
     """
 
     least: float
     excess: Array
     efficiency: float
     roots: Array
-    frames: Numbers
+    frames: Array
+    alike: float
+
+    @staticmethod
+    def of(
+        covariance: Array, efficiency: float, *, roots: Array, frames: Array, alike: float
+    ) -> WithinPlace:
+        """Split K, the (6, 6) ``covariance`` by all frames; the rest is as of the attributes."""
+        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+        least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
+        excess = (vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T
+        return WithinPlace(least, excess, efficiency, roots, frames, alike)
 
     def mean_variance(self, place_variance: float) -> float:
         """Of all matches of the camera, in units of independent ones, in the mean over a pose."""
-        alike = float(np.square(self.frames).sum() / max(self.frames.sum(), 1))
         within = self.least + float(np.trace(self.excess)) / 6
-        return within + place_variance * self.efficiency * alike
+        return within + place_variance * self.efficiency * self.alike
 
     def at_place(self, place_variance: float) -> Array:
         """(P, 6, 6) covariance of a_cp about m_c."""
@@ -81,14 +91,13 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     inverse = np.linalg.inv(true)
     covariance = root.T @ inverse @ scatter @ inverse @ root
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
-    return WithinPlace(
-        least=least,
-        excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
-        efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
+    frames = placed.frames.astype(np.float64)
+    return WithinPlace.of(
+        covariance,
+        float(np.trace(root.T @ inverse @ root)) / 6,
         roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
-        frames=placed.frames,
+        frames=frames,
+        alike=float(np.square(frames).sum() / max(frames.sum(), 1)),
     )
 
 
