@@ -70,7 +70,7 @@ def test_images_that_show_nothing_leave_all_poses_open(
     found = posterior_of(with_images_of(dataset, tmp_path), truth)
     assert (np.std(found.near, axis=0) > 2 * REACH / 10).all()
     assert (np.std(found.elsewhere, axis=0) > 0.5 * REACH).all()
-    assert 0.02 < found.share < 0.5  # what was assumed before
+    assert found.share > 0.5
 
 
 def test_about_a_wrong_result_it_reaches_as_far_as_the_truth(dataset: Dataset, truth: Rig) -> None:
