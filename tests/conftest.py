@@ -24,6 +24,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.report import plots
+from calibgraph.trust import image_checks
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -155,6 +156,12 @@ def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
     Session fixtures such as ``calibrated_sample`` are made before, with drawn ones.
     """
     monkeypatch.setattr(plots, "to_data_uri", lambda figure: "data:image/png;base64,")
+
+
+@pytest.fixture
+def no_time_offsets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not track images in the images before and after, for tests of all else."""
+    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
 
 
 def make_pair() -> Rig:
