@@ -73,7 +73,7 @@ def calibrate(
         checks = assess_run(evidence)
     report("done", 1, 1)
     return replace(
-        to_calibration(evidence.solution, checks, model_of(run.correspondences.metadata)),
+        to_calibration(evidence.solution, checks, model_of(run.correspondences.matcher)),
         correspondences=run.correspondences,
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
@@ -157,7 +157,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
-        build_graph=evidence.build_graph,
+        build_graph=solution.graph,
     )
     if _log.isEnabledFor(logging.INFO):
         verdict = result.verdict

@@ -73,11 +73,11 @@ def match_in_rounds(
         places = find_stationary(data, guess)
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
-    estimate, found = start.rig, start.findings.to_metadata()
+    estimate = start.rig
     for index in range(start.first_round, full.rounds):
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=progress)
-            table = replace(table, metadata={**table.metadata, **found}).with_places(places)
+            table = table.with_findings(start.findings).with_places(places)
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms=terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
@@ -282,8 +282,8 @@ def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> M
     findings = run.correspondences.findings
     z_score = dict(findings.z_score)
     z_score |= {name: again.correspondences.findings.z_score[name] for name in better}
-    keys = replace(findings, z_score=z_score).to_metadata()
-    mixed = replace(concatenate(parts), metadata={**run.correspondences.metadata, **keys})
+    mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
+    mixed = mixed.with_findings(replace(findings, z_score=z_score))
     second = again.solution.rig.T_camera_lidar
     start = run.solution.rig.moved_to({name: second[name] for name in better})
     settings = run.solution.config, run.solution.terms

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_lidar_camera
-from factors import BlockSums, PairBlock, ProjectionBlock
+from factors import BlockSums, PairBlock, ProjectionBlock, pair_block_factor
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -70,9 +71,42 @@ class BlockByPlace:
         runs = np.column_stack([self.edges[:-1], self.edges[1:]])
         return self.block.run_sums(np.ascontiguousarray(T_camera_cloud), runs)
 
-    def at_place(self, place: int) -> ProjectionBlock:
-        """The correspondences of one place."""
-        return self.block.select(np.arange(self.edges[place], self.edges[place + 1]))
+    def factor(self, place: int, cloud: int, matched: int) -> gtsam.NonlinearFactor:
+        """The correspondences of one place, lossless, on the variables of these keys."""
+        rows = np.arange(self.edges[place], self.edges[place + 1])
+        return pair_block_factor(cloud, matched, self.block.select(rows))
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticByPlace:
+    """One camera's correspondences whose sums alone are kept: a quadratic per place.
+
+    Attributes:
+        places: (p,) the places that have correspondences, in rising order.
+        T_lidar_camera: per such place, the minimum.
+        information: (p, 6, 6) in the tangent there, positive definite.
+    """
+
+    places: Numbers
+    T_lidar_camera: Sequence[gtsam.Pose3]
+    information: Array
+
+    def sums(self, T_camera_cloud: Array) -> BlockSums:
+        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
+        count = len(T_camera_cloud)
+        hessian, step = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        for row, place in enumerate(self.places):
+            here = to_T_lidar_camera(T_camera_cloud[place])
+            step[place] = self.T_lidar_camera[row].localCoordinates(here)
+        hessian[self.places] = self.information
+        gradient = np.einsum("pij,pj->pi", hessian, step)
+        return BlockSums(hessian, gradient, np.einsum("pi,pi->p", gradient, step))
+
+    def factor(self, place: int, cloud: int, matched: int) -> gtsam.NonlinearFactor:
+        """The quadratic of one place, a stock factor on the variables of these keys."""
+        row = int(np.searchsorted(self.places, place))
+        noise = gtsam.noiseModel.Gaussian.Information(self.information[row])
+        return gtsam.BetweenFactorPose3(cloud, matched, self.T_lidar_camera[row], noise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.by_place import BlockByPlace, PairByPlace
+from calibgraph.graph.by_place import BlockByPlace, PairByPlace, QuadraticByPlace
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
@@ -33,7 +33,7 @@ from calibgraph.graph.variables import (
     matched_key,
     paired_key,
 )
-from factors import biased_between_factor, pair_block_factor, placed_pair_factor, robust_noise
+from factors import biased_between_factor, placed_pair_factor, robust_noise
 
 Array = NDArray[np.float64]
 
@@ -98,14 +98,15 @@ class LatentPoseModel:
 
     Attributes:
         cameras: their names.
-        blocks: correspondences, per camera that has some.
+        blocks: correspondences, per camera that has some, or the quadratics that are left of them.
         pairs: camera-to-camera matches.
-        pose_graph: priors and measured relative poses, on ``x_c``.
+        pose_graph: priors and measured relative poses, on ``x_c``; marginals of places that are
+            not in the graph, on ``o`` and ``m_c``.
         components: of the errors.
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, BlockByPlace]
+    blocks: Mapping[str, BlockByPlace | QuadraticByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -184,8 +185,8 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     """One lossless factor per camera and place, and one per pair and place."""
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places():
-        block = model.blocks[model.cameras[camera]].at_place(place)
-        graph.add(pair_block_factor(cloud_at_key(place), matched_at_key(place, camera), block))
+        keys = cloud_at_key(place), matched_at_key(place, camera)
+        graph.add(model.blocks[model.cameras[camera]].factor(place, *keys))
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, features in pair.at_each_place():

@@ -15,7 +15,7 @@ order:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from calibgraph.io.dataset import Dataset
@@ -141,7 +141,7 @@ class MatcherWithDefaults:
     ) -> Correspondences:
         """The matcher's own correspondences; its source of Stage 1 in their metadata."""
         table = self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
-        return replace(table, metadata={STAGE1: self.stage1, **table.metadata})
+        return table.with_metadata({STAGE1: self.stage1, **table.metadata})
 
     def release(self) -> None:
         """Release the memory that the matcher keeps between rounds."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +49,9 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
-        metadata: the matcher, its settings and its findings.
+        metadata: as the file has it: the matcher, its settings, its findings and the places.
+        findings: the matcher's, read from the metadata.
+        places: which frames share a place, read from the metadata.
 
     Raises:
         CorrespondenceError: on wrong shapes or values, naming the first bad row, and if the
@@ -66,6 +68,8 @@ class Correspondences:
     stamp_ns: NDArray[np.int64] | None = None
     point_index: NDArray[np.int64] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    findings: MatcherFindings = field(init=False)
+    places: Places = field(init=False)
 
     def __post_init__(self) -> None:
         n = len(self.frame)
@@ -80,10 +84,16 @@ class Correspondences:
             0 <= self.camera_index.min() <= self.camera_index.max() < len(self.cameras)
         ):
             raise CorrespondenceError(f"camera_index must count the cameras {self.cameras}")
-        if not isinstance(self.metadata, dict):
-            raise CorrespondenceError(f"metadata must be a mapping, found {self.metadata!r}")
-        _ = self.findings, self.places
+        self._read(self.metadata)
         self._check_values()
+
+    def _read(self, metadata: dict[str, Any]) -> None:
+        """Take over a record of metadata, and read the typed parts of it."""
+        if not isinstance(metadata, dict):
+            raise CorrespondenceError(f"metadata must be a mapping, found {metadata!r}")
+        object.__setattr__(self, "metadata", metadata)
+        object.__setattr__(self, "findings", MatcherFindings.from_metadata(metadata))
+        object.__setattr__(self, "places", Places.from_metadata(metadata))
 
     @staticmethod
     def from_arrays(
@@ -159,27 +169,29 @@ class Correspondences:
         return self.select(~np.isin(self.camera_index, left_out)) if left_out else self
 
     @property
-    def findings(self) -> MatcherFindings:
-        """The matcher's findings, from the metadata.
+    def matcher(self) -> str:
+        """The name of the matcher; empty if the table does not state it."""
+        name = self.metadata.get("matcher")
+        return name if isinstance(name, str) else ""
 
-        Raises:
-            CorrespondenceError: if a value is not a number in its range.
-        """
-        return MatcherFindings.from_metadata(self.metadata)
-
-    @property
-    def places(self) -> Places:
-        """Which frames share a place, from the metadata.
-
-        Raises:
-            CorrespondenceError: if they are not lists of frame numbers.
-        """
-        return Places.from_metadata(self.metadata)
+    def with_findings(self, findings: MatcherFindings) -> Correspondences:
+        """The table with what these findings state; what they leave open stays as it is."""
+        return self.with_metadata({**self.metadata, **findings.to_metadata()})
 
     def with_places(self, places: Places) -> Correspondences:
-        """The table with other places in its metadata."""
+        """The table with other places."""
         kept = {key: value for key, value in self.metadata.items() if key not in KEYS}
-        return replace(self, metadata={**kept, **places.to_metadata()})
+        return self.with_metadata({**kept, **places.to_metadata()})
+
+    def with_metadata(self, metadata: dict[str, Any]) -> Correspondences:
+        """The same rows with another record of metadata.
+
+        Raises:
+            CorrespondenceError: if its findings or places are wrong.
+        """
+        changed = copy.copy(self)  # the columns are not checked again
+        changed._read(metadata)
+        return changed
 
     def counts(self) -> dict[str, int]:
         """Rows per camera."""
@@ -246,7 +258,9 @@ _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
     "information_px": 3, "stamp_ns": 1, "point_index": 1,
 }  # fmt: skip
-assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {"cameras", "metadata"}
+assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {
+    "cameras", "metadata", "findings", "places",
+}  # fmt: skip
 
 
 def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:

@@ -12,6 +12,7 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.matcher_errors import MatcherErrors
@@ -53,7 +54,7 @@ def draw_places(
         rounds: how often all places are visited, one after the other.
     """
     truth, there = stereo(), []
-    findings = MatcherFindings.from_metadata(vars(SIZES))
+    findings = MatcherFindings(**vars(SIZES))
     whole = np.repeat(findings.rigid_sigmas, 3)
     bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
     at_place = np.repeat([SIZES.place_rotation_rad, SIZES.place_translation_m], 3)
@@ -77,10 +78,8 @@ def draw_places(
         bent = points + np.tensordot(bends, distortions_at(points), axes=1)
         tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
         names[place] += range(frames * visit, frames * (visit + 1))
-    stated = {name: value for name, value in vars(SIZES).items()}
-    joined = concatenate(tables)
-    metadata = {**joined.metadata, **stated, "places": names}
-    return Drawn(truth, replace(joined, metadata=metadata))
+    joined = concatenate(tables).with_findings(findings)
+    return Drawn(truth, joined.with_places(Places(places=as_groups(names))))
 
 
 def draw_cameras(truth: Rig, matches: int, rng: Rng) -> Array:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.camera_pairs import PairTerm, usual_excess
+from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.camera_pairs import usual_excess
 from calibgraph.solver.curvature import (
     Curvature,
     add_pair_hessians,
@@ -18,8 +16,9 @@ from calibgraph.solver.curvature import (
     rows_of_pair,
     unknown,
 )
-from calibgraph.solver.objective import Objective, Scales, Transforms
-from factors import ProjectionBlock, unit_diagonal
+from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.objective import Objective
+from factors import unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -35,14 +34,7 @@ frames)."""
 _FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
 
-def cluster_robust_covariance(
-    inliers: Objective,
-    T_camera_lidar: Transforms,
-    scales: Scales,
-    curvature: Curvature,
-    *,
-    held: Sequence[str] = (),
-) -> Array | None:
+def cluster_robust_covariance(at: FittedObjective, curvature: Curvature) -> Array | None:
     """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few + M) H^-1``.
 
     g_f is the gradient of the correspondences of frame f, over all cameras jointly; ``few`` is the
@@ -53,46 +45,44 @@ def cluster_robust_covariance(
     the middle: their means come from the same correspondences.
 
     Args:
-        inliers: after the gate.
-        T_camera_lidar: its minimum, all cameras.
-        scales: of the residuals.
-        curvature: at the minimum.
-        held: cameras that nothing determines.
+        at: the minimum.
+        curvature: there.
 
     Returns:
         (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
         xi = (rotation [rad], translation [m]) in each camera's axes. Cameras that are held are
         unknown by a radian and a metre. None without correspondences, or where H is singular.
     """
+    inliers = at.objective
     if not inliers.uses_correspondences or not inliers.blocks or curvature.inverse is None:
         return None
-    no_bar = unknown([name in held for name in T_camera_lidar])
+    no_bar = unknown([name in at.held for name in at.cameras])
     known = np.diag(no_bar) == 0
-    gradients = frame_gradients(inliers, T_camera_lidar, scales)
-    counts = [_frames_behind(name, inliers) for name in T_camera_lidar]
+    gradients = frame_gradients(at)
+    counts = [_frames_behind(name, inliers) for name in at.cameras]
     scatter = with_pseudo_frames(
         gradients.T @ gradients,
         curvature.whole,
         np.repeat(counts, 6).astype(np.float64),
-        usual_scatter(inliers, T_camera_lidar, curvature),
+        usual_scatter(at, curvature),
     )
     covariance = curvature.sandwich(scatter + curvature.measured)
     return np.asarray(covariance * np.outer(known, known) + no_bar)
 
 
-def usual_scatter(inliers: Objective, T_camera_lidar: Transforms, curvature: Curvature) -> Array:
+def usual_scatter(at: FittedObjective, curvature: Curvature) -> Array:
     """(6 N, 6 N) scatter of all frames' gradients if matches are correlated as usual.
 
     Of n independent matches it is their Hessian; with a correlation r, 1 + r (n - 1) times that.
     """
-    cameras, usual = list(T_camera_lidar), np.zeros_like(curvature.whole)
-    for name, block in inliers.blocks.items():
-        rows = pose_rows(cameras.index(name))
+    usual = np.zeros_like(curvature.whole)
+    for name, block in at.objective.blocks.items():
+        rows = pose_rows(at.cameras.index(name))
         excess = error_components().frame_correlation * (len(block) / block.frames - 1)
         usual[rows, rows] = (1 + excess) * curvature.of_correspondences[rows, rows]
-    for pair in inliers.pairs:
+    for pair in at.objective.pairs:
         own = np.zeros_like(usual)
-        add_pair_hessians(own, [pair], T_camera_lidar)
+        add_pair_hessians(own, [pair], at.T_camera_lidar)
         usual += usual_excess([pair]) * own
     return usual
 
@@ -105,22 +95,21 @@ def _frames_behind(name: str, inliers: Objective) -> int:
     return len(np.unique(np.concatenate(tied))) if tied else 1
 
 
-def frame_gradients(inliers: Objective, T_camera_lidar: Transforms, scales: Scales) -> Array:
+def frame_gradients(at: FittedObjective) -> Array:
     """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
-    cameras, blocks = list(T_camera_lidar), inliers.blocks
+    cameras, blocks, pairs = at.cameras, at.objective.blocks, at.objective.pairs
     own = {name: block.frame_numbers for name, block in blocks.items()}
-    of_pairs = [pair.frame for pair in inliers.pairs]
+    of_pairs = [pair.frame for pair in pairs]
     numbers = np.unique(np.concatenate([np.empty(0, np.int64), *own.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
     for name, block in blocks.items():
-        pose = to_T_lidar_camera(T_camera_lidar[name])
         rows = np.searchsorted(numbers, own[name])
-        of_frames = block.frame_gradients(pose, scales[name])
+        of_frames = block.frame_gradients(at.pose(name), at.scales[name])
         gradients[rows, pose_rows(cameras.index(name))] = of_frames
-    for pair in inliers.pairs:
+    for pair in pairs:
         rows = np.searchsorted(numbers, np.unique(pair.frame))
         columns = rows_of_pair(cameras, pair)
-        gradients[np.ix_(rows, columns)] += pair.frame_gradients(T_camera_lidar)
+        gradients[np.ix_(rows, columns)] += pair.frame_gradients(at.T_camera_lidar)
     return gradients
 
 
@@ -162,33 +151,23 @@ def _along(vectors: Array, matrix: Array) -> Array:
     return np.asarray((vectors * (matrix @ vectors)).sum(axis=0))
 
 
-def data_sigmas(
-    blocks: Mapping[str, ProjectionBlock],
-    pose_graph: gtsam.NonlinearFactorGraph,
-    T_camera_lidar: Mapping[str, Array],
-    pairs: Sequence[PairTerm] = (),
-) -> Array:
+def data_sigmas(at: FittedObjective) -> Array:
     """Standard deviations if every correspondence were independent.
 
     A lower bound of the true uncertainty: it shows the directions that the data do not determine.
-
-    Args:
-        blocks: per camera with correspondences.
-        pose_graph: measured relative poses; no priors.
-        T_camera_lidar: the solution, all cameras.
-        pairs: what cameras see in common.
+    Measured relative poses and camera pairs count, priors do not.
 
     Returns:
         (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
         infinite in directions without information.
     """
-    cameras = list(T_camera_lidar)
-    hessian = pose_hessian(pose_graph, cameras, T_camera_lidar)
-    for name, block in blocks.items():
+    objective, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
+    measured = relative_pose_graph(objective.cameras, objective.rig.relative_poses)
+    hessian = pose_hessian(measured, cameras, T_camera_lidar)
+    for name, block in at.projections.items():
         rows = pose_rows(cameras.index(name))
-        sums = block.sums(to_T_lidar_camera(T_camera_lidar[name]))
-        hessian[rows, rows] += sums.hessian
-    add_pair_hessians(hessian, pairs, T_camera_lidar)
+        hessian[rows, rows] += block.sums(at.pose(name)).hessian
+    add_pair_hessians(hessian, objective.pairs, T_camera_lidar)
     scaled, units = unit_diagonal(hessian)
     values, vectors = np.linalg.eigh(scaled)
     free = values < _FREE

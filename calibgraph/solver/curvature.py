@@ -11,15 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.objective import relative_pose_graph
-from calibgraph.model.geometry import (
-    pose_rows,
-    retract_all,
-    to_T_camera_lidar,
-    to_T_lidar_camera,
-)
+from calibgraph.model.geometry import pose_rows, retract_all, to_T_camera_lidar
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
-from calibgraph.solver.objective import Objective, Transforms
+from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.optimizer import to_values
 from factors import ProjectionBlock, unit_diagonal
 
@@ -48,12 +43,7 @@ class Curvature:
     @cached_property
     def inverse(self) -> Array | None:
         """None where a direction is not determined."""
-        scaled, units = unit_diagonal(self.whole)
-        values, vectors = np.linalg.eigh(scaled)
-        if values[0] <= _SINGULAR * values[-1]:
-            return None
-        inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
-        return inverse
+        return invert_or_none(self.whole)
 
     def sandwich(self, scatter: Array) -> Array:
         """``H^-1 S H^-1`` for a positive semidefinite S, which it is as well, in spite of rounding.
@@ -69,21 +59,25 @@ class Curvature:
         return covariance
 
 
-def curvature_at(
-    inliers: Objective,
-    T_camera_lidar: Transforms,
-    robust_hessians: Mapping[str, Array],
-    held: Sequence[str] = (),
-) -> Curvature:
-    """The curvature of an objective's terms.
+def invert_or_none(hessian: Array) -> Array | None:
+    """The inverse of a positive semidefinite matrix, None where a direction is not determined."""
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] <= _SINGULAR * values[-1]:
+        return None
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
+    return inverse
+
+
+def curvature_at(at: FittedObjective, robust_hessians: Mapping[str, Array]) -> Curvature:
+    """The curvature of an objective's terms, the gate's own among them.
 
     Args:
-        inliers: after the gate, whose own curvature is part of it.
-        T_camera_lidar: its minimum.
+        at: the minimum.
         robust_hessians: per camera, (6, 6) of its correspondences there.
-        held: cameras that nothing determines.
     """
-    cameras, gates = list(T_camera_lidar), inliers.gate_hessian
+    inliers, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
+    gates = inliers.gate_hessian
     own = np.zeros((6 * len(cameras), 6 * len(cameras)))
     for name, hessian in robust_hessians.items():
         rows = pose_rows(cameras.index(name))
@@ -91,7 +85,7 @@ def curvature_at(
     measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
     whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
     add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
-    whole += unknown([name in held for name in cameras])
+    whole += unknown([name in at.held for name in cameras])
     return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
 
 
@@ -105,12 +99,12 @@ def unknown(chosen: Sequence[bool]) -> Array:
     return np.diag(np.repeat(np.array(chosen, dtype=np.float64), 6))
 
 
-def hessians_of_blocks(
-    blocks: Mapping[str, ProjectionBlock], T_camera_lidar: Mapping[str, Array]
-) -> dict[str, Array]:
-    """Per camera with correspondences, its :func:`robust_hessian`, (6, 6)."""
-    poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in blocks]
-    hessians = map_on_cores(robust_hessian, [*blocks.values()], poses)
+def robust_hessians(at: FittedObjective) -> dict[str, Array]:
+    """Per camera with correspondences, its :func:`robust_hessian`; empty if no term uses them."""
+    if not at.objective.uses_correspondences:
+        return {}
+    blocks = at.projections
+    hessians = map_on_cores(robust_hessian, [*blocks.values()], [at.pose(n) for n in blocks])
     return dict(zip(blocks, hessians, strict=True))
 
 

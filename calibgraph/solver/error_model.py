@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
-from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents
+from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.conflicts import relative_pose_conflict
+from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
-from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.pair_refinement import pair_sigmas
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.prior_components import common_error, variance_components
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.solver.within_place import WEAK, within_place
@@ -32,7 +29,6 @@ from calibgraph.solver.within_place import WEAK, within_place
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
 _ROUNDS = 3  # of fits and estimates of the variance ratios
 _COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
 
@@ -96,31 +92,36 @@ class ErrorFit:
 
 
 def refine_with_error_model(
-    inliers: Objective,
-    optimum: Optimum,
-    scales: Scales,
-    metadata: Mapping[str, Any],
-    held: Sequence[str] = (),
+    at: FittedObjective, optimum: Optimum, findings: MatcherFindings, places: Places
 ) -> tuple[ErrorFit | None, Optimum]:
     """The optimum of the error model, where it differs from that of independent matches.
 
     With nothing but the matches of one place, and no scan distortion, both optima are equal; then
     no model is made. Measured relative poses that contradict the correspondences take no part, so
-    that a wrong one, or two swapped cameras, do not move the others. Arguments and None as of
-    :func:`fit_errors`.
+    that a wrong one, or two swapped cameras, do not move the others.
+
+    Args:
+        at: the optimum for independent matches.
+        optimum: the same, with its cost.
+        findings: the matcher's error.
+        places: which frames share a place.
+
+    Returns:
+        The model, None as of :func:`fit_errors`; and its optimum.
     """
-    several = inliers.blocks and len(places_of(inliers, metadata)) > 1
-    distorted = any(MatcherFindings.from_metadata(metadata).bend_sigmas)
+    inliers = at.objective
+    several = inliers.blocks and len(split_frames(inliers, places)) > 1
+    distorted = any(findings.bend_sigmas)
     if not (several or distorted or inliers.pairs or inliers.rig.relative_poses):
         return None, optimum
-    free, T = None, optimum.T_camera_lidar
-    if inliers.rig.relative_poses:
-        free = fit_without_priors(inliers, T, scales, metadata)
+    free = fit_without_priors(at, findings, places) if inliers.rig.relative_poses else None
     if free is not None:
         agreeing = _without_contradictions(inliers, free)
-        T = T if agreeing is inliers else T | free.T_camera_lidar
-        inliers = agreeing
-    found = fit_errors(inliers, T, scales, metadata, held)
+        if agreeing is not inliers:
+            at = replace(
+                at, objective=agreeing, T_camera_lidar=at.T_camera_lidar | free.T_camera_lidar
+            )
+    found = fit_errors(at, findings, places)
     if found is None:
         return None, optimum
     found = replace(found, without_priors=free)
@@ -129,17 +130,12 @@ def refine_with_error_model(
 
 
 def fit_without_priors(
-    inliers: Objective,
-    T_camera_lidar: Mapping[str, Array],
-    scales: Scales,
-    metadata: Mapping[str, Any],
+    at: FittedObjective, findings: MatcherFindings, places: Places
 ) -> ErrorFit | None:
     """The fit of correspondences and pairs alone; None as of :func:`fit_errors`."""
-    if inliers.config.preset != "auto" or not inliers.uses_correspondences:
+    if at.objective.config.preset != "auto" or not at.objective.uses_correspondences:
         return None
-    free = inliers.data_only()
-    start = {name: T_camera_lidar[name] for name in free.cameras}
-    return fit_errors(free, free.minimize(start, scales).T_camera_lidar, scales, metadata)
+    return fit_errors(at.data_only(), findings, places)
 
 
 def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
@@ -157,33 +153,26 @@ def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
     return replace(inliers, rig=inliers.rig.model_copy(update={"relative_poses": kept}))
 
 
-def fit_errors(
-    inliers: Objective,
-    T_camera_lidar: Mapping[str, Array],
-    scales: Scales,
-    metadata: Mapping[str, Any],
-    held: Sequence[str] = (),
-) -> ErrorFit | None:
+def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -> ErrorFit | None:
     """Fit poses and variance ratios, from the optimum for independent matches.
 
     Args:
-        inliers: after the gate.
-        T_camera_lidar: its optimum.
-        scales: of the residuals.
-        metadata: of the correspondences, with the matcher's error and the places.
-        held: cameras that nothing determines; they are known to a radian and a metre.
+        at: that optimum.
+        findings: the matcher's error.
+        places: which frames share a place.
 
     Returns:
         None without correspondences, with a preset of the paper, or where a direction of a camera
         is not determined.
     """
+    inliers = at.objective
     if inliers.config.preset != "auto" or not inliers.uses_correspondences or not inliers.blocks:
         return None
-    places = places_of(inliers, metadata)
-    model = error_model(inliers, T_camera_lidar, scales, metadata, places, held)
+    frames = split_frames(inliers, places)
+    model = error_model(at, findings, frames)
     prior, ratios = model.components, VarianceRatios()
     fit = fit_latent_poses(
-        model, start_values(model, T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
+        model, start_values(model, at.T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
     if fit is not None and np.isfinite(prior.robust_scale):  # an outlying place has no evidence
         weight = fit.place_weights(prior.robust_scale)
@@ -196,118 +185,62 @@ def fit_errors(
         model, ratios = replace(model, components=found.scale(prior)), found
         fit = fit_latent_poses(model, fit, relative_tolerance=_COARSE_TOLERANCE)
     fit = None if fit is None else fit_latent_poses(model, fit)
-    return None if fit is None else ErrorFit(fit, tuple(places), ratios)
+    return None if fit is None else ErrorFit(fit, tuple(frames), ratios)
 
 
-def places_of(inliers: Objective, metadata: Mapping[str, Any]) -> list[Numbers]:
+def split_frames(inliers: Objective, places: Places) -> list[Numbers]:
     """The numbers of the frames of each place, over all cameras."""
     blocks = [block.frame_numbers for block in inliers.blocks.values()]
     frames = np.unique(np.concatenate([*blocks, *(pair.frame for pair in inliers.pairs)]))
-    return Places.from_metadata(metadata).split(frames)
+    return places.split(frames)
 
 
 def error_model(
-    inliers: Objective,
-    T_camera_lidar: Mapping[str, Array],
-    scales: Scales,
-    metadata: Mapping[str, Any],
-    places: Sequence[Numbers],
-    held: Sequence[str] = (),
+    at: FittedObjective, findings: MatcherFindings, places: Sequence[Numbers]
 ) -> LatentPoseModel:
-    """The model with prior variance components; arguments as of :func:`fit_errors`."""
-    findings, prior = MatcherFindings.from_metadata(metadata), error_components()
-    cameras = tuple(T_camera_lidar)
-    whole, share = np.square(findings.rigid_sigmas), findings.camera_share
-    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = prior.matchers[UNKNOWN]
-        whole = np.square([unknown.systematic_rotation_rad, unknown.systematic_translation_m])
-        share = unknown.camera_share
-    of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
-    at_place = np.tile(np.eye(6), (len(places), len(cameras), 1, 1))
-    scatter_at_place = at_place.copy()
-    sigmas = np.asarray(findings.bend_sigmas)
-    blocks, jacobian = {}, np.zeros((len(cameras), 6, len(sigmas)))
-    shape = len(places), len(cameras), len(sigmas)
-    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
-    for name, block in inliers.blocks.items():
-        number, by_place = cameras.index(name), block_by_place(block, scales[name], places)
-        within = within_place(inliers, name, T_camera_lidar[name], scales[name], by_place)
-        at_place[:, number] = within.at_place(findings.place_variance)
-        scatter_at_place[:, number] = within.at_place(0.0)
-        blocks[name] = by_place.with_variance(within.least)
-        if sigmas.any():
-            pose = to_T_lidar_camera(T_camera_lidar[name])
-            evidence = distortion_evidence(block, scales[name], pose, WEAK, places=places)
-            jacobian[number] = evidence.jacobian * sigmas
-            weight = 1.0 / within.mean_variance(findings.place_variance)
-            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
-            vector[:, number] = weight * sigmas * evidence.vector
-    pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
-    components = VarianceComponents(
-        cloud=_covariance(*((1.0 - share) * whole)),
-        cloud_at_place=_covariance(*of_place),
-        camera=_covariance(*(share * whole)),
-        pairs=_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
-        at_place=at_place,
-        scatter_at_place=scatter_at_place,
-        distortion_jacobian=jacobian,
-        pair_distortion_jacobian=pair_jacobians(
-            jacobian,
-            np.isin(cameras, list(inliers.blocks)),
-            invert(np.stack([T_camera_lidar[name] for name in cameras])),
-            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
-        ),
-        distortion_information=information,
-        distortion_vector=vector,
-        distortion_weight=np.ones(shape[:2]),
-        robust_scale=prior.robust_sigmas if len(places) >= prior.robust_places else np.inf,
-    )
-    graph = join(inliers.pose_graph, _held_graph(cameras, T_camera_lidar, held))
-    return LatentPoseModel(cameras, blocks, _pairs_by_place(pairs, places), graph, components)
-
-
-def block_by_place(
-    camera: CameraBlock, scale: ResidualScale, places: Sequence[Numbers]
-) -> BlockByPlace:
-    """The correspondences of a camera, sorted by place.
+    """The model with prior variance components.
 
     Args:
-        camera: its correspondences.
-        scale: of their residuals.
+        at: the optimum for independent matches.
+        findings: the matcher's error.
         places: the frame numbers of each place.
     """
-    of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
-    if len(places) == 1:
-        return BlockByPlace(camera.with_scale(scale), np.array([0, len(camera)]), of_frame, counts)
-    edges = np.zeros(len(places) + 1, dtype=np.int64)
-    np.add.at(edges[1:], of_frame, counts)
-    block = camera.sorted_by(of_frame).with_scale(scale)
-    return BlockByPlace(block, edges.cumsum(), of_frame, counts)
+    inliers, cameras = at.objective, at.cameras
+    blocks, shown = {}, {}
+    for name, block in inliers.blocks.items():
+        by_place = block_by_place(block, at.scales[name], places)
+        within = within_place(at, name, by_place)
+        blocks[name], evidence = by_place.with_variance(within.least), None
+        if any(findings.bend_sigmas):
+            evidence = distortion_evidence(
+                block, at.scales[name], at.pose(name), WEAK, places=places
+            )
+        shown[name] = within, evidence
+    pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
+    components = variance_components(findings, cameras, shown, places=len(places))
+    if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
+        unknown = error_components().matchers[UNKNOWN]
+        whole = unknown.systematic_rotation_rad, unknown.systematic_translation_m
+        components = common_error(components, whole, unknown.camera_share)
+    components = replace(
+        components,
+        pair_distortion_jacobian=pair_jacobians(
+            components.distortion_jacobian,
+            np.isin(cameras, list(inliers.blocks)),
+            invert(np.stack([*at.T_camera_lidar.values()])),
+            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
+        ),
+    )
+    graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
+    return LatentPoseModel(cameras, blocks, pairs_by_place(pairs, places), graph, components)
 
 
-def _covariance(rotation_rad2: float, translation_m2: float) -> Array:
-    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
-
-
-def _held_graph(
-    cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Sequence[str]
+def held_graph(
+    cameras: Sequence[str], T_camera_lidar: Mapping[str, Array], held: Iterable[str]
 ) -> gtsam.NonlinearFactorGraph:
+    """Priors of some cameras, to a radian and a metre."""
     graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
     for name in held:
         pose = to_T_lidar_camera(T_camera_lidar[name])
         graph.add(gtsam.PriorFactorPose3(pose_key(cameras, name), pose, unit))
     return graph
-
-
-def _pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PairByPlace]:
-    """Each term with the information of features that err as usual in a frame."""
-    found = []
-    for pair in pairs:
-        own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
-        term = pair.deflate(usual_excess(own))
-        of_row = place_of(term.frame, places)
-        rows = np.argsort(of_row, kind="stable")
-        present, first = np.unique(of_row[rows], return_index=True)
-        edges = np.append(first, len(rows))
-        found.append(PairByPlace(term.a, term.b, term.block.select(rows), present, edges))
-    return found

@@ -16,6 +16,7 @@ from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.error_model import refine_with_error_model
+from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
@@ -82,7 +83,8 @@ def solve_joint(
 
     with watch("error_model"):                                             # ours: shared errors
         errors, optimum = refine_with_error_model(
-            inliers, optimum, scales, kept.table.metadata, held)
+            FittedObjective(inliers, scales, optimum.T_camera_lidar, held),
+            optimum, kept.table.findings, kept.table.places)
 
     outlier_frames = frames.outlier_frames
     counts = count_correspondences(
@@ -129,11 +131,12 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     stops = solution.correspondences.places
     by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
-        inliers, optimum = refine_with_pairs(alone.inliers, alone.optimum, alone.scales, by_stop)
+        refined = refine_with_pairs(alone.fitted, by_stop)
+        inliers, optimum = refined or (alone.inliers, alone.optimum)
     with watch("error_model"):
-        errors, optimum = refine_with_error_model(
-            inliers, optimum, alone.scales, solution.correspondences.metadata, alone.held
-        )
+        at = FittedObjective(inliers, alone.scales, optimum.T_camera_lidar, alone.held)
+        table = solution.correspondences
+        errors, optimum = refine_with_error_model(at, optimum, table.findings, table.places)
     return replace(
         alone,
         inliers=inliers,

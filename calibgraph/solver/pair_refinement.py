@@ -21,7 +21,8 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms, usual_excess
-from calibgraph.solver.objective import Objective, Scales
+from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum, optimize
 from factors import EpipolarBlock, pose_sigmas
 
@@ -33,39 +34,33 @@ _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair
 
 
 def refine_with_pairs(
-    inliers: Objective,
-    optimum: Optimum,
-    scales: Scales,
-    matches: CameraMatches,
-    *,
-    kind: Kind = "surface",
-) -> tuple[Objective, Optimum]:
+    at: FittedObjective, matches: CameraMatches, *, kind: Kind = "surface"
+) -> tuple[Objective, Optimum] | None:
     """Minimize again with the terms of camera pairs, their sigmas narrowed step by step; gate; fit.
 
     Args:
-        inliers: the objective after the gate of the correspondences.
-        optimum: its minimum.
-        scales: of the correspondences' residuals.
+        at: the minimum without pairs.
         matches: with surfaces, taken near the optimum.
         kind: see ``pair_terms``.
 
     Returns:
-        The objective with the pairs' inliers, and its minimum; both unchanged where no pair of
-        cameras has enough in common, or the correspondences are not used.
+        The objective with the pairs' inliers, and its minimum; None where no pair of cameras has
+        enough in common, or the correspondences are not used.
     """
-    rig = inliers.rig.moved_to(optimum.T_camera_lidar)
+    inliers, T = at.objective, at.T_camera_lidar
+    rig = inliers.rig.moved_to(T)
     terms = pair_terms(rig, matches, inliers.config, kind=kind)
     if not terms or not inliers.uses_correspondences:
-        return inliers, optimum
-    T, least = optimum.T_camera_lidar, _least_sigmas(terms, optimum.T_camera_lidar)
+        return None
+    least = _least_sigmas(terms, T)
     for step in range(_NARROWINGS):
         now = np.array([term.sigma_px(T) for term in terms])
         sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / _NARROWINGS)
         scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
-        T = replace(inliers, pairs=scaled).minimize(T, scales).T_camera_lidar
+        T = replace(inliers, pairs=scaled).minimize(T, at.scales).T_camera_lidar
     kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
     joined = replace(inliers, pairs=kept)
-    return joined, joined.minimize(T, scales)
+    return joined, joined.minimize(T, at.scales)
 
 
 def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Array:

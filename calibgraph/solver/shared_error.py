@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -34,8 +33,9 @@ def with_common_error(table: Correspondences, config: Config) -> Correspondences
     rotation_rad, translation_m = np.radians(config.common_deg or 0), (config.common_cm or 0) / 100
     wanted, found = (float(rotation_rad), translation_m), table.findings
     if not found.states_common_error:
-        keys = ("systematic_rotation_rad", "systematic_translation_m")
-        return replace(table, metadata={**table.metadata, **dict(zip(keys, wanted, strict=True))})
+        return table.with_findings(
+            MatcherFindings(systematic_rotation_rad=wanted[0], systematic_translation_m=wanted[1])
+        )
     if found.systematic_sigmas != wanted:
         rotation_rad, translation_m = found.systematic_sigmas
         raise CorrespondenceError(

@@ -6,13 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +62,11 @@ class Solution:
         """Per camera, the (4, 4) estimate: p_camera = T_camera_lidar * p_lidar."""
         return dict(self.optimum.T_camera_lidar)
 
+    @cached_property
+    def fitted(self) -> FittedObjective:
+        """The objective that it was fitted to, with its scales, at the estimate."""
+        return FittedObjective(self.inliers, self.scales, self.T_camera_lidar, tuple(self.held))
+
     @property
     def T_hat(self) -> Transforms:
         """Per camera that has one, the (4, 4) Stage-1 estimate."""
@@ -74,8 +87,30 @@ class Solution:
         """The rig with the estimated extrinsics."""
         return self.rig.moved_to(self.T_camera_lidar)
 
+    @cached_property
+    def marginals(self) -> Marginals:
+        """Its covariance, and all that it is made of."""
+        alone = None if self.before_pairs is None else self.without_pairs().marginals
+        return Marginals(self.fitted, self.correspondences, self.errors, self.camera_matches, alone)
+
+    @property
+    def covariance(self) -> Array | None:
+        """(6 N, 6 N) of all extrinsics, in the rig's order; None if a direction is undetermined.
+
+        Of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation [rad], translation [m]).
+        """
+        return self.marginals.covariance
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph whose optimum and marginal are reported."""
+        return self.marginals.graph
+
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
+        return self._alone
+
+    @cached_property
+    def _alone(self) -> Solution:
         if self.before_pairs is None:
             return self
         alone = replace(self.inliers, pairs=())

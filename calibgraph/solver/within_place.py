@@ -19,16 +19,13 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.fitted import FittedObjective
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
@@ -45,19 +42,30 @@ class WithinPlace:
         efficiency: of independent matches: their true variance over that of H, in the mean.
         roots: (P, 6, 6) Cholesky roots of the Hessian of each place.
         frames: (P,) of each place.
+        alike: frames of a place, in the mean over frames.
     """
 
     least: float
     excess: Array
     efficiency: float
     roots: Array
-    frames: Numbers
+    frames: Array
+    alike: float
+
+    @staticmethod
+    def of(
+        covariance: Array, efficiency: float, *, roots: Array, frames: Array, alike: float
+    ) -> WithinPlace:
+        """Split K, the (6, 6) ``covariance`` by all frames; the rest is as of the attributes."""
+        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+        least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
+        excess = (vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T
+        return WithinPlace(least, excess, efficiency, roots, frames, alike)
 
     def mean_variance(self, place_variance: float) -> float:
         """Of all matches of the camera, in units of independent ones, in the mean over a pose."""
-        alike = float(np.square(self.frames).sum() / max(self.frames.sum(), 1))
         within = self.least + float(np.trace(self.excess)) / 6
-        return within + place_variance * self.efficiency * alike
+        return within + place_variance * self.efficiency * self.alike
 
     def at_place(self, place_variance: float) -> Array:
         """(P, 6, 6) covariance of a_cp about m_c."""
@@ -67,34 +75,29 @@ class WithinPlace:
         return (covariance + covariance.transpose(0, 2, 1)) / 2
 
 
-def within_place(
-    inliers: Objective, name: str, T_camera_lidar: Array, scale: ResidualScale, placed: BlockByPlace
-) -> WithinPlace:
+def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> WithinPlace:
     """What a camera's matches share.
 
     Args:
-        inliers: after the gate.
+        at: the minimum for independent matches.
         name: of the camera.
-        T_camera_lidar: (4, 4) its minimum.
-        scale: of its residuals.
         placed: its matches.
     """
-    block, pose = inliers.blocks[name], to_T_lidar_camera(T_camera_lidar)
-    hessians = placed.sums(np.tile(T_camera_lidar, (len(placed.frames), 1, 1))).hessian
+    block, pose, scale = at.objective.blocks[name], at.pose(name), at.scales[name]
+    hessians = placed.sums(np.tile(at.T_camera_lidar[name], (len(placed.frames), 1, 1))).hessian
     root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
-    robust = robust_hessian(block.with_scale(scale), pose)
-    true = convex_hessian(robust + inliers.gate_hessian.get(name, 0.0), robust) + WEAK
+    robust = robust_hessian(at.projections[name], pose)
+    true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     inverse = np.linalg.inv(true)
     covariance = root.T @ inverse @ scatter @ inverse @ root
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
-    return WithinPlace(
-        least=least,
-        excess=(vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T,
-        efficiency=float(np.trace(root.T @ inverse @ root)) / 6,
+    frames = placed.frames.astype(np.float64)
+    return WithinPlace.of(
+        covariance,
+        float(np.trace(root.T @ inverse @ root)) / 6,
         roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
-        frames=placed.frames,
+        frames=frames,
+        alike=float(np.square(frames).sum() / max(frames.sum(), 1)),
     )
 
 

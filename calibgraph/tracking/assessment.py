@@ -12,7 +12,7 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, joint_estimate
+from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined, posterior
 from calibgraph.tracking.split_half import SplitHalf
@@ -40,9 +40,7 @@ class Assessment:
     verdicts: dict[str, Verdict]
 
 
-def assess(
-    state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces, *, priors: Priors
-) -> Assessment:
+def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces) -> Assessment:
     """Assess the present estimates.
 
     Args:
@@ -50,9 +48,8 @@ def assess(
         sums: over its summaries and live frames.
         halves: the same sums, of every other epoch.
         closed: sums over places, of its closed epochs.
-        priors: priors and relative poses.
     """
-    joint = joint_estimate(state, sums, closed, priors)
+    joint = joint_estimate(state, sums, closed)
     verdicts = {}
     for camera, name in enumerate(state.names):
         own = tuple(c for c in joint.conflicts if name in (c.pair.a, c.pair.b))
@@ -163,7 +160,7 @@ def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
     halves = SplitHalf.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, ClosedPlaces.of(state), priors=Priors.of(state))
+    assessment = assess(state, sums, halves, ClosedPlaces.of(state))
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows, to_T_camera_lidar
+from calibgraph.solver.prior_components import pose_covariance
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit, squared_sigmas
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.place_errors import SharedErrors, shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, parts_of
 from calibgraph.tracking.posterior import is_determined, posterior, steps_of, true_hessian
 from calibgraph.tracking.state import LEAST_FRAMES, State
@@ -123,17 +124,41 @@ def _frame_hessian(state: State, camera: int, own: OutlierFrame) -> Array:
 
 def _shift(state: State, first: dict[str, Array], second: dict[str, Array]) -> Array:
     """(6 n, 6 n) as of :func:`shift_between`, by (n,) numbers of frames per place."""
-    n, shifts = len(state.cameras), state.all_bends.shifts
-    errors = SharedErrors.of(state.findings, state.references, state.sizes, shifts)
-    if not errors.are_at_places:
+    n, findings = len(state.cameras), state.findings
+    of_cloud = np.square([findings.place_rotation_rad, findings.place_translation_m])
+    if not (findings.place_variance or of_cloud.any()):
         return np.zeros((6 * n, 6 * n))
     older = dict(zip(state.places.names, state.places.frames, strict=True))
     names = {**older, **first, **second}
     none = np.zeros(n)
     one = np.array([older.get(name, none) + first.get(name, none) for name in names])
     two = np.array([second.get(name, none) for name in names])
+    flat = np.concatenate([*map(adjoint_camera_lidar, state.references)])
+    by_cloud = flat @ (state.sizes.cloud * pose_covariance(*of_cloud)) @ flat.T
     of_frame = state.total_hessian / np.maximum(state.total_frames, 1.0)[:, None, None]
-    return shift_covariance(one, two, of_frame, errors)
+    own = np.asarray(findings.place_variance * np.linalg.inv(of_frame + WEAK))
+    return shift_covariance(one, two, by_cloud, own)
+
+
+def shift_covariance(before: Array, after: Array, by_cloud: Array, own: Array) -> Array:
+    """(6 n, 6 n) covariance of the steps between two sets of frames by what places share.
+
+    Frames of the same place share their errors, which cancel.
+
+    Args:
+        before: (P, n) numbers of frames of the first set, per place and camera.
+        after: (P, n) of the second.
+        by_cloud: (6 n, 6 n) of all cameras, by the cloud's displacement at a place.
+        own: (n, 6, 6) of each camera at a place besides.
+    """
+    apart = before / np.maximum(before.sum(axis=0), 1.0)
+    apart = apart - after / np.maximum(after.sum(axis=0), 1.0)
+    both = apart.T @ apart
+    found = np.kron(both, np.ones((6, 6))) * by_cloud
+    for camera, covariance in enumerate(own):
+        rows = pose_rows(camera)
+        found[rows, rows] += both[camera, camera] * covariance
+    return np.asarray(found)
 
 
 def _counts(frames: Iterable[LiveFrame], cameras: int) -> dict[str, Array]:

@@ -34,7 +34,7 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import ClosedPlaces, Priors, with_sizes
+from calibgraph.tracking.joint_estimate import ClosedPlaces, with_sizes
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
@@ -182,7 +182,7 @@ class IncrementalCalibrator:
         if self._assessed is None or self._assessed[0] is not state:
             sums, halves = with_open_epoch(self._closed, state), self._closed_halves
             halves = halves.add(state.epochs[-1].frames)
-            found = assess(state, sums, halves, self._closed_places, priors=self._priors)
+            found = assess(state, sums, halves, self._closed_places)
             self._assessed = state, found
         return self._assessed[1]
 
@@ -238,7 +238,6 @@ class IncrementalCalibrator:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
         self._window = Window(self._state)
         self._copy_estimates()
-        self._priors = Priors.of(self._state)
         self._closed_places = ClosedPlaces.of(self._state)
         self._closed = closed_posterior(self._state)
         self._closed_halves = SplitHalf.of_closed_epochs(self._state)

@@ -3,34 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.latent_poses import latent_pose_graph
-from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.calibration import Residuals
-from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
+from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference, pose_rows, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
-from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature, curvature_at, hessians_of_blocks
-from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
-from calibgraph.solver.error_shares import (
-    predict_variances,
-    sources_of_error,
-    variances_by_source,
-)
-from calibgraph.solver.objective import Objective, Transforms
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
+from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
@@ -38,7 +25,6 @@ from calibgraph.trust.observability import prior_shares, shares_of_marginal
 from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors, widen
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.thresholds import limit
-from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -46,19 +32,6 @@ _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unk
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class DataOnly:
-    """The solution of the correspondences alone, without priors and relative poses.
-
-    Attributes:
-        T_camera_lidar: per camera that has correspondences, (4, 4).
-        covariance: (6 M, 6 M) in the order of ``T_camera_lidar``, or None.
-    """
-
-    T_camera_lidar: Transforms
-    covariance: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,42 +84,13 @@ class Evidence:
         }
 
     @cached_property
-    def curvature(self) -> Curvature:
-        """The curvature of all terms at the solution."""
-        solution = self.solution
-        return curvature_at(
-            solution.inliers, solution.T_camera_lidar, self.robust_hessians, solution.held
-        )
-
-    @cached_property
-    def scatter(self) -> Array | None:
-        """(6 N, 6 N) covariance by the scatter between frames, or None."""
-        solution = self.solution
-        return cluster_robust_covariance(
-            solution.inliers,
-            solution.T_camera_lidar,
-            solution.scales,
-            self.curvature,
-            held=solution.held,
-        )
-
-    @cached_property
-    def robust_hessians(self) -> Mapping[str, Array]:
-        """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences:
-            return {}
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
-        return hessians_of_blocks(blocks, solution.T_camera_lidar)
-
-    @cached_property
     def joint_covariance(self) -> Array | None:
         """(6 N, 6 N): of the matches, widened where the images' evidence is flat.
 
         Cameras that are held are unknown by a radian and a metre.
         """
-        if self.covariance_of_matches is None:
-            return None
+        if self.covariance_of_matches is None or not self.posteriors:
+            return self.covariance_of_matches
         posteriors = self.posteriors.items()
         moments = {self.cameras.index(name): found.moments for name, found in posteriors}
         return widen(self.covariance_of_matches, moments)
@@ -170,118 +114,31 @@ class Evidence:
             return probability_beyond(own, tolerance)
         return self.posteriors[camera].probability_beyond(own, tolerance)
 
-    @cached_property
+    @property
     def covariance_of_matches(self) -> Array | None:
-        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
-        solution = self.solution
-        if solution.config.preset == "auto":
-            return None if self.errors is None else self.errors.fit.covariance
-        if self.scatter is None:
-            return None
-        shared = self.shared_variance_ratio * self._shared(solution.inliers, self.curvature)
-        return (
-            self.scatter + shared + error_between(solution.T_camera_lidar, solution.inliers.pairs)
-        )
-
-    def build_graph(self) -> gtsam.NonlinearFactorGraph:
-        """The graph whose optimum and marginal are reported; with the paper's presets, Eq. 5."""
-        if self.errors is not None:
-            return latent_pose_graph(self.errors.model)
-        return self.solution.inliers.graph(self.solution.scales)
-
-    @cached_property
-    def error_sources(self) -> dict[str, ErrorSources]:
-        """Per camera with an error bar, the shares of its sources."""
-        if self.covariance_of_matches is None or self.joint_covariance is None:
-            return {}
-        total, held = np.diag(self.covariance_of_matches), self.solution.held
-        if self.errors is None:
-            parts = self._sandwich_parts
-            fixed = parts[COMMON] + parts[PAIRS]
-            forecast = {times: fixed + (total - fixed) / times for times in TIMES}
-        else:
-            parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
-        flat = np.diag(self.joint_covariance) - total
-        forecast = {times: variance + flat / times for times, variance in forecast.items()}
-        total, parts = total + flat, {**parts, FLAT: flat}
-        return {
-            name: sources_of_error(total, parts, forecast, number)
-            for number, name in enumerate(self.cameras)
-            if name not in held
-        }
+        """(6 N, 6 N): the marginal of the solution's graph."""
+        return self.solution.marginals.covariance
 
     @property
-    def _sandwich_parts(self) -> dict[str, Array]:
-        """Per source but the matches, (6 N,) variances, with the paper's presets."""
-        inliers, T_camera_lidar = self.solution.inliers, self.solution.T_camera_lidar
-        no_places = replace(self.findings, place_variance=0.0)
-        every, common = (
-            self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
-            for findings in (self.findings, no_places)
-        )
-        between = np.diag(error_between(T_camera_lidar, inliers.pairs))
-        return {COMMON: common, PLACES: every - common, PAIRS: between}
-
-    @cached_property
-    def errors(self) -> ErrorFit | None:
-        """The error model of the solution; None with the paper's presets.
-
-        The shared error is at least as large as pairs of images show, even if the loss rejects
-        them.
-        """
-        solution = self.solution
-        found = solution.errors or fit_errors(
-            solution.inliers,
-            solution.T_camera_lidar,
-            solution.scales,
-            solution.correspondences.metadata,
-            solution.held,
-        )
-        return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
-
-    @cached_property
-    def shared_variance_ratio(self) -> float:
-        """Variance of the shared error relative to its prior, from co-visible features."""
-        own = self.of_correspondences
-        if own is self or own.joint_covariance is None:
-            return 1.0
-        return shared_variance_ratio(
-            own.solution.T_camera_lidar, own.joint_covariance, own.pair_fits
-        )
+    def error_sources(self) -> dict[str, ErrorSources]:
+        """Per camera with an error bar, the shares of its sources."""
+        joint = self.joint_covariance
+        return {} if joint is None else self.solution.marginals.error_sources(joint)
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
         """The relative poses of pairs by images, the first camera held near the solution."""
-        matches = self.solution.camera_matches
-        if matches is None:
-            return []
-        held = [self._block(self.pair_covariance, name) for name in self.cameras]
-        return fit_pairs(self.solution.solved_rig, matches, self.solution.config, np.array(held))
+        marginals, joint = self.solution.marginals, self.joint_covariance
+        return marginals.pair_fits if not self.posteriors else marginals.fit_pairs_near(joint)
 
     @cached_property
     def pair_covariance(self) -> Array:
         """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
-        if self.joint_covariance is not None:
-            return self.joint_covariance
-        held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
-        return np.diag(np.tile(held, len(self.cameras)))
-
-    def _shared(
-        self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
-    ) -> Array:
-        """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
-        places = self.solution.correspondences.places
-        repeats = {
-            name: places.frames_per_place(block.frame_numbers)
-            for name, block in inliers.blocks.items()
-        }
-        T_camera_lidar = {name: self.solution.T_camera_lidar[name] for name in inliers.cameras}
-        scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
-        return curvature.sandwich(scatter)
+        return self.solution.marginals.known_or_prior(self.joint_covariance)
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
-        return self._block(self.scatter, camera)
+        return self._block(self.solution.marginals.scatter, camera)
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
@@ -304,19 +161,10 @@ class Evidence:
     @cached_property
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
-        if self.errors is None:
-            return prior_shares(self.solution, self.robust_hessians)
-        return shares_of_marginal(self.solution, self.errors.fit.covariance)
-
-    @cached_property
-    def data_sigmas(self) -> Array | None:
-        """(N, 6) standard deviations if every correspondence were independent."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences:
-            return None
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in solution.inliers.blocks.items()}
-        known = relative_pose_graph(solution.inliers.cameras, solution.rig.relative_poses)
-        return data_sigmas(blocks, known, solution.T_camera_lidar, solution.inliers.pairs)
+        errors = self.solution.marginals.errors
+        if errors is None:
+            return prior_shares(self.solution, self.solution.marginals.robust_hessians)
+        return shares_of_marginal(self.solution, errors.fit.covariance)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:
@@ -342,62 +190,17 @@ class Evidence:
             solutions.append(optimum.T_camera_lidar)
         return {name: (solutions[0][name], solutions[1][name]) for name in inliers.blocks}
 
-    @cached_property
-    def data_only(self) -> DataOnly | None:
-        """The solution of the correspondences alone; None where there is nothing else."""
-        solution = self.solution
-        if not solution.inliers.uses_correspondences or not solution.inliers.pose_graph.size():
-            return None
-        if (found := self._data_only_by_errors) is not None:
-            return found
-        free = solution.inliers.data_only()
-        start = {name: solution.T_camera_lidar[name] for name in free.cameras}
-        T_camera_lidar = free.minimize(start, solution.scales).T_camera_lidar
-        if solution.config.preset == "auto":
-            return DataOnly(T_camera_lidar, None)
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in free.blocks.items()}
-        curvature = curvature_at(free, T_camera_lidar, hessians_of_blocks(blocks, T_camera_lidar))
-        scatter = cluster_robust_covariance(free, T_camera_lidar, solution.scales, curvature)
-        if scatter is None:
-            return DataOnly(T_camera_lidar, None)
-        shared = self._shared(free, curvature) + error_between(T_camera_lidar, free.pairs)
-        return DataOnly(T_camera_lidar, scatter + shared)
-
-    @property
-    def _data_only_by_errors(self) -> DataOnly | None:
-        """The same by the error model, None where there is none."""
-        solution, errors = self.solution, self.errors
-        if errors is not None and errors.without_priors is None and not solution.rig.relative_poses:
-            fit = errors.drop_pose_graph()  # near its minimum already
-            if fit is not None and len(errors.model.blocks) == len(self.cameras):
-                return DataOnly(fit.T_camera_lidar, fit.covariance)
-        alone = None if errors is None else errors.without_priors
-        if alone is None:
-            metadata, T = solution.correspondences.metadata, solution.T_camera_lidar
-            alone = fit_without_priors(solution.inliers, T, solution.scales, metadata)
-        return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
-
-    @cached_property
-    def conflicts(self) -> tuple[Conflict, ...]:
-        """The factors of relative poses between cameras that both have correspondences."""
-        if self.data_only is None:
-            return ()
-        T_camera_lidar, covariance = self.data_only.T_camera_lidar, self.data_only.covariance
-        cameras = tuple(self.solution.inliers.blocks)
-        return tuple(
-            relative_pose_conflict(pair, cameras, T_camera_lidar, covariance)
-            for pair in self.solution.rig.relative_poses
-            if pair.a in cameras and pair.b in cameras
-        )
-
     def pull_of(self, camera: str) -> tuple[float, float] | None:
         """How far priors and relative poses pull a camera from its own solution: deg, cm.
 
         None if nothing pulls, or by less than ``pull_sigmas`` of the camera's own solution.
         """
-        if self.data_only is None or camera not in self.solution.inliers.blocks:
+        if self.solution.marginals.data_only is None or camera not in self.solution.inliers.blocks:
             return None
-        own, covariance = self.data_only.T_camera_lidar[camera], self.data_only.covariance
+        own, covariance = (
+            self.solution.marginals.data_only.T_camera_lidar[camera],
+            self.solution.marginals.data_only.covariance,
+        )
         joint = self.solution.T_camera_lidar[camera]
         if covariance is not None:
             first = 6 * tuple(self.solution.inliers.blocks).index(camera)
@@ -413,7 +216,8 @@ class Evidence:
         Of the matches alone: where the images are flat, the error bar says so, and no check fails.
         """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
-        sigmas, held = self.data_sigmas, camera in solution.held
+        sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
+        held = camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
@@ -422,7 +226,7 @@ class Evidence:
             covariance=None if held else self._block(self.covariance_of_matches, camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
-            conflicts=tuple(c for c in self.conflicts if camera in (c.pair.a, c.pair.b)),
+            conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.curvature import pose_hessian
+from calibgraph.solver.curvature import invert_or_none, pose_hessian
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.spread_kernel import quantile
 
@@ -24,7 +24,6 @@ _THIRDS = ("left", "middle", "right")
 _EMPTY, _SPARSE = 0.002, 0.05  # share of the matches in a third of the image
 _NEAR_M, _FAR_M = 6.0, 20.0
 _SHALLOW = 2.0  # ratio of far to near
-_FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
 
 def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[str, ...]:
@@ -42,22 +41,11 @@ def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[
     how, covariance = "weakest direction, by the scatter of the frames", scatter
     if covariance is None:
         how = "weakest direction, by the matches as if each were independent"
-        covariance = _covariance_if_independent(block, solution, camera)
+        independent = solution.fitted.projections[camera].sums(solution.fitted.pose(camera))
+        covariance = invert_or_none(independent.hessian)
     direction = [] if covariance is None else [f"{how}: {weakest_direction(covariance)}"]
     T = solution.T_camera_lidar[camera]
     return (*direction, *empty_parts(solution.rig.cameras[camera], block, T))
-
-
-def _covariance_if_independent(block: CameraBlock, solution: Solution, camera: str) -> Array | None:
-    """(6, 6) inverse of the Hessian of the matches; None if that is singular."""
-    T_lidar_camera = to_T_lidar_camera(solution.T_camera_lidar[camera])
-    hessian = block.with_scale(solution.scales[camera]).sums(T_lidar_camera).hessian
-    units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
-    if values[0] < _FREE:
-        return None
-    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
-    return inverse
 
 
 def weakest_direction(covariance: Array) -> str:

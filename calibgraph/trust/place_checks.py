@@ -72,7 +72,7 @@ def _count(block: CameraBlock, places: Sequence[Numbers]) -> Array:
 
 def place_checks(evidence: Evidence) -> Checks:
     """Whether any place contradicts the others, where there are enough to tell which."""
-    errors = evidence.errors
+    errors = evidence.solution.marginals.errors
     if errors is None or len(errors.places) < error_components().robust_places:
         return {}
     found = {name: place_agreements(evidence, errors, name) for name in errors.model.blocks}

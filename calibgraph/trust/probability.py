@@ -46,9 +46,9 @@ def judge(
     return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance))
 
 
-def model_of(metadata: Mapping[str, Any]) -> str:
-    """The model for a run, by the metadata of its correspondences."""
-    return STRUCTURE if metadata.get("matcher") == STRUCTURE else TABLES
+def model_of(matcher: str) -> str:
+    """The model for a run, by the name of its matcher."""
+    return STRUCTURE if matcher == STRUCTURE else TABLES
 
 
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:

@@ -10,6 +10,8 @@ from calibgraph import (
     CorrespondenceError,
     concatenate,
 )
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.places import NOWHERE
 from tests.model.tables import table
 
 
@@ -59,3 +61,22 @@ def test_concatenating_keeps_rows_and_fills_information() -> None:
     assert joined.information_px[-1].tolist() == [4, 0, 1]
     assert len(joined.of_camera("rear")) == 4
     assert len(joined.of_camera("nobody")) == 0
+
+
+def test_a_table_holds_its_findings_and_places_and_rows_of_it_the_same() -> None:
+    stated = {"place_variance": 2.0, "places": [[0, 1]], "matcher": "mine"}
+    found = table(metadata=stated)
+    assert found.select(slice(2)).findings is found.findings
+    assert found.of_camera("left").places is found.places
+    assert (found.matcher, table().matcher) == ("mine", "")
+
+
+def test_findings_replace_what_they_state_and_leave_other_keys_of_the_file() -> None:
+    stated = {"place_variance": 2.0, "camera_share": 0.25, "places": [[0, 1]], "seed": 7}
+    found = table(metadata=stated).with_findings(MatcherFindings(place_variance=3.0))
+    assert found.metadata == {**stated, "place_variance": 3.0}
+    assert (found.findings.place_variance, found.findings.camera_share) == (3.0, 0.25)
+    assert found.places.places == ((0, 1),)
+    assert found.with_places(NOWHERE).metadata == {
+        "place_variance": 3.0, "camera_share": 0.25, "seed": 7,
+    }  # fmt: skip

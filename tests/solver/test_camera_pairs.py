@@ -28,7 +28,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
-from calibgraph.solver.curvature import curvature_at, hessians_of_blocks
+from calibgraph.solver.curvature import curvature_at, robust_hessians
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.solution import Solution
@@ -193,9 +193,8 @@ def test_frame_gradients_add_up_and_frames_are_clusters(rig: Rig) -> None:
         assert total == pytest.approx(pair.sums(T).gradient, rel=1e-6, abs=1e-6)
     covariances = []
     for inliers in (solution.inliers, solution.without_pairs().inliers):
-        blocks = {n: b.with_scale(solution.scales[n]) for n, b in inliers.blocks.items()}
-        bent = curvature_at(inliers, T, hessians_of_blocks(blocks, T))
-        covariances.append(cluster_robust_covariance(inliers, T, solution.scales, bent))
+        at = replace(solution.fitted, objective=inliers)
+        covariances.append(cluster_robust_covariance(at, curvature_at(at, robust_hessians(at))))
     a, b = list(rig.cameras)[:2]
     T_b_a = relative_transform(T[b], T[a])
     relative = [relative_covariance(c, 0, 1, T_b_a) for c in covariances]

@@ -136,9 +136,7 @@ def table_of(
 def solve_model(rig: Rig, table: Correspondences, *, pairs: bool) -> ErrorFit:
     matches = simulated_pairs(rig, count=40) if pairs else None
     solution = solve_joint(rig, table, Config(learnt_weights=False), camera_matches=matches)
-    errors = solution.errors or fit_errors(
-        solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata
-    )
+    errors = solution.errors or fit_errors(solution.fitted, table.findings, table.places)
     assert errors is not None
     return errors
 
@@ -182,7 +180,7 @@ def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig, kind
     empty = term.select(np.zeros(len(term.frame), np.bool_))
     more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
     found, expected = (
-        fit_errors(inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+        fit_errors(replace(solution.fitted, objective=inliers), table.findings, table.places)
         for inliers in (more, solution.inliers)
     )
     assert found is not None and expected is not None
@@ -224,7 +222,7 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     solution = solve_joint(pair, table, config)
     assert solution.errors is None
-    errors = fit_errors(solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+    errors = fit_errors(solution.fitted, table.findings, table.places)
     assert errors is not None
     for name, T in errors.T_camera_lidar.items():
         np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
@@ -274,6 +272,6 @@ def test_data_that_determine_far_less_than_exact_ties_have_an_error_bar(pair: Ri
     table = simulate_correspondences(pair, errors=MatcherErrors(outlier_share=0.9), seed=0)
     assert table.metadata["systematic_translation_m"] == 0.0
     solution = solve_joint(pair, table, Config(learnt_weights=False))
-    errors = fit_errors(solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata)
+    errors = fit_errors(solution.fitted, table.findings, table.places)
     assert errors is not None and errors.fit.converged
     assert np.isfinite(errors.fit.covariance).all()

@@ -58,7 +58,7 @@ def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config:
 
 def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
     """The part that is left to the matches is the one that their own equations give."""
-    errors = evidence(pair, table(pair, 3, OF_A_SENSOR)).errors
+    errors = evidence(pair, table(pair, 3, OF_A_SENSOR)).solution.marginals.errors
     assert errors is not None
     parts = variances_by_source(errors)
     matches = np.diag(errors.fit.covariance) - sum(parts.values())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -119,7 +121,7 @@ def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
     moved[table.camera_index == table.cameras.index("right")] += [0.0, 0.12, 0.0]
     widths = []
     for points in (table.points_lidar_m, moved):
-        given = type(table)(**{**vars(table), "points_lidar_m": points, "metadata": metadata})
+        given = replace(table, points_lidar_m=points, metadata=metadata)
         solution = solve_joint(pair, given, camera_matches=simulated_pairs(pair))
         evidence = Evidence(solution, guess=pair)
         covariance = evidence.covariance_of("right")

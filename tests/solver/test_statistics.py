@@ -12,7 +12,6 @@ from calibgraph import Config, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.simulation.place_draws import draw_places
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.evidence import Evidence
 
 pytestmark = pytest.mark.statistics
 
@@ -37,7 +36,7 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         table = simulate_correspondences(pair, frames=frames, matches=100, errors=errors, seed=seed)
         solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time
         found, true = solved.T_camera_lidar, pair.T_camera_lidar
-        joint = Evidence(solved, guess=pair).scatter
+        joint = solved.marginals.scatter
         assert joint is not None
         T_right_left = found["right"] @ np.linalg.inv(found["left"])
         xi_pair = error(T_right_left, true["right"] @ np.linalg.inv(true["left"]))

@@ -37,9 +37,7 @@ def table_of(rig: Rig, places: int, size: float, seed: int) -> Correspondences:
 
 def errors_of(rig: Rig, table: Correspondences) -> ErrorFit:
     solution = solve_joint(rig, table, Config(learnt_weights=False))
-    found = solution.errors or fit_errors(
-        solution.inliers, solution.T_camera_lidar, solution.scales, table.metadata
-    )
+    found = solution.errors or fit_errors(solution.fitted, table.findings, table.places)
     assert found is not None
     return found
 

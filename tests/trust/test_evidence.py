@@ -92,7 +92,7 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     rig = tied(pair, rotation_deg=0.01, translation_m=0.001)
     table = simulated(pair, frames=10).of_camera("left")
     findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
-    table = Correspondences(**{**vars(table), "metadata": findings})
+    table = table.with_metadata(findings)
     evidence = Evidence(solve_joint(rig, table), guess=rig)
     covariance = evidence.joint_covariance
     assert covariance is not None

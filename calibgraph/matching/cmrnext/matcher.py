@@ -126,9 +126,8 @@ class CmrNextMatcher:
         metadata = {
             **self._metadata(schedule[-1].checkpoint, round_index),
             "failed_frames": list_failed_frames(results),
-            **findings.to_metadata(),
         }
-        return replace(concatenate(tables), metadata=metadata)
+        return concatenate(tables).with_metadata(metadata).with_findings(findings)
 
     def release(self) -> None:
         """Nothing is kept of frames."""

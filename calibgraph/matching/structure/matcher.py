@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -146,7 +146,7 @@ class StructureMatcher:
                 progress(what, done, self.rounds * work)
                 table, z_scores[name] = next(matches)
                 tables.append(table)
-        return replace(concatenate(tables), metadata=self._metadata(round_index, z_scores))
+        return concatenate(tables).with_metadata(self._metadata(round_index, z_scores))
 
     def _require_structure(self, cache: FrameCache, frames: Sequence[Frame], rig: Rig) -> None:
         """Raise if no cloud has enough windows."""

@@ -1,0 +1,259 @@
+"""The covariance of a solution, and all that it is made of: the marginal of its graph.
+
+With the preset ``auto`` it is the marginal of the error model. The paper's presets have no error
+model: there it is the sandwich, by the scatter between frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph.latent_poses import latent_pose_graph
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
+from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
+from calibgraph.solver.curvature import Curvature, curvature_at, robust_hessians
+from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
+from calibgraph.solver.error_shares import (
+    predict_variances,
+    sources_of_error,
+    variances_by_source,
+)
+from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.objective import Objective, Transforms
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
+from factors import pose_sigmas
+
+Array = NDArray[np.float64]
+
+_HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class DataOnly:
+    """The solution of the correspondences alone, without priors and relative poses.
+
+    Attributes:
+        T_camera_lidar: per camera that has correspondences, (4, 4).
+        covariance: (6 M, 6 M) in the order of ``T_camera_lidar``, or None.
+    """
+
+    T_camera_lidar: Transforms
+    covariance: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Marginals:
+    """The covariance of a solution and its parts, each computed once, when it is needed.
+
+    Attributes:
+        at: the solution's objective, at its estimate.
+        table: the correspondences, with the matcher's error and the places.
+        fit: the error model that the estimate is of; None where it is that of the objective.
+        camera_matches: what cameras see in common.
+        alone: those of the solution without camera pairs; None where there are none.
+    """
+
+    at: FittedObjective
+    table: Correspondences
+    fit: ErrorFit | None = None
+    camera_matches: CameraMatches | None = None
+    alone: Marginals | None = None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names, in the rig's order."""
+        return self.at.cameras
+
+    @property
+    def findings(self) -> MatcherFindings:
+        """The findings of the matcher."""
+        return self.table.findings
+
+    @cached_property
+    def covariance(self) -> Array | None:
+        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
+        if self.at.objective.config.preset == "auto":
+            return None if self.errors is None else self.errors.fit.covariance
+        if self.scatter is None:
+            return None
+        shared = self.shared_variance_ratio * self._shared(self.at.objective, self.curvature)
+        return (
+            self.scatter + shared + error_between(self.at.T_camera_lidar, self.at.objective.pairs)
+        )
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph whose optimum and marginal they are; with the paper's presets, Eq. 5."""
+        if self.errors is not None:
+            return latent_pose_graph(self.errors.model)
+        return self.at.objective.graph(self.at.scales)
+
+    @cached_property
+    def errors(self) -> ErrorFit | None:
+        """The error model of the solution; None with the paper's presets.
+
+        The shared error is at least as large as pairs of images show, even if the loss rejects
+        them.
+        """
+        found = self.fit or fit_errors(self.at, self.findings, self.table.places)
+        return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
+
+    @cached_property
+    def curvature(self) -> Curvature:
+        """The curvature of all terms at the solution."""
+        return curvature_at(self.at, self.robust_hessians)
+
+    @cached_property
+    def scatter(self) -> Array | None:
+        """(6 N, 6 N) covariance by the scatter between frames, or None."""
+        return cluster_robust_covariance(self.at, self.curvature)
+
+    @cached_property
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
+        return robust_hessians(self.at)
+
+    @cached_property
+    def data_sigmas(self) -> Array | None:
+        """(N, 6) standard deviations if every correspondence were independent."""
+        if not self.at.objective.uses_correspondences:
+            return None
+        return data_sigmas(self.at)
+
+    def error_sources(self, joint: Array) -> dict[str, ErrorSources]:
+        """Per camera with an error bar, the shares of its sources.
+
+        Args:
+            joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
+        """
+        if self.covariance is None:
+            return {}
+        total, held = np.diag(self.covariance), self.at.held
+        if self.errors is None:
+            parts = self._sandwich_parts
+            fixed = parts[COMMON] + parts[PAIRS]
+            forecast = {times: fixed + (total - fixed) / times for times in TIMES}
+        else:
+            parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
+        flat = np.diag(joint) - total
+        forecast = {times: variance + flat / times for times, variance in forecast.items()}
+        total, parts = total + flat, {**parts, FLAT: flat}
+        return {
+            name: sources_of_error(total, parts, forecast, number)
+            for number, name in enumerate(self.cameras)
+            if name not in held
+        }
+
+    @property
+    def _sandwich_parts(self) -> dict[str, Array]:
+        """Per source but the matches, (6 N,) variances, with the paper's presets."""
+        inliers, T_camera_lidar = self.at.objective, self.at.T_camera_lidar
+        no_places = replace(self.findings, place_variance=0.0)
+        every, common = (
+            self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
+            for findings in (self.findings, no_places)
+        )
+        between = np.diag(error_between(T_camera_lidar, inliers.pairs))
+        return {COMMON: common, PLACES: every - common, PAIRS: between}
+
+    @cached_property
+    def shared_variance_ratio(self) -> float:
+        """Variance of the shared error relative to its prior, from co-visible features."""
+        own = self.alone
+        if own is None or own.covariance is None:
+            return 1.0
+        return shared_variance_ratio(own.at.T_camera_lidar, own.covariance, own.pair_fits)
+
+    @cached_property
+    def pair_fits(self) -> list[PairFit]:
+        """The relative poses of pairs by images, the first camera held near the solution."""
+        return self.fit_pairs_near(self.covariance)
+
+    def fit_pairs_near(self, joint: Array | None) -> list[PairFit]:
+        """The same, the first camera held by some (6 N, 6 N) covariance."""
+        if self.camera_matches is None:
+            return []
+        known = self.known_or_prior(joint)
+        held = [known[pose_rows(number), pose_rows(number)] for number in range(len(self.cameras))]
+        rig = self.at.objective.rig.moved_to(self.at.T_camera_lidar)
+        return fit_pairs(rig, self.camera_matches, self.at.objective.config, np.array(held))
+
+    def known_or_prior(self, joint: Array | None) -> Array:
+        """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
+        if joint is not None:
+            return joint
+        held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
+        return np.diag(np.tile(held, len(self.cameras)))
+
+    def _shared(
+        self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
+    ) -> Array:
+        """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
+        places = self.table.places
+        repeats = {
+            name: places.frames_per_place(block.frame_numbers)
+            for name, block in inliers.blocks.items()
+        }
+        T_camera_lidar = {name: self.at.T_camera_lidar[name] for name in inliers.cameras}
+        scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
+        return curvature.sandwich(scatter)
+
+    @cached_property
+    def data_only(self) -> DataOnly | None:
+        """The solution of the correspondences alone; None where there is nothing else."""
+        if not self.at.objective.uses_correspondences or not self.at.objective.pose_graph.size():
+            return None
+        if (found := self._data_only_by_errors) is not None:
+            return found
+        free = self.at.data_only()
+        if self.at.objective.config.preset == "auto":
+            return DataOnly(free.T_camera_lidar, None)
+        curvature = curvature_at(free, robust_hessians(free))
+        scatter = cluster_robust_covariance(free, curvature)
+        if scatter is None:
+            return DataOnly(free.T_camera_lidar, None)
+        shared = self._shared(free.objective, curvature)
+        between = error_between(free.T_camera_lidar, free.objective.pairs)
+        return DataOnly(free.T_camera_lidar, scatter + (shared + between))
+
+    @property
+    def _data_only_by_errors(self) -> DataOnly | None:
+        """The same by the error model, None where there is none."""
+        errors = self.errors
+        if (
+            errors is not None
+            and errors.without_priors is None
+            and not self.at.objective.rig.relative_poses
+        ):
+            fit = errors.drop_pose_graph()  # near its minimum already
+            if fit is not None and len(errors.model.blocks) == len(self.cameras):
+                return DataOnly(fit.T_camera_lidar, fit.covariance)
+        alone = None if errors is None else errors.without_priors
+        if alone is None:
+            places = self.table.places
+            alone = fit_without_priors(self.at, self.findings, places)
+        return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
+
+    @cached_property
+    def conflicts(self) -> tuple[Conflict, ...]:
+        """The factors of relative poses between cameras that both have correspondences."""
+        free, cameras = self.data_only, tuple(self.at.objective.blocks)
+        if free is None:
+            return ()
+        return tuple(
+            relative_pose_conflict(pair, cameras, free.T_camera_lidar, free.covariance)
+            for pair in self.at.objective.rig.relative_poses
+            if pair.a in cameras and pair.b in cameras
+        )
