@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import os
+import pickle
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.report import plots
+from calibgraph.trust import image_checks
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -120,8 +123,23 @@ def run_command(*arguments: object, folder: Path) -> CommandRun:
 
 @pytest.fixture(scope="session")
 def calibrated_sample(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
-    """``calibrate`` of the sample, with matches that are the truth and a pixel of noise."""
-    folder = tmp_path_factory.mktemp("sample")
+    """``calibrate`` of the sample, with matches that are the truth and a pixel of noise.
+
+    Processes of pytest-xdist share it: the first makes it, and the others wait.
+    """
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "calibrated_sample"
+    folder.mkdir(exist_ok=True)
+    done = folder / "run.pickle"
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            done.write_bytes(pickle.dumps(calibrate_sample(folder)))
+    run: CommandRun = pickle.loads(done.read_bytes())
+    return run
+
+
+def calibrate_sample(folder: Path) -> CommandRun:
     truth = load_rig(SAMPLE / "reference.yaml")
     table = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=0.1))
     table.save(folder / "table.parquet")
@@ -138,6 +156,12 @@ def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
     Session fixtures such as ``calibrated_sample`` are made before, with drawn ones.
     """
     monkeypatch.setattr(plots, "to_data_uri", lambda figure: "data:image/png;base64,")
+
+
+@pytest.fixture
+def no_time_offsets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not track images in the images before and after, for tests of all else."""
+    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
 
 
 def make_pair() -> Rig:

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 _INTERRUPTED = 130
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
+_PLAIN: Any = {"add_completion": False, "pretty_exceptions_enable": False}
 
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
@@ -48,8 +49,7 @@ app = typer.Typer(
     "A RIG, ESTIMATE or REFERENCE is a rig file, a result (file or folder), a dataset folder "
     "(its rig.yaml), a KITTI odometry sequence folder, a nuScenes folder or a ROS bag.",
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    **_PLAIN,
 )
 
 
@@ -168,10 +168,31 @@ def _require_utf8(arguments: list[str]) -> None:
             raise CalibrationError(message) from error
 
 
+class _Commands(typer.core.TyperGroup):
+    """Commands by name and help; the options of one are read when it is called, 30 ms for all."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, _command_of(name), rest
+
+
 @cache
 def _parser() -> typer.core.TyperGroup:
-    """All commands with their options, read from the signatures once per process."""
-    return typer.main.get_group(app)
+    """The command line without the options of its commands, once per process."""
+    frame = typer.Typer(cls=_Commands, help=app.info.help, no_args_is_help=True, **_PLAIN)
+    frame.callback()(_options)
+    group = typer.main.get_group(frame)
+    for info in app.registered_commands:
+        group.commands[str(info.name)] = typer.core.TyperCommand(info.name, help=info.help)
+    return group
+
+
+@cache
+def _command_of(name: str | None) -> Any:
+    """A command with its options, read from its signature once per process."""
+    alone = typer.Typer(**_PLAIN)
+    alone.registered_commands = [info for info in app.registered_commands if info.name == name]
+    return typer.main.get_command(alone)
 
 
 def _run_app() -> int:

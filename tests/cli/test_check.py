@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from calibgraph import Audit, CameraAudit, load_rig
-from calibgraph.audit import audit_summary
+from calibgraph.audit import audit_summary, check
 from calibgraph.cli import remote
 from tests.audit.deployed import motion, with_camera_moved
 from tests.cli.conftest import error_line
@@ -16,6 +17,21 @@ from tests.conftest import SAMPLE, Call, CommandRun
 
 REFERENCE = SAMPLE / "reference.yaml"
 AXES = ("deviation_deg", "deviation_cm", "sigma_deg", "sigma_cm", "detectable_deg", "detectable_cm")
+
+
+MEASURED: list[Audit] = []
+
+
+@pytest.fixture
+def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure a right rig in one frame once, for the tests of all that is told about it."""
+
+    def measure(*arguments: Any, **options: Any) -> Audit:
+        if not MEASURED:
+            MEASURED.append(check(*arguments, **options))
+        return MEASURED[0]
+
+    monkeypatch.setattr("calibgraph.audit.check", measure)
 
 
 def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> None:
@@ -53,6 +69,7 @@ def test_a_turned_camera_exits_with_1_and_is_named_with_its_axis(
     assert list(tmp_path.iterdir()) == [deployed]
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_one_frame_exits_with_3(call: Call) -> None:
     code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0")
     assert code == 3
@@ -60,6 +77,7 @@ def test_one_frame_exits_with_3(call: Call) -> None:
     assert "record" in err
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_the_recording_that_made_the_result_is_named_in_the_first_line(
     call: Call, calibrated_sample: CommandRun
 ) -> None:
@@ -72,6 +90,7 @@ def test_the_recording_that_made_the_result_is_named_in_the_first_line(
     assert json.loads(out)["same_recording"] is True
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:
     page, other, recording = tmp_path / "check.html", tmp_path / "report.html", tmp_path / "sample"
     given = ("check", REFERENCE, SAMPLE, "--frames", "0", "--page")

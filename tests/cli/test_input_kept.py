@@ -20,15 +20,31 @@ from calibgraph.cli.fleet import fleet
 from calibgraph.cli.guess import init
 from calibgraph.cli.simulate import simulate
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call, CommandRun
+from tests.conftest import SAMPLE, Call, CommandRun, run_command
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of ``simulate``: correspondences.parquet, rig.yaml, reference.yaml."""
+    folder = tmp_path_factory.mktemp("written") / "sim"
+    run = run_command("simulate", "kitti", "--frames", 8, "--out", folder, folder=folder)
+    assert run.code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def solved(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result of ``solve`` for that folder, to be copied."""
+    out = tmp_path_factory.mktemp("solved") / "out"
+    table = written / "correspondences.parquet"
+    assert run_command("solve", written, table, "--out", out, folder=out).code == 0
+    return out
 
 
 @pytest.fixture
-def simulated(tmp_path: Path, call: Call) -> Path:
-    """A folder of ``simulate``: correspondences.parquet, rig.yaml, reference.yaml."""
-    code, _, _ = call("simulate", "kitti", "--frames", 8, "--out", tmp_path / "sim")
-    assert code == 0
-    return tmp_path / "sim"
+def simulated(tmp_path: Path, written: Path) -> Path:
+    """A copy of that folder."""
+    return Path(shutil.copytree(written, tmp_path / "sim"))
 
 
 @pytest.mark.parametrize("command", ["track", "solve"])
@@ -50,9 +66,11 @@ def test_a_table_that_is_only_beside_the_result_is_not_lost(simulated: Path, cal
     assert table.read_bytes() == other.read_bytes()
 
 
-def test_the_result_that_is_the_guess_is_not_replaced(simulated: Path, call: Call) -> None:
-    table, out = simulated / "correspondences.parquet", simulated / "out"
-    assert call("solve", simulated, table, "--out", out)[0] == 0
+def test_the_result_that_is_the_guess_is_not_replaced(
+    simulated: Path, solved: Path, call: Call
+) -> None:
+    table = simulated / "correspondences.parquet"
+    out = shutil.copytree(solved, simulated / "out")
     assert "is read by this command" in error_line(*call("solve", out, table, "--out", out))
     assert call("solve", simulated, table, "--out", out)[0] == 0  # an earlier result is replaced
 
@@ -124,12 +142,12 @@ def test_what_a_command_wrote_is_replaced_by_it_but_not_while_it_is_read(
         assert "is read by this command" in error_line(*call(*arguments))
 
 
-def test_a_followed_folder_is_not_the_place_of_a_result(simulated: Path, call: Call) -> None:
-    source, out = simulated / "source", simulated / "out"
-    table = simulated / "correspondences.parquet"
-    assert call("solve", simulated, table, "--out", out)[0] == 0
+def test_a_followed_folder_is_not_the_place_of_a_result(
+    simulated: Path, solved: Path, call: Call
+) -> None:
+    source = simulated / "source"
     source.mkdir()
-    shutil.copy(out / "correspondences.parquet", source)  # a result's, which may be replaced
+    shutil.copy(solved / "correspondences.parquet", source)  # a result's, which may be replaced
     before = files_in(source)
     message = error_line(*call("track", simulated, source, "--out", source))
     assert "is read by this command" in message
@@ -150,9 +168,9 @@ def test_every_command_with_an_output_declares_it() -> None:
         assert (written is not outputs.nothing) == (has_output and not refuses_itself)
 
 
-def test_the_table_of_another_result_is_refused(simulated: Path, call: Call) -> None:
-    table, out = simulated / "correspondences.parquet", simulated / "out"
-    assert call("solve", simulated, table, "--out", out)[0] == 0
+def test_the_table_of_another_result_is_refused(simulated: Path, solved: Path, call: Call) -> None:
+    table = simulated / "correspondences.parquet"
+    out = shutil.copytree(solved, simulated / "out")
     assert len(load_calibration(out).correspondences)
     shutil.copy(table, out / "correspondences.parquet")
     assert "is not the table of" in error_line(*call("report", out))

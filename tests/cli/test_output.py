@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -23,12 +24,15 @@ def run_in_shell(line: str) -> tuple[int, str]:
     "line",
     [
         f"{EVALUATE} --json | true",
-        f"{EVALUATE} 2>&1 | true",
+        f"init {SAMPLE} --out rig.yaml 2>&1 | true",
         "calibrate --help | true",
         "--version | true",
     ],
 )
-def test_a_reader_that_has_gone_is_no_error(line: str) -> None:
+def test_a_reader_that_has_gone_is_no_error(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     assert run_in_shell(line) == (0, "")
 
 

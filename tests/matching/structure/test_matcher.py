@@ -213,7 +213,7 @@ class TestRounds:
         T = dict(truth.T_camera_lidar)
         T["left"] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ T["left"]
         data = replace(calibgraph.load_dataset(SAMPLE).select("0"), rig=truth.moved_to(T))
-        result = calibgraph.calibrate(data, matcher=without_search(LEVELS))
+        result = calibgraph.calibrate(data, matcher=without_search(LEVELS[-2:]))
         (check,) = (c for c in result.camera_verdicts["left"].checks if c.name == "correspondences")
         assert check.status == "FAIL" and "the cloud lies where T_camera_lidar looks" in check.text
 
