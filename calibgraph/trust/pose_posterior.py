@@ -8,13 +8,13 @@ evidence of both, the likelihood's mean over their priors, tells how likely each
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, expit
+from scipy.special import expit
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
@@ -27,11 +27,9 @@ from calibgraph.trust.tempering import sample_posterior
 from factors import pose_sigmas
 
 Array = NDArray[np.float64]
-LogLikelihood = Callable[[Array], Array]
 
 MAX_FRAMES = 10  # evenly spread over the dataset: bounds the time
 SAMPLES = 1000
-CONFIDENCE = 0.95  # that a pose which the images exclude is wrong
 NEAR = 3.0  # the prior of a result that is right, in standard deviations of its matches
 ODDS_ELSEWHERE = 8.0
 """Prior odds of rounds that ended elsewhere: with it one result in ten is misled. Fitted on a KITTI
@@ -49,13 +47,11 @@ class PosePosterior:
         near: (n, 6) samples, if the rounds ended where the matches say.
         elsewhere: (n, 6) samples, if they ended elsewhere.
         share: the probability that they ended elsewhere.
-        log_likelihood: (n,) of twists (n, 6), by the images.
     """
 
     near: Array
     elsewhere: Array
     share: float
-    log_likelihood: LogLikelihood
 
     @property
     def moments(self) -> Array:
@@ -63,14 +59,9 @@ class PosePosterior:
         near, elsewhere = (_moments(samples) for samples in (self.near, self.elsewhere))
         return (1.0 - self.share) * near + self.share * elsewhere
 
-    def excludes(self, twist: Array) -> bool:
-        """Whether the images exclude a pose: the likelihood ratio to the best one near the result.
-
-        Args:
-            twist: (6,) from the result.
-        """
-        best, own = self.log_likelihood(self.near).max(), self.log_likelihood(twist[None])[0]
-        return bool(2.0 * (best - own) > chdtri(len(twist), 1.0 - CONFIDENCE))
+    def widest(self, covariance: Array) -> Array:
+        """(6, 6): a covariance that is at least that of the poses elsewhere."""
+        return widen(covariance, {0: _moments(self.elsewhere)})
 
     def probability_beyond(self, by_matches: Array, tolerance: tuple[float, float]) -> float:
         """The probability of an error beyond the tolerance.
@@ -116,7 +107,7 @@ def measure_posteriors(
             near, of_near = sample_posterior(likelihood, NEAR**2 * covariance, **options)
             far, of_far = sample_posterior(likelihood, np.diag(REACH**2), **options)
             share = float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near))
-            return PosePosterior(near, far, share, likelihood)
+            return PosePosterior(near, far, share)
 
         found = pool.map(measure, covariances, covariances.values())
         return dict(zip(covariances, found, strict=True))
