@@ -19,7 +19,7 @@ from scipy.special import expit
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.frame_scores import FrameScorer
 from calibgraph.trust.probability import probability_beyond
@@ -101,7 +101,7 @@ def measure_posteriors(
         scorer = FrameScorer(dataset, spread_out(dataset.frames, MAX_FRAMES), cores)
 
         def measure(name: str, covariance: Array) -> PosePosterior:
-            camera: Camera = rig.cameras[name]
+            camera = rig.cameras[name]
             scores = scorer.score_together(scorer.load_images(name, camera), camera, FAR)
             likelihood, options = log_likelihood(scores), {"samples": SAMPLES, "seed": seed}
             near, of_near = sample_posterior(likelihood, NEAR**2 * covariance, **options)
