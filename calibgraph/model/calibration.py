@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -94,6 +94,8 @@ class Calibration:
             findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None where not determined.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
+        pair_covariance: per pair "A->B" of cameras with error bars, (6, 6) of xi in T_B_A = exp(xi)
+            estimate, in B's axes: of the cameras as they are mounted, whatever the cloud.
         camera_verdicts: per camera.
         residuals: per camera that had correspondences.
         counts: per camera, correspondences left after each filter and the gate, and frames.
@@ -130,6 +132,7 @@ class Calibration:
     timings_s: dict[str, float]
     terms: Terms
     config: Config
+    pair_covariance: dict[str, Array] = field(default_factory=dict)
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
     weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
     prior_share: dict[str, float] = field(default_factory=dict)
@@ -221,23 +224,6 @@ class Calibration:
         """The standard deviations of :meth:`sigmas` where they hold, else None."""
         return self.sigmas(name) if self.error_bar_holds(name) else None
 
-    @property
-    def pair_covariance(self) -> dict[str, Array]:
-        """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
-
-        Without the pairs of cameras that have no error bar.
-        """
-        if self.joint_covariance is None:
-            return {}
-        T = self.T_camera_lidar
-        return {
-            f"{a}->{b}": relative_covariance(
-                self.joint_covariance, i, j, relative_transform(T[b], T[a])
-            )
-            for (i, a), (j, b) in combinations(enumerate(T), 2)
-            if self.covariance[a] is not None and self.covariance[b] is not None
-        }
-
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
         """The same result with the SHA-256 of its input files, by path."""
         return replace(self, inputs=dict(inputs))
@@ -322,6 +308,26 @@ class Calibration:
             "versions": self.versions,
             "date": self.date,
         }
+
+
+def pair_covariances(
+    joint: Array | None, T_camera_lidar: Mapping[str, Array], without: Container[str] = ()
+) -> dict[str, Array]:
+    """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate; of none without a covariance.
+
+    Args:
+        joint: (6 N, 6 N) of all cameras.
+        T_camera_lidar: (4, 4) of each.
+        without: cameras that have no error bar.
+    """
+    if joint is None:
+        return {}
+    T = T_camera_lidar
+    return {
+        f"{a}->{b}": relative_covariance(joint, i, j, relative_transform(T[b], T[a]))
+        for (i, a), (j, b) in combinations(enumerate(T), 2)
+        if a not in without and b not in without
+    }
 
 
 def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:

@@ -141,12 +141,13 @@ def fit_without_priors(
 def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
     """Without the relative poses that the correspondences of both their cameras contradict."""
     cameras, limit = free.model.cameras, error_components().contradiction_sigmas
-    measured, T = inliers.rig.relative_poses, free.T_camera_lidar
+    measured, mount = inliers.rig.relative_poses, free.fit.of_mount
+    T = mount.T_camera_lidar
     kept = tuple(
         pair
         for pair in measured
         if not {pair.a, pair.b} <= set(cameras)
-        or relative_pose_conflict(pair, cameras, T, free.fit.covariance).largest <= limit
+        or relative_pose_conflict(pair, cameras, T, mount.covariance).largest <= limit
     )
     if len(kept) == len(measured):
         return inliers
