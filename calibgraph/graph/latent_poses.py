@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import gtsam
 import numpy as np
@@ -40,10 +39,10 @@ from calibgraph.graph.variables import (
     matched_key,
     paired_key,
 )
+from calibgraph.model.config import Reported
 from factors import biased_between_factor, placed_pair_factor, robust_noise
 
 Array = NDArray[np.float64]
-Reported = Literal["alignment", "mount"]
 
 EXACT = 1e-5
 """Standard deviation [rad and m] of what holds exactly; less is lost in rounding."""

@@ -233,7 +233,8 @@ def error_model(
         ),
     )
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
-    return LatentPoseModel(cameras, blocks, pairs_by_place(pairs, places), graph, components)
+    features = pairs_by_place(pairs, places)
+    return LatentPoseModel(cameras, blocks, features, graph, components, inliers.config.of)
 
 
 def held_graph(
