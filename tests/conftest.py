@@ -24,7 +24,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.report import plots
-from calibgraph.trust import image_checks
+from calibgraph.trust import assess, image_checks
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -163,9 +163,10 @@ def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def no_time_offsets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not track images in the images before and after, for tests of all else."""
-    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
+def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not check results and guesses against the images, for tests of all else."""
+    monkeypatch.setattr(image_checks, "check_images", lambda *_, **__: {})
+    monkeypatch.setattr(assess, "likely_intended_guess", lambda *_: None)
 
 
 def make_pair() -> Rig:
