@@ -24,7 +24,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.report import plots
-from calibgraph.trust import assess, image_checks
+from calibgraph.trust import assess, image_checks, inputs
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -166,7 +166,8 @@ def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not check results and guesses against the images, for tests of all else."""
     monkeypatch.setattr(image_checks, "check_images", lambda *_, **__: {})
-    monkeypatch.setattr(assess, "likely_intended_guess", lambda *_: None)
+    for module in (assess, inputs):
+        monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
 
 
 def make_pair() -> Rig:
