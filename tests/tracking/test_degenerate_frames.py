@@ -64,7 +64,6 @@ def test_nonsense_neither_throws_nor_harms(kind: str, share: float, frames: int)
     """Every kind of nonsense. Warnings are errors here: no division by zero either."""
     tied = pair_of()
     rig = {
-
         "one": Rig(cameras={"only": make_camera()}),
         "fisheye": pair_of(model="fisheye", distortion=KANNALA),
         "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
