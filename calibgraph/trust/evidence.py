@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,9 +22,15 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors, widen
+from calibgraph.trust.pose_posterior import (
+    PosePosterior,
+    group_tied,
+    no_posteriors,
+    widen,
+)
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.thresholds import limit
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -34,6 +40,11 @@ Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
 
 
+MeasurePosteriors = Callable[
+    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
+]
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """A solution, the first guess, and the values that checks compute from them.
@@ -41,13 +52,14 @@ class Evidence:
     Attributes:
         solution: of the joint solve.
         guess: the rig as it was first guessed.
-        measure_posteriors: of the (6, 6) covariances by the matches, per camera, the posteriors by
-            the images' evidence; none where nothing but correspondences is known.
+        measure_posteriors: of the (6, 6) covariances by the matches, per camera, and of groups of
+            cameras that move together, the posteriors by the images' evidence; none where nothing
+            but correspondences is known.
     """
 
     solution: Solution
     guess: Rig
-    measure_posteriors: Callable[[Mapping[str, Array]], Mapping[str, PosePosterior]] = no_posteriors
+    measure_posteriors: MeasurePosteriors = no_posteriors
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -102,7 +114,19 @@ class Evidence:
             return {}
         free = [name for name in self.cameras if name not in self.solution.held]
         known = self.covariance_of_matches
-        return self.measure_posteriors({name: self._rows_of(known, name) for name in free})
+        own = {name: self._rows_of(known, name) for name in free}
+        return self.measure_posteriors(own, group_tied(free, self._relative_poses))
+
+    @property
+    def _relative_poses(self) -> Iterator[tuple[str, str, Array]]:
+        """Those that are known without the cloud, with (6, 6) covariances."""
+        for fit in self.solution.marginals.pair_fits:
+            yield fit.a, fit.b, fit.covariance
+        for pose in self.solution.inliers.rig.relative_poses:
+            sigmas = pose_sigmas(
+                rotation_rad=pose.rotation_sigma_rad, translation_m=pose.translation_sigma_m
+            )
+            yield pose.a, pose.b, np.diag(sigmas**2)
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
