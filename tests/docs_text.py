@@ -9,7 +9,6 @@ from typer.main import get_command
 
 from calibgraph.cli.app import app
 
-
 program = cache(partial(get_command, app))  # it takes a tenth of a second to build
 
 
