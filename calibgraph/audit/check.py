@@ -1,7 +1,5 @@
 """``check``: is the calibration that is deployed still right?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 from calibgraph.audit.judgement import (

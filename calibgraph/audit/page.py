@@ -1,7 +1,5 @@
 """The page of an audit: is the deployed calibration still right?"""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 

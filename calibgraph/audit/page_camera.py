@@ -1,7 +1,5 @@
 """One camera's section of an audit page: numbers, charts, points on an image."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

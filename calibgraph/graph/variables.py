@@ -9,8 +9,6 @@ o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
 """
 
-from __future__ import annotations
-
 import gtsam
 
 CLOUD = int(gtsam.symbol("o", 0))

@@ -1,7 +1,5 @@
 """A rig file to fill in, from the images and clouds of a dataset folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

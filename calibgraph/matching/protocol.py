@@ -12,8 +12,6 @@ order:
 6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -4,8 +4,6 @@ The file states how each number was got. Its format has a version of its own; a 
 into the metadata of its tables, so that a table remains what it was when the file changes.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from functools import cache

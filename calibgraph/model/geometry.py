@@ -5,8 +5,6 @@
 Tangent vectors are (rotation [rad], translation [m]).
 """
 
-from __future__ import annotations
-
 import math
 
 import gtsam

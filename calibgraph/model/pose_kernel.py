@@ -4,8 +4,6 @@ As GTSAM's, of twists (rotation [rad], translation [m]). Below a small angle, se
 are as exact as the closed formulas.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The files of a result in its folder, and the marks by which they are recognised."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from calibgraph.outputs import Output, is_marked

@@ -1,7 +1,5 @@
 """Rigs to simulate with, by name; their extrinsics are the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -8,8 +8,6 @@ matches; a frame far from where frames are densest has weight zero. Confidences 
 deviations by the residuals of the matches that have them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

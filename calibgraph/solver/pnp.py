@@ -1,7 +1,5 @@
 """One camera's extrinsic from its correspondences in single frames: robust PnP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """The paper's correspondence preprocessing, with a count at every filter."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The geodesic median of rotations, compiled: its iteration takes up to a hundred small steps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

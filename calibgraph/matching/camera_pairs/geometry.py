@@ -1,7 +1,5 @@
 """Robust epipolar geometry on rays, and whether it could have come about by chance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The relative pose of two cameras from features whose depth the LiDAR gives: robust PnP."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """The learned matcher CMRNext: its network, weights, matcher and training. Needs torch."""
 
-from __future__ import annotations
-
 try:
     import torch as _torch  # noqa: F401
 except ModuleNotFoundError as error:

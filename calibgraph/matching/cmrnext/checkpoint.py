@@ -1,7 +1,5 @@
 """Checkpoints: a network's weights, checked against their config, with the file's hash."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

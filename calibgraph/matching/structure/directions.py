@@ -1,7 +1,5 @@
 """Directions: view angles of a camera, and one direction per cell of the sphere."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

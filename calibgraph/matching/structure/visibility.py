@@ -1,7 +1,5 @@
 """Which points of a cloud a camera sees."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
