@@ -213,18 +213,15 @@ def crosses(v: Array) -> Array:
 def _exponentials(twists: Array) -> Array:
     """(f, 4, 4) transforms of (f, 6) twists, as GTSAM's ``Pose3.Expmap``."""
     squared = np.einsum("fi,fi->f", twists[:, :3], twists[:, :3])
-    small = squared < _SMALL_ANGLE**2
-    safe = np.where(small, 1.0, np.sqrt(squared))
-    by_sine = np.where(small, 1 - squared / 6 * (1 - squared / 20), np.sin(safe) / safe)
-    by_cosine = np.where(
-        small, 0.5 - squared / 24 * (1 - squared / 30), 2 * (np.sin(safe / 2) / safe) ** 2
-    )
-    rest = np.where(small, 1 / 6 - squared / 120, (1 - by_sine) / safe**2)
+    half_turns, small = np.sqrt(squared) / np.pi, squared < _SMALL_ANGLE**2
+    by_sine, by_cosine = np.sinc(half_turns), 0.5 * np.sinc(half_turns / 2) ** 2
+    rest = np.where(small, 1 / 6 - squared / 120, (1 - by_sine) / np.where(small, 1, squared))
     # R = I + by_sine [w]x + by_cosine [w]x^2,  t = (I + by_cosine [w]x + rest [w]x^2) v.
     cross = crosses(twists[:, :3])
-    T = np.tile(np.eye(4), (len(twists), 1, 1))
+    T = np.zeros((len(twists), 4, 4))
     T[:, :3, :3] = _series(cross, by_sine, by_cosine)
     T[:, :3, 3:] = _series(cross, by_cosine, rest) @ twists[:, 3:, None]
+    T[:, 3, 3] = 1.0
     return T
 
 
