@@ -26,7 +26,6 @@ from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
-from calibgraph.cli.former_options import with_present_options
 from calibgraph.cli.guess import guess, init
 from calibgraph.cli.inspect import evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
@@ -131,7 +130,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
-    sys.argv[1:] = _repeat_weights_option(with_present_options(sys.argv[1:]))
+    sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
     try:
         _require_utf8(sys.argv[1:])
         code = _run_app()

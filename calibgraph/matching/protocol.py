@@ -119,9 +119,7 @@ class MatcherWithDefaults:
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
-        self.image_checks_can_fail = bool(
-            getattr(matcher, "image_checks_can_fail", getattr(matcher, "fails_on_images", False))
-        )  # fails_on_images: its former name
+        self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
         self._locate = getattr(matcher, "locate", None)
         self._release = getattr(matcher, "release", None)
 

@@ -207,11 +207,6 @@ class Verdict:
         return {check.kind or check.name for check in self.checks if check.status != "PASS"}
 
     @property
-    def doubt(self) -> ErrorProbability | None:
-        """Former name of ``error_probability``, for one release."""
-        return self.error_probability
-
-    @property
     def cannot_tell(self) -> bool:
         """Whether it is WARN because the data determine too little, not because something is odd.
 
