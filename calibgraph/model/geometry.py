@@ -210,6 +210,12 @@ def crosses(v: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
+def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
+    """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
+    sigmas = np.sqrt(np.diag(covariance))
+    return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
+
+
 def _exponentials(twists: Array) -> Array:
     """(f, 4, 4) transforms of (f, 6) twists, as GTSAM's ``Pose3.Expmap``."""
     squared = np.einsum("fi,fi->f", twists[:, :3], twists[:, :3])

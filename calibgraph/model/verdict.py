@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
 
@@ -232,6 +232,15 @@ class Verdict:
             return tuple(texts)
         found = self.error_probability
         return (f"{found.sentence} of {found.percent}{found.advice}", *texts)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As plain values, without the checks."""
+        return {
+            "status": self.status,
+            "cannot_tell": self.cannot_tell,
+            "error_probability": self.error_probability and vars(self.error_probability),
+            "reasons": list(self.reasons),
+        }
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.calibration import Calibration, degrees_and_centimetres
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Verdict
