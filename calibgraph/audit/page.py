@@ -14,8 +14,6 @@ from calibgraph.model.summary import Reason
 from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import depth_scale
 
-MARK = b'<meta name="generator" content="calibgraph check">'
-
 _CALIBRATE = (
     "Do not use it any longer. Fasten what is loose, and calibrate again: calibgraph calibrate. If "
     "nothing can have moved, check the intrinsics and the distances of the LiDAR: where these have "

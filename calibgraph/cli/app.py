@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
 
@@ -33,9 +33,6 @@ from calibgraph.cli.pick import pick
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
-
-if TYPE_CHECKING:
-    from calibgraph.outputs import Output
 
 _INTERRUPTED = 130
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
@@ -84,12 +81,12 @@ def _options(
     remote.require_known(context.invoked_subcommand)
 
 
-COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
+COMMANDS: dict[Callable[..., None], outputs.Outputs] = {
     calibrate: outputs.result,
     check: outputs.page_of_audit,
     drift: outputs.plot_of_drift,
     match: outputs.table,
-    solve: outputs.result,
+    solve: outputs.solved,
     report: outputs.page,
     view: outputs.recordings,
     evaluate: outputs.nothing,

@@ -11,10 +11,11 @@ a_cp  camera c as its matches at place p show it
 
 import gtsam
 
+from calibgraph.outputs import DOT_MARK
+
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
-DOT_MARK = "// calibgraph graph"
 """First line of a graph in Graphviz's language."""
 
 MOST_CAMERAS = 1000
