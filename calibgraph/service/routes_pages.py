@@ -16,7 +16,6 @@ from calibgraph.service import pages
 from calibgraph.service.access import COOKIE, Caller, Gate
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.pages import form_of
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job
@@ -61,8 +60,8 @@ def jobs_page(
     """The jobs, with their verdicts."""
     records = state.jobs.newest(caller, _PER_PAGE, before)
     following = records[-1].number if len(records) == _PER_PAGE else None
-    views = [pages.job_view(record, state.runner.step(record.id)) for record in records]
-    return _page(request, "jobs.html.j2", jobs=views, next=following, is_later=before is not None)
+    is_later = before is not None
+    return _page(request, "jobs.html.j2", jobs=records, next=following, is_later=is_later)
 
 
 @router.get("/jobs/{id}")
@@ -75,7 +74,8 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
     return _page(
         request,
         "job.html.j2",
-        job=pages.job_view(record, state.runner.step(id)),
+        job=record,
+        step=state.runner.step(id),
         actions=pages.actions_of(summary),
         reasons=pages.reasons_of(summary),
         columns=columns,
@@ -113,7 +113,7 @@ def _links(record: JobRecord) -> list[dict[str, str]]:
 @router.get("/new/{kind}")
 def new_page(kind: JobKind, request: Request, caller: Visitor) -> Response:
     """The form of a new job."""
-    return _page(request, "new.html.j2", problem=None, **form_of(kind))
+    return _page(request, "new.html.j2", problem=None, kind=kind)
 
 
 @router.post("/new/{kind}")
@@ -125,18 +125,14 @@ async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor
         record, _ = await submit(state, request, caller, kind, key=None)
     except (Problem, CalibrationError) as error:
         status = error.status if isinstance(error, Problem) else 422
-        return _page(request, "new.html.j2", status, problem=str(error), **form_of(kind))
+        return _page(request, "new.html.j2", status, problem=str(error), kind=kind)
     return RedirectResponse(f"/jobs/{record.id}", 303)
 
 
 @router.get("/trackers")
 def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
     """The trackers."""
-    trackers = [
-        {"id": record.id, "name": record.name, "created": pages.minute_of(record.created_s)}
-        for record in state.tracker_table.list(caller)
-    ]
-    return _page(request, "trackers.html.j2", trackers=trackers)
+    return _page(request, "trackers.html.j2", trackers=state.tracker_table.list(caller))
 
 
 @router.get("/trackers/{id}")
@@ -148,7 +144,7 @@ async def tracker_page(id: str, request: Request, state: State, caller: Visitor)
     return _page(
         request,
         "tracker.html.j2",
-        tracker={"name": record.name, "created": pages.minute_of(record.created_s)},
+        tracker=record,
         verdict_word=found["verdict"],
         frame=found["frame"],
         reasons=found["reasons"],
