@@ -70,7 +70,6 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
     record = find_job(state, caller, id)
     folder = state.folder.of_job(id) / RESULT
     summary = pages.read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
-    columns, cameras = pages.camera_table(summary.get("cameras", {}))
     return _page(
         request,
         "job.html.j2",
@@ -78,8 +77,7 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
         step=state.runner.step(id),
         actions=pages.actions_of(summary),
         reasons=pages.reasons_of(summary),
-        columns=columns,
-        cameras=cameras,
+        cameras=summary.get("cameras", {}),
         page=_explanation(state, record),
         links=_links(record),
     )
@@ -140,7 +138,6 @@ async def tracker_page(id: str, request: Request, state: State, caller: Visitor)
     """A tracker: its verdict, its alarms, its extrinsics over time."""
     record = await run_in_threadpool(find_tracker, state, caller, id)
     found: dict[str, Any] = await ask_tracker(state, caller, id, "state")
-    columns, cameras = pages.camera_table(found["cameras"])
     return _page(
         request,
         "tracker.html.j2",
@@ -150,8 +147,7 @@ async def tracker_page(id: str, request: Request, state: State, caller: Visitor)
         reasons=found["reasons"],
         events=[event["text"] for event in reversed(found["events"])],
         plot=f"/v1/trackers/{id}/drift.png",
-        columns=columns,
-        cameras=cameras,
+        cameras=found["cameras"],
     )
 
 
