@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from calibgraph.model.pose_kernel import exponential_times, logarithms
 
-_SMALL_ANGLE = 1e-2  # rad: below, series of two terms are as exact as the closed formulas
+Array = NDArray[np.float64]
 
 
 def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -138,7 +138,8 @@ def twists_between(T_a_b: Array, references: Array) -> Array:
         T_a_b: (f, 4, 4).
         references: (4, 4) or (f, 4, 4).
     """
-    return _logarithms(relative_transform(T_a_b, references))
+    twists: Array = logarithms(relative_transform(T_a_b, references))
+    return twists
 
 
 def pose_rows(camera: int) -> slice:
@@ -190,7 +191,8 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
         T_camera_lidar: (f, 4, 4).
         steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
     """
-    moved: Array = _exponentials(-steps) @ T_camera_lidar
+    moved = np.empty((len(steps), 4, 4))
+    exponential_times(-steps, np.ascontiguousarray(T_camera_lidar), moved)
     return moved
 
 
@@ -201,7 +203,8 @@ def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
         T_camera_lidar: (4, 4) of the one, inverted.
         T_lidar_camera: (f, 4, 4) of the others.
     """
-    return _logarithms(T_camera_lidar @ T_lidar_camera)
+    tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
+    return tangents
 
 
 def crosses(v: Array) -> Array:
@@ -214,37 +217,3 @@ def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
     """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
     sigmas = np.sqrt(np.diag(covariance))
     return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
-
-
-def _exponentials(twists: Array) -> Array:
-    """(f, 4, 4) transforms of (f, 6) twists, as GTSAM's ``Pose3.Expmap``."""
-    squared = np.einsum("fi,fi->f", twists[:, :3], twists[:, :3])
-    half_turns, small = np.sqrt(squared) / np.pi, squared < _SMALL_ANGLE**2
-    by_sine, by_cosine = np.sinc(half_turns), 0.5 * np.sinc(half_turns / 2) ** 2
-    rest = np.where(small, 1 / 6 - squared / 120, (1 - by_sine) / np.where(small, 1, squared))
-    # R = I + by_sine [w]x + by_cosine [w]x^2,  t = (I + by_cosine [w]x + rest [w]x^2) v.
-    cross = crosses(twists[:, :3])
-    T = np.zeros((len(twists), 4, 4))
-    T[:, :3, :3] = _series(cross, by_sine, by_cosine)
-    T[:, :3, 3:] = _series(cross, by_cosine, rest) @ twists[:, 3:, None]
-    T[:, 3, 3] = 1.0
-    return T
-
-
-def _logarithms(T: Array) -> Array:
-    """(f, 6) twists of (f, 4, 4) transforms, as GTSAM's ``Pose3.Logmap``."""
-    if not len(T):
-        return np.empty((0, 6))
-    turn = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-    squared = np.einsum("fi,fi->f", turn, turn)
-    small = squared < _SMALL_ANGLE**2
-    safe = np.where(small, 1.0, np.sqrt(squared))
-    inward = np.where(small, 1 / 12 + squared / 720, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
-    # The inverse of the left Jacobian: I - [w]x / 2 + inward [w]x^2.
-    back = _series(crosses(turn), np.full(len(turn), -0.5), inward)
-    return np.hstack([turn, (back @ T[:, :3, 3:])[:, :, 0]])
-
-
-def _series(cross: Array, first: Array, second: Array) -> Array:
-    """(f, 3, 3) I + first [w]x + second [w]x^2."""
-    return np.eye(3) + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
