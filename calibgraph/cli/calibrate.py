@@ -115,11 +115,10 @@ def solve(
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256, write_text
-    from calibgraph.graph.variables import DOT_MARK, to_dot
+    from calibgraph.graph.variables import to_dot
     from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
-    from calibgraph.outputs import Output, require_writable
     from calibgraph.pipeline import solve
     from calibgraph.report.result_files import write_result
 
@@ -139,9 +138,6 @@ def solve(
             raise ValueError("a server returns no graph; leave --print-graph and --graph out")
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
-        if graph is not None:
-            drawing = Output(graph, "solve --graph", (DOT_MARK.encode(),), (".dot",))
-            require_writable([drawing], [rig, correspondences])
     if remote.SERVER.get() is not None:
         remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
         _print_and_exit(*remote_result, as_json=as_json)

@@ -10,14 +10,13 @@ o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
 """
 
-from __future__ import annotations
-
 import gtsam
+
+from calibgraph.outputs import DOT_MARK
 
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
-DOT_MARK = "// calibgraph graph"
 """First line of a graph in Graphviz's language."""
 
 MOST_CAMERAS = 1000

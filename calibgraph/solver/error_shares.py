@@ -6,8 +6,6 @@ different factors are independent, and their variances C J^T M S M J C add up to
 the rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

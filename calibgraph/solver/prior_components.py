@@ -1,7 +1,5 @@
 """The variance components of the error model before the data refine them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
