@@ -160,7 +160,7 @@ def to_calibration(state: State) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     sums = posterior(state)
     halves = SplitHalf.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, ClosedPlaces.of(state))
+    assessment = assess(state, sums, halves, ClosedPlaces.of(state, iterate=False))
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     return Calibration(

@@ -116,7 +116,8 @@ class _PlaceInEpoch:
     Attributes:
         hessian: (6, 6).
         gradient: (6,) at the reference.
-        reweighted: (6, 6) Hessian by the matches' weights in the loss.
+        reweighted: (6, 6) Hessian by the matches' weights in the loss, at the pose of the place.
+        pull: (6,) gradient at the reference, by the same from there.
         scores: (f, 6) gradients at the estimate, of all the epoch's frames; zero of others.
         frames, matches: how many.
     """
@@ -124,6 +125,7 @@ class _PlaceInEpoch:
     hessian: Array
     gradient: Array
     reweighted: Array
+    pull: Array
     scores: Array
     frames: int
     matches: int
@@ -132,13 +134,15 @@ class _PlaceInEpoch:
     def empty(frames: int) -> _PlaceInEpoch:
         """Of none of so many frames."""
         zero = np.zeros((6, 6))
-        return _PlaceInEpoch(zero, np.zeros(6), zero, np.zeros((frames, 6)), 0, 0)
+        none = np.zeros(6)
+        return _PlaceInEpoch(zero, none, zero, none, np.zeros((frames, 6)), 0, 0)
 
     def __add__(self, other: _PlaceInEpoch) -> _PlaceInEpoch:
         return _PlaceInEpoch(
             self.hessian + other.hessian,
             self.gradient + other.gradient,
             self.reweighted + other.reweighted,
+            self.pull + other.pull,
             self.scores + other.scores,
             self.frames + other.frames,
             self.matches + other.matches,
@@ -165,8 +169,13 @@ def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _Plac
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     to_reference = step_between(T_lidar_camera, state.references[camera])
     gradient = by_frame.gradient.sum(axis=0) + hessian @ to_reference
-    reweighted = by_frame.hessian.sum(axis=0)
-    return _PlaceInEpoch(hessian, gradient, reweighted, scores, len(own), len(inliers.frame))
+    of_place = None if state.optimum is None else state.optimum.pose_at(place, camera)
+    here = block.sums(of_place or T_lidar_camera)
+    to_reference = step_between(of_place or T_lidar_camera, state.references[camera])
+    pull = here.gradient + here.hessian @ to_reference
+    return _PlaceInEpoch(
+        hessian, gradient, here.hessian, pull, scores, len(own), len(inliers.frame)
+    )
 
 
 def _summarize_oldest(state: State) -> State:
@@ -213,7 +222,7 @@ def _to_part(name: str, cameras: Sequence[_PlaceInEpoch]) -> PlacePart:
     return PlacePart(
         name,
         hessian=np.array([one.hessian for one in cameras]),
-        gradient=np.array([one.gradient for one in cameras]),
+        gradient=np.array([one.pull for one in cameras]),
         reweighted=np.array([one.reweighted for one in cameras]),
         score=np.array([one.scores.sum(axis=0) for one in cameras]),
         scatter=np.array([one.scores.T @ one.scores for one in cameras]),

@@ -40,6 +40,10 @@ class LiveFrame:
     reweighted: Array
     place: str = ""
 
+    def inliers_of(self, camera: int) -> CameraBlock:
+        """A camera's matches within the gate."""
+        return self.raw[camera].select(self.inliers[camera])
+
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
         sums = {name: getattr(self, name).copy() for name in _SUMS}

@@ -34,7 +34,7 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import ClosedPlaces, with_sizes
+from calibgraph.tracking.joint_estimate import ClosedPlaces, with_optimum
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
@@ -238,7 +238,7 @@ class IncrementalCalibrator:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
         self._window = Window(self._state)
         self._copy_estimates()
-        self._closed_places = ClosedPlaces.of(self._state)
+        self._closed_places = ClosedPlaces.of(self._state, iterate=False)
         self._closed = closed_posterior(self._state)
         self._closed_halves = SplitHalf.of_closed_epochs(self._state)
 
@@ -317,5 +317,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(with_sizes(self._state))
+        self._resume(with_optimum(self._state))
         return events
