@@ -61,18 +61,29 @@ def _with_bends(state: State, epoch: Epoch) -> Epoch:
 
 
 def _regate(state: State, epoch: Epoch) -> Epoch:
-    """The epoch with its frames gated at its newest estimate."""
-    T_camera_lidar = [*map(to_T_camera_lidar, epoch.T_lidar_camera)]
-    gates_px = [camera_state.scale.gate_px for camera_state in state.cameras]
-    frames = []
-    for frame in epoch.frames:
-        inliers = dict(frame.inliers)
-        for camera, raw in frame.raw.items():
-            rows = raw.within_gate(T_camera_lidar[camera], gates_px[camera])
-            if np.count_nonzero(rows) >= MIN_MATCHES:
-                inliers[camera] = rows
-        frames.append(replace(frame, inliers=inliers))
-    return replace(epoch, frames=tuple(frames))
+    """The epoch with its frames gated, and their gradients taken, at its newest estimate."""
+    frames = {frame.number: frame for frame in epoch.frames}
+    for camera, one in enumerate(state.cameras):
+        own = [frame for frame in epoch.frames if camera in frame.raw]
+        if not own:
+            continue
+        T_lidar_camera, reference = epoch.T_lidar_camera[camera], state.references[camera]
+        raw = merge([frame.raw[camera] for frame in own])
+        rows = raw.within_gate(to_T_camera_lidar(T_lidar_camera), one.scale.gate_px)
+        masks = [
+            found if np.count_nonzero(found) >= MIN_MATCHES else frame.inliers[camera]
+            for frame, found in zip(own, np.split(rows, raw.frame_edges[1:-1]), strict=True)
+        ]
+        inliers = raw.select(np.concatenate(masks))
+        sums = inliers.with_scale(one.scale).frame_sums(T_lidar_camera, inliers.frame_edges)
+        step = step_between(T_lidar_camera, reference)
+        for row, frame in enumerate(own):
+            gradient = sums.gradient[row] + frame.hessian[camera] @ step
+            number = frame.number
+            frames[number] = frames[number].with_sums(
+                camera, masks[row], gradient=gradient, reweighted=sums.hessian[row]
+            )
+    return replace(epoch, frames=tuple(frames.values()))
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:

@@ -61,15 +61,14 @@ class LiveFrame:
         sums: Mapping[str, Array],
     ) -> LiveFrame:
         """The frame with a camera's matches, and their sums by the names of the attributes."""
-        own = {name: getattr(self, name).copy() for name in _SUMS}
+        return replace(self, raw={**self.raw, camera: raw}).with_sums(camera, inliers, **sums)
+
+    def with_sums(self, camera: int, inliers: NDArray[np.bool_], **sums: Array) -> LiveFrame:
+        """The frame with other inliers of a camera, and sums by the names of the attributes."""
+        own = {name: getattr(self, name).copy() for name in sums}
         for name, values in own.items():
             values[camera] = sums[name]
-        return replace(
-            self,
-            raw={**self.raw, camera: raw},
-            inliers={**self.inliers, camera: inliers},
-            **own,
-        )
+        return replace(self, inliers={**self.inliers, camera: inliers}, **own)
 
     @staticmethod
     def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
