@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, merge
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.live_frames import Epoch
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import PlacePart
 from calibgraph.tracking.posterior import true_hessian
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 
 Array = NDArray[np.float64]
+
+_GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
 
 
 def close_epoch(
@@ -47,7 +50,8 @@ def close_epoch(
         for camera_state in state.cameras
     )
     state = replace(state, cameras=cameras)
-    epochs = tuple(_regate(state, epoch) for epoch in state.epochs)
+    state = _regate(state)
+    epochs = state.epochs
     epochs = (*epochs[:-1], _with_bends(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
     return report_drift(replace(state, epochs=epochs))
 
@@ -60,30 +64,67 @@ def _with_bends(state: State, epoch: Epoch) -> Epoch:
     return epoch
 
 
-def _regate(state: State, epoch: Epoch) -> Epoch:
-    """The epoch with its frames gated, and their gradients taken, at its newest estimate."""
-    frames = {frame.number: frame for frame in epoch.frames}
+def _regate(state: State) -> State:
+    """The state with its live frames gated, and their gradients taken, at the newest estimates."""
+    frames = {frame.number: frame for frame in state.live_frames}
     for camera, one in enumerate(state.cameras):
-        own = [frame for frame in epoch.frames if camera in frame.raw]
-        if not own:
-            continue
-        T_lidar_camera, reference = epoch.T_lidar_camera[camera], state.references[camera]
-        raw = merge([frame.raw[camera] for frame in own])
-        rows = raw.within_gate(to_T_camera_lidar(T_lidar_camera), one.scale.gate_px)
-        masks = [
-            found if np.count_nonzero(found) >= MIN_MATCHES else frame.inliers[camera]
-            for frame, found in zip(own, np.split(rows, raw.frame_edges[1:-1]), strict=True)
-        ]
-        inliers = raw.select(np.concatenate(masks))
-        sums = inliers.with_scale(one.scale).frame_sums(T_lidar_camera, inliers.frame_edges)
-        step = step_between(T_lidar_camera, reference)
-        for row, frame in enumerate(own):
-            gradient = sums.gradient[row] + frame.hessian[camera] @ step
-            number = frame.number
-            frames[number] = frames[number].with_sums(
-                camera, masks[row], gradient=gradient, reweighted=sums.hessian[row]
-            )
-    return replace(epoch, frames=tuple(frames.values()))
+        together = [state.live_frames]
+        if one.summary.walk:
+            together = [epoch.frames for epoch in state.epochs]
+        poses = [epoch.T_lidar_camera[camera] for epoch in state.epochs[-len(together) :]]
+        for group, pose in zip(together, poses, strict=True):
+            own = [frames[frame.number] for frame in group if camera in frame.raw]
+            if own:
+                frames |= {f.number: f for f in _regated(state, camera, own, pose)}
+    epochs = tuple(
+        replace(epoch, frames=tuple(frames[frame.number] for frame in epoch.frames))
+        for epoch in state.epochs
+    )
+    return replace(state, epochs=epochs)
+
+
+def _regated(
+    state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
+) -> Iterator[LiveFrame]:
+    """Frames with a camera's gate drawn anew, and its gradients taken at an estimate."""
+    scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
+    gate = _gate_pose(state, camera, raw, T_lidar_camera)
+    rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
+    masks = [
+        found if np.count_nonzero(found) >= MIN_MATCHES else frame.inliers[camera]
+        for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True)
+    ]
+    inliers = raw.select(np.concatenate(masks))
+    sums = inliers.with_scale(scale).frame_sums(T_lidar_camera, inliers.frame_edges)
+    step = step_between(T_lidar_camera, state.references[camera])
+    for row, frame in enumerate(frames):
+        gradient = sums.gradient[row] + frame.hessian[camera] @ step
+        yield frame.with_sums(
+            camera, masks[row], gradient=gradient, reweighted=sums.hessian[row]
+        )
+
+
+def _gate_pose(
+    state: State, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
+) -> gtsam.Pose3:
+    """Where the gate is drawn: the minimum of all matches of live frames, as in a batch.
+
+    That of the matches within a gate is drawn to where the gate was before. A camera that drifts
+    keeps its estimate, which later epochs have a part in.
+    """
+    one = state.cameras[camera]
+    if one.summary.walk:
+        return T_lidar_camera
+    block, (hessian, gradient, *_) = raw.with_scale(one.scale), one.summary.selected
+    for _ in range(_GATE_STEPS):
+        sums, step = block.sums(T_lidar_camera), step_between(
+            state.references[camera], T_lidar_camera
+        )
+        pull = sums.gradient + gradient + hessian @ step
+        T_lidar_camera = T_lidar_camera.retract(
+            -np.linalg.solve(sums.hessian + hessian + WEAK, pull)
+        )
+    return T_lidar_camera
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
