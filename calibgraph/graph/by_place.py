@@ -115,7 +115,7 @@ class QuadraticByPlace:
                 self.T_lidar_camera[row],
                 gtsam.noiseModel.Gaussian.Information(self.information[row]),
             )
-            for row in np.flatnonzero(self.places == place)
+            for row in map(int, np.flatnonzero(self.places == place))
         ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -66,42 +66,42 @@ def _with_bends(state: State, epoch: Epoch) -> Epoch:
 
 def _regate(state: State) -> State:
     """The state with its live frames gated, and their gradients taken, at the newest estimates."""
-    frames = {frame.number: frame for frame in state.live_frames}
+    frames = {
+        f.number: replace(
+            f, inliers=dict(f.inliers), gradient=f.gradient.copy(), reweighted=f.reweighted.copy()
+        )
+        for f in state.live_frames
+    }
     for camera, one in enumerate(state.cameras):
-        together = [state.live_frames]
-        if one.summary.walk:
-            together = [epoch.frames for epoch in state.epochs]
-        poses = [epoch.T_lidar_camera[camera] for epoch in state.epochs[-len(together) :]]
-        for group, pose in zip(together, poses, strict=True):
-            own = [frames[frame.number] for frame in group if camera in frame.raw]
+        epochs = state.epochs if one.summary.walk else state.epochs[-1:]
+        for epoch in epochs:
+            group = epoch.frames if one.summary.walk else state.live_frames
+            own = [frames[f.number] for f in group if camera in f.raw]
             if own:
-                frames |= {f.number: f for f in _regated(state, camera, own, pose)}
+                _regate_camera(state, camera, own, epoch.T_lidar_camera[camera])
     epochs = tuple(
-        replace(epoch, frames=tuple(frames[frame.number] for frame in epoch.frames))
+        replace(epoch, frames=tuple(frames[f.number] for f in epoch.frames))
         for epoch in state.epochs
     )
     return replace(state, epochs=epochs)
 
 
-def _regated(
+def _regate_camera(
     state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
-) -> Iterator[LiveFrame]:
-    """Frames with a camera's gate drawn anew, and its gradients taken at an estimate."""
+) -> None:
+    """Fill in a camera's inliers of frames, and their gradients at an estimate."""
     scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
     gate = _gate_pose(state, camera, raw, T_lidar_camera)
     rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
-    masks = [
-        found if np.count_nonzero(found) >= MIN_MATCHES else frame.inliers[camera]
-        for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True)
-    ]
-    inliers = raw.select(np.concatenate(masks))
+    for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True):
+        if np.count_nonzero(found) >= MIN_MATCHES:
+            frame.inliers[camera] = found
+    inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
     sums = inliers.with_scale(scale).frame_sums(T_lidar_camera, inliers.frame_edges)
     step = step_between(T_lidar_camera, state.references[camera])
-    for row, frame in enumerate(frames):
-        gradient = sums.gradient[row] + frame.hessian[camera] @ step
-        yield frame.with_sums(
-            camera, masks[row], gradient=gradient, reweighted=sums.hessian[row]
-        )
+    for frame, gradient, reweighted in zip(frames, sums.gradient, sums.hessian, strict=True):
+        frame.gradient[camera] = gradient + frame.hessian[camera] @ step
+        frame.reweighted[camera] = reweighted
 
 
 def _gate_pose(
@@ -117,8 +117,9 @@ def _gate_pose(
         return T_lidar_camera
     block, (hessian, gradient, *_) = raw.with_scale(one.scale), one.summary.selected
     for _ in range(_GATE_STEPS):
-        sums, step = block.sums(T_lidar_camera), step_between(
-            state.references[camera], T_lidar_camera
+        sums, step = (
+            block.sums(T_lidar_camera),
+            step_between(state.references[camera], T_lidar_camera),
         )
         pull = sums.gradient + gradient + hessian @ step
         T_lidar_camera = T_lidar_camera.retract(

@@ -6,7 +6,7 @@ found. What is reported is the minimum under the error model, as of a batch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -39,10 +39,9 @@ from calibgraph.solver.variance_components import estimate_variance_ratios
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
-    Data,
     FrameSpread,
+    PlaceData,
     marginals_of_places,
-    place_data,
     place_model,
     summary_factor,
 )
@@ -63,33 +62,35 @@ _ROUNDS = 3  # of fits and estimates of the variance ratios, as in a batch
 
 @dataclass(frozen=True, eq=False)
 class ClosedPlaces:
-    """The frames of closed epochs, and the graph of their places near its optimum.
+    """The frames of closed epochs, and the graph of their places.
 
     Attributes:
         sums: per place; of a camera that drifts, none.
         linear: the same, linearized at the pose that each place has there.
         findings: with which the rest was made.
         seen: by the frames of each camera.
-        rows: of ``sums``, the places of the graph.
-        fit: near its optimum.
+        data: of the places of the graph.
+        fit: its optimum.
+        optimum: the poses there.
     """
 
     sums: PlaceSums
     linear: PlaceSums
     findings: MatcherFindings
     seen: FrameSpread
-    rows: Rows
+    data: PlaceData
     fit: LatentPoseFit
+    optimum: Optimum
     _summaries: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
     _pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
 
     @staticmethod
-    def of(state: State, *, iterate: bool = True) -> ClosedPlaces:
+    def of(state: State, *, at_optimum: bool = False) -> ClosedPlaces:
         """Of a state's closed epochs.
 
         Args:
             state: of the tracker.
-            iterate: or stay at the optimum that the state has.
+            at_optimum: stay at the one that the state has, if it has one.
         """
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
         sums, earlier = state.places.add(parts_of(frames, steps_of(state))), state.places
@@ -97,25 +98,21 @@ class ClosedPlaces:
             if one.summary.walk:
                 sums, earlier = sums.without(camera), earlier.without(camera)
         seen = FrameSpread.of(state, sums)
-        rows = tuple(int(row) for row in np.flatnonzero(sums.frames.any(axis=1)))
-        names = [sums.names[row] for row in rows]
-        data = place_data(state, earlier, frames, names)
-        model = place_model(state, sums, seen, rows, data)
-        pose_graphs = {NO_ROWS: pose_priors(state)}
-        fit, _ = _fit(
-            state, sums, model, _start(state, model, names), pose_graphs=pose_graphs,
-            iterate=iterate or state.optimum is None,
-        )  # fmt: skip
-        linear = linearized(state, sums, rows, data, fit)
+        rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
+        data = PlaceData.of(state, earlier, frames, rows)
+        model = place_model(state, sums, seen, data)
+        pose_graphs, found = {NO_ROWS: pose_priors(state)}, state.optimum
+        values = _start(state, model, data.names)
+        if found is None or not at_optimum:
+            fit, contradicting, _ = _fit(state, sums, model, values, pose_graphs=pose_graphs)
+            found = Optimum.of(model, fit.linear.values, data.names, contradicting)
+        else:
+            model = _with_pose_graph(state, model, found.contradicting, pose_graphs)
+            fit = LatentPoseFit(Linearization.at(model, values), 0, True)
+        linear = linearized(state, sums, data, fit)
         return ClosedPlaces(
-            sums, linear, state.findings, seen, rows, fit, _pose_graphs=pose_graphs
+            sums, linear, state.findings, seen, data, fit, found, _pose_graphs=pose_graphs
         )
-
-    @property
-    def optimum(self) -> Optimum:
-        """The poses there."""
-        names = [self.sums.names[row] for row in self.rows]
-        return Optimum.of(self.fit.linear.model, self.fit.linear.values, names)
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
@@ -147,43 +144,38 @@ class ClosedPlaces:
         if kept not in self._summaries:
             chosen = [self.marginals[i] for i in kept]
             self._summaries[kept] = summary_factor(chosen, self.fit.linear.values)
-        names = [every.names[row] for row in rows]
-        model = place_model(
-            state, every, seen, rows, place_data(state, earlier, frames, names)
-        )
+        data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
+        model = place_model(state, every, seen, data)
         model = replace(model, pose_graph=self._summaries[kept])
-        values = _start(state, model, names)
-        return _fit(state, every, model, values, pose_graphs=self._pose_graphs)
+        values = _start(state, model, data.names)
+        fit, _, conflicts = _fit(state, every, model, values, pose_graphs=self._pose_graphs)
+        return fit, conflicts
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
         """Which of the closed places a summary stands for, and the rows of the other places."""
-        names, present = self.sums.names, np.flatnonzero(every.frames.any(axis=1))
-        kept = tuple(i for i, row in enumerate(self.rows) if names[row] not in touched)
+        names, present = self.data.names, np.flatnonzero(every.frames.any(axis=1))
+        kept = tuple(i for i, name in enumerate(names) if name not in touched)
         rows = [int(row) for row in present if every.names[row] in touched]
         if not rows and kept:  # the scan distortion needs a place
-            kept, rows = kept[:-1], [every.names.index(names[self.rows[kept[-1]]])]
+            kept, rows = kept[:-1], [every.names.index(names[kept[-1]])]
         return kept, rows
 
 
-def linearized(
-    state: State, sums: PlaceSums, rows: Rows, data: Mapping[int, Data], fit: LatentPoseFit
-) -> PlaceSums:
+def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFit) -> PlaceSums:
     """The sums with the quadratics that all matches have at the pose of their place in a fit."""
     gradient, reweighted = np.zeros_like(sums.gradient), np.zeros_like(sums.reweighted)
-    values, count = fit.linear.values, len(rows)
+    values, count = fit.linear.values, len(data.rows)
     clouds = poses_of(values, map(cloud_at_key, range(count)))
-    for camera, matches in data.items():
-        T_camera_cloud = np.tile(np.eye(4), (count, 1, 1))
-        keys = [matched_at_key(int(place), camera) for place in matches.places]
-        T_camera_cloud[matches.places] = (
-            invert_each(poses_of(values, keys)) @ clouds[matches.places]
-        )
+    for camera, matches in data.cameras.items():
+        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
+        keys = [matched_at_key(int(place), camera) for place in places]
+        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
         here = matches.sums(T_camera_cloud)
-        for place in matches.places:
+        for place, row in zip(places, data.rows[places], strict=True):
             pose = to_T_lidar_camera(T_camera_cloud[place])
             step = step_between(pose, state.references[camera])
-            reweighted[rows[place], camera] = here.hessian[place]
-            gradient[rows[place], camera] = here.gradient[place] + here.hessian[place] @ step
+            reweighted[row, camera] = here.hessian[place]
+            gradient[row, camera] = here.gradient[place] + here.hessian[place] @ step
     return replace(sums, gradient=gradient, reweighted=reweighted)
 
 
@@ -227,18 +219,18 @@ def joint_estimate(state: State, sums: Posterior, closed: ClosedPlaces) -> Joint
     return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
 
 
-def with_optimum(state: State) -> State:
+def close_places(state: State) -> tuple[State, ClosedPlaces]:
     """The state with the optimum of its closed epochs, and the variance ratios that these show."""
+    closed = ClosedPlaces.of(state)
     for _ in range(_ROUNDS):
-        closed = ClosedPlaces.of(state)
-        state = replace(state, optimum=closed.optimum)
         if closed.sums.is_of_one_place and not state.rig.relative_poses:
             break
         found = estimate_variance_ratios(closed.fit, state.sizes)
         if found.is_near(state.sizes):
             break
-        state = replace(state, sizes=found)
-    return state
+        state = replace(state, sizes=found, optimum=closed.optimum)
+        closed = ClosedPlaces.of(state)
+    return replace(state, optimum=closed.optimum), closed
 
 
 def _fit(
@@ -248,8 +240,7 @@ def _fit(
     values: gtsam.Values,
     *,
     pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-    iterate: bool = True,
-) -> tuple[LatentPoseFit, Conflicts]:
+) -> tuple[LatentPoseFit, Rows, Conflicts]:
     """The optimum with priors and relative poses, and the conflicts of these with the data.
 
     Args:
@@ -258,21 +249,27 @@ def _fit(
         model: with the places, and the summary of others.
         values: near the optimum.
         pose_graphs: the priors without contradicting relative poses, by their places in the rig.
-        iterate: or stay at the values.
     """
     conflicts = _conflicts(state, sums, model, values)
     limit = error_components().contradiction_sigmas
     dropped = tuple(place for place, one in conflicts.items() if one.largest > limit)
+    fit = fit_latent_poses(_with_pose_graph(state, model, dropped, pose_graphs), values)
+    if fit is None:
+        raise RuntimeError("a direction of a camera is not determined")
+    return fit, dropped, conflicts
+
+
+def _with_pose_graph(
+    state: State,
+    model: LatentPoseModel,
+    dropped: Rows,
+    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
+) -> LatentPoseModel:
+    """The model with the priors, without contradicting relative poses."""
     if dropped not in pose_graphs:
         without = tuple(sorted({*state.dropped_pairs, *dropped}))
         pose_graphs[dropped] = pose_priors(replace(state, dropped_pairs=without))
-    model = replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
-    if not iterate:
-        return LatentPoseFit(Linearization.at(model, values), 0, True), conflicts
-    fit = fit_latent_poses(model, values)
-    if fit is None:
-        raise RuntimeError("a direction of a camera is not determined")
-    return fit, conflicts
+    return replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
 
 
 def _conflicts(

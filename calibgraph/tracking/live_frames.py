@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.bends import BendSums
 
@@ -40,10 +40,6 @@ class LiveFrame:
     reweighted: Array
     place: str = ""
 
-    def inliers_of(self, camera: int) -> CameraBlock:
-        """A camera's matches within the gate."""
-        return self.raw[camera].select(self.inliers[camera])
-
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
         sums = {name: getattr(self, name).copy() for name in _SUMS}
@@ -61,14 +57,15 @@ class LiveFrame:
         sums: Mapping[str, Array],
     ) -> LiveFrame:
         """The frame with a camera's matches, and their sums by the names of the attributes."""
-        return replace(self, raw={**self.raw, camera: raw}).with_sums(camera, inliers, **sums)
-
-    def with_sums(self, camera: int, inliers: NDArray[np.bool_], **sums: Array) -> LiveFrame:
-        """The frame with other inliers of a camera, and sums by the names of the attributes."""
-        own = {name: getattr(self, name).copy() for name in sums}
+        own = {name: getattr(self, name).copy() for name in _SUMS}
         for name, values in own.items():
             values[camera] = sums[name]
-        return replace(self, inliers={**self.inliers, camera: inliers}, **own)
+        return replace(
+            self,
+            raw={**self.raw, camera: raw},
+            inliers={**self.inliers, camera: inliers},
+            **own,
+        )
 
     @staticmethod
     def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
@@ -121,3 +118,12 @@ class OutlierFrame:
     number: int
     raw: CameraBlock
     T_lidar_camera: gtsam.Pose3
+
+
+def inliers_of(frames: Iterable[LiveFrame], camera: int) -> CameraBlock | None:
+    """A camera's matches within the gate, of frames; None if there are none."""
+    own = [frame for frame in frames if camera in frame.raw]
+    if not own:
+        return None
+    rows = np.concatenate([frame.inliers[camera] for frame in own])
+    return merge([frame.raw[camera] for frame in own]).select(rows)

@@ -31,15 +31,22 @@ class Optimum:
         distortion: in standard deviations of its prior, or None.
         clouds: per place, ``o_p``.
         matched: per place and camera (by its place in the rig), ``a_cp``.
+        contradicting: places in ``rig.relative_poses`` of those that take no part.
     """
 
     shared: Mapping[int, gtsam.Pose3]
     distortion: Array | None
     clouds: Mapping[str, gtsam.Pose3]
     matched: Mapping[str, Mapping[int, gtsam.Pose3]]
+    contradicting: tuple[int, ...]
 
     @staticmethod
-    def of(model: LatentPoseModel, values: gtsam.Values, names: Sequence[str]) -> Optimum:
+    def of(
+        model: LatentPoseModel,
+        values: gtsam.Values,
+        names: Sequence[str],
+        contradicting: tuple[int, ...],
+    ) -> Optimum:
         """Of a model of places of some names."""
         matched: dict[str, dict[int, gtsam.Pose3]] = {name: {} for name in names}
         for place, camera in model.matched_places():
@@ -49,9 +56,12 @@ class Optimum:
             values.atVector(DISTORTION) if model.is_distorted else None,
             {name: values.atPose3(cloud_at_key(place)) for place, name in enumerate(names)},
             matched,
+            contradicting,
         )
 
-    def values(self, model: LatentPoseModel, names: Sequence[str], guess: Array) -> gtsam.Values:
+    def values(
+        self, model: LatentPoseModel, names: Sequence[str], guess: Sequence[gtsam.Pose3]
+    ) -> gtsam.Values:
         """Values of all variables of a model, near its optimum.
 
         Places that are new are where they are expected; cameras that are, at a guess.
@@ -76,8 +86,9 @@ class Optimum:
             values.insert(matched_at_key(place, camera), pose)
         if model.is_distorted:
             size = model.components.distortion_jacobian.shape[2]
-            known = self.distortion is not None
-            values.insert(DISTORTION, self.distortion if known else np.zeros(size))
+            values.insert(
+                DISTORTION, np.zeros(size) if self.distortion is None else self.distortion
+            )
         return values
 
     def pose_at(self, name: str, camera: int) -> gtsam.Pose3 | None:

@@ -19,7 +19,6 @@ from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.camera_block import merge
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.data_by_place import block_by_place
@@ -27,7 +26,7 @@ from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 
@@ -90,40 +89,51 @@ class FrameSpread:
         )
 
 
-def place_data(
-    state: State, earlier: PlaceSums, frames: Sequence[LiveFrame], names: Sequence[str]
-) -> dict[int, Data]:
-    """Per camera its matches at some places, as if all were independent.
+@dataclass(frozen=True, eq=False)
+class PlaceData:
+    """The matches of some places, as if all were independent.
 
-    Args:
-        state: of the tracker.
-        earlier: sums of frames whose matches are gone.
-        frames: the others; those of a camera that drifts are among the sums.
+    Attributes:
         names: of the places.
+        rows: (p,) theirs, in the sums over all frames.
+        cameras: per camera (by its place in the rig) that has some.
     """
-    numbers = [
-        np.array([frame.number for frame in frames if frame.place == name], dtype=np.int64)
-        for name in names
-    ]
-    kept, found = [frame for frame in frames if frame.place in names], dict[int, Data]()
-    for camera, one in enumerate(state.cameras):
-        quadratic = _quadratic(state, earlier, camera, names)
-        own = [frame.inliers_of(camera) for frame in kept if camera in frame.raw]
-        if not own or one.summary.walk:
-            if len(quadratic.places):
-                found[camera] = quadratic
-            continue
-        block = block_by_place(merge(own), one.scale, numbers)
-        found[camera] = SummarizedByPlace(quadratic, block) if len(quadratic.places) else block
-    return found
+
+    names: Sequence[str]
+    rows: Numbers
+    cameras: Mapping[int, Data]
+
+    @staticmethod
+    def of(
+        state: State, earlier: PlaceSums, frames: Sequence[LiveFrame], places: Mapping[str, int]
+    ) -> PlaceData:
+        """Of frames whose matches are kept, and the sums over earlier ones.
+
+        Args:
+            state: of the tracker.
+            earlier: those sums; those of a camera that drifts are over all frames.
+            frames: the others.
+            places: the rows by their names.
+        """
+        numbers = [
+            np.array([frame.number for frame in frames if frame.place == name], dtype=np.int64)
+            for name in places
+        ]
+        kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
+        for camera, one in enumerate(state.cameras):
+            quadratic = _quadratic(state, earlier, camera, [*places])
+            own = None if one.summary.walk else inliers_of(kept, camera)
+            if own is not None:
+                block = block_by_place(own, one.scale, numbers)
+                several = len(quadratic.places) > 0
+                cameras[camera] = SummarizedByPlace(quadratic, block) if several else block
+            elif len(quadratic.places):
+                cameras[camera] = quadratic
+        return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
 
 
 def place_model(
-    state: State,
-    sums: PlaceSums,
-    seen: FrameSpread,
-    rows: Sequence[int],
-    data: Mapping[int, Data],
+    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData
 ) -> LatentPoseModel:
     """The graph of some places, without any prior of a camera.
 
@@ -131,12 +141,11 @@ def place_model(
         state: of the tracker.
         sums: of all frames.
         seen: by the frames of each camera.
-        rows: of ``sums``, the places.
-        data: per camera, its matches there.
+        data: the matches of the places.
     """
-    chosen, names = np.asarray(rows, dtype=np.int64), state.names
+    chosen, names = data.rows, state.names
     blocks, shown = {}, {}
-    for camera, matches in data.items():
+    for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
         blocks[names[camera]] = matches.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
