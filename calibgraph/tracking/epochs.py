@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
@@ -68,7 +69,11 @@ def _regate(state: State) -> State:
     """The state with its live frames gated, and their gradients taken, at the newest estimates."""
     frames = {
         f.number: replace(
-            f, inliers=dict(f.inliers), gradient=f.gradient.copy(), reweighted=f.reweighted.copy()
+            f,
+            inliers=dict(f.inliers),
+            hessian=f.hessian.copy(),
+            gradient=f.gradient.copy(),
+            reweighted=f.reweighted.copy(),
         )
         for f in state.live_frames
     }
@@ -89,7 +94,10 @@ def _regate(state: State) -> State:
 def _regate_camera(
     state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
 ) -> None:
-    """Fill in a camera's inliers of frames, and their gradients at an estimate."""
+    """Fill in a camera's inliers of frames, and their sums at an estimate.
+
+    Hessians of frames are as they were, but for a share of what their sum is now.
+    """
     scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
     gate = _gate_pose(state, camera, raw, T_lidar_camera)
     rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
@@ -97,11 +105,16 @@ def _regate_camera(
         if np.count_nonzero(found) >= MIN_MATCHES:
             frame.inliers[camera] = found
     inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
-    sums = inliers.with_scale(scale).frame_sums(T_lidar_camera, inliers.frame_edges)
+    block = inliers.with_scale(scale)
+    sums = block.frame_sums(T_lidar_camera, inliers.frame_edges)
+    robust = robust_hessian(block, T_lidar_camera)
+    true = convex_hessian(robust + raw.gate_hessian(to_T_camera_lidar(gate), scale), robust)
+    missing = true - sum(frame.hessian[camera] for frame in frames)
     step = step_between(T_lidar_camera, state.references[camera])
-    for frame, gradient, reweighted in zip(frames, sums.gradient, sums.hessian, strict=True):
-        frame.gradient[camera] = gradient + frame.hessian[camera] @ step
-        frame.reweighted[camera] = reweighted
+    for row, (frame, count) in enumerate(zip(frames, inliers.frame_counts, strict=True)):
+        frame.hessian[camera] += missing * (count / len(inliers))
+        frame.gradient[camera] = sums.gradient[row] + frame.hessian[camera] @ step
+        frame.reweighted[camera] = sums.hessian[row]
 
 
 def _gate_pose(
