@@ -110,9 +110,10 @@ def _regate_camera(
     robust = robust_hessian(block, T_lidar_camera)
     true = convex_hessian(robust + raw.gate_hessian(to_T_camera_lidar(gate), scale), robust)
     missing = true - sum(frame.hessian[camera] for frame in frames)
+    shares = sums.hessian @ np.linalg.solve(sums.hessian.sum(axis=0) + WEAK, missing)
     step = step_between(T_lidar_camera, state.references[camera])
-    for row, (frame, count) in enumerate(zip(frames, inliers.frame_counts, strict=True)):
-        frame.hessian[camera] += missing * (count / len(inliers))
+    for row, frame in enumerate(frames):
+        frame.hessian[camera] += (shares[row] + shares[row].T) / 2
         frame.gradient[camera] = sums.gradient[row] + frame.hessian[camera] @ step
         frame.reweighted[camera] = sums.hessian[row]
 
