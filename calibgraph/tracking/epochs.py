@@ -121,24 +121,20 @@ def _regate_camera(
 def _gate_pose(
     state: State, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
 ) -> gtsam.Pose3:
-    """Where the gate is drawn: the minimum of all matches of live frames, as in a batch.
+    """Where the gate is drawn: the minimum of all matches, as in a batch.
 
     That of the matches within a gate is drawn to where the gate was before. A camera that drifts
     keeps its estimate, which later epochs have a part in.
     """
-    one = state.cameras[camera]
+    one, reference = state.cameras[camera], state.references[camera]
     if one.summary.walk:
         return T_lidar_camera
-    block, (hessian, gradient, *_) = raw.with_scale(one.scale), one.summary.selected
+    block, older = raw.with_scale(one.scale), one.summary
     for _ in range(_GATE_STEPS):
-        sums, step = (
-            block.sums(T_lidar_camera),
-            step_between(state.references[camera], T_lidar_camera),
-        )
-        pull = sums.gradient + gradient + hessian @ step
-        T_lidar_camera = T_lidar_camera.retract(
-            -np.linalg.solve(sums.hessian + hessian + WEAK, pull)
-        )
+        sums, step = block.sums(T_lidar_camera), step_between(reference, T_lidar_camera)
+        pull = sums.gradient + older.ungated_gradient + older.ungated_hessian @ step
+        whole = sums.hessian + older.ungated_hessian + WEAK
+        T_lidar_camera = T_lidar_camera.retract(-np.linalg.solve(whole, pull))
     return T_lidar_camera
 
 
@@ -184,7 +180,7 @@ class _PlaceInEpoch:
         hessian: (6, 6).
         gradient: (6,) at the reference.
         reweighted: (6, 6) Hessian by the matches' weights in the loss, at the pose of the place.
-        pull: (6,) gradient at the reference, by the same from there.
+        pull: (6,) gradient at the reference, from there.
         scores: (f, 6) gradients at the estimate, of all the epoch's frames; zero of others.
         frames, matches: how many.
     """
@@ -219,15 +215,14 @@ class _PlaceInEpoch:
 def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _PlaceInEpoch:
     numbers = np.array([frame.number for frame in epoch.frames])
     nothing = _PlaceInEpoch.empty(len(numbers))
-    raw = [f.raw[camera] for f in epoch.frames if camera in f.raw and f.place == place]
-    if not raw:
+    frames = [f for f in epoch.frames if camera in f.raw and f.place == place]
+    if not frames:
         return nothing
+    raw = [frame.raw[camera] for frame in frames]
+    rows = np.concatenate([frame.inliers[camera] for frame in frames])
     T_lidar_camera, scale = epoch.T_lidar_camera[camera], state.cameras[camera].scale
-    everything = merge(raw)
-    residuals = everything.at(to_T_camera_lidar(T_lidar_camera))
-    inliers = everything.select(residuals.inliers(scale))
-    if len(inliers.frame) < MIN_MATCHES:
-        return nothing
+    residuals = merge(raw).at(to_T_camera_lidar(T_lidar_camera))
+    inliers = residuals.block.select(rows)
     block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
     by_frame = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame)))
@@ -239,7 +234,7 @@ def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _Plac
     of_place = None if state.optimum is None else state.optimum.pose_at(place, camera)
     here = block.sums(of_place or T_lidar_camera)
     to_reference = step_between(of_place or T_lidar_camera, state.references[camera])
-    pull = here.gradient + here.hessian @ to_reference
+    pull = here.gradient + hessian @ to_reference
     return _PlaceInEpoch(
         hessian, gradient, here.hessian, pull, scores, len(own), len(inliers.frame)
     )
@@ -266,6 +261,7 @@ def _summarize_oldest(state: State) -> State:
         summary = camera_state.summary
         if s.frames:
             summary = summary.add(s.hessian, s.gradient, s.scores.T @ s.scores, s.frames)
+            summary = summary.add_ungated(*_ungated(state, epoch, camera))
         summary, gain = summary.propagate(
             state.walk_variance(len(epoch.frames)), state.overconfidence(camera)
         )
@@ -282,6 +278,15 @@ def _summarize_oldest(state: State) -> State:
     )
     parts = [_to_part(name, [at[row] for at in at_places]) for row, name in enumerate(names)]
     return _with_places(state, parts, drifted)
+
+
+def _ungated(state: State, epoch: Epoch, camera: int) -> tuple[Array, Array]:
+    """(6, 6) Hessian and (6,) gradient at the reference, of all matches of a camera in an epoch."""
+    pose = epoch.T_lidar_camera[camera]
+    raw = merge([frame.raw[camera] for frame in epoch.frames if camera in frame.raw])
+    sums = raw.with_scale(state.cameras[camera].scale).sums(pose)
+    step = step_between(pose, state.references[camera])
+    return sums.hessian, sums.gradient + sums.hessian @ step
 
 
 def _to_part(name: str, cameras: Sequence[_PlaceInEpoch]) -> PlacePart:

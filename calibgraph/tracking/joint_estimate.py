@@ -176,7 +176,7 @@ def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFi
             step = step_between(pose, state.references[camera])
             reweighted[row, camera] = here.hessian[place]
             gradient[row, camera] = here.gradient[place] + here.hessian[place] @ step
-    return replace(sums, gradient=gradient, reweighted=reweighted)
+    return replace(sums, hessian=reweighted, gradient=gradient, reweighted=reweighted)
 
 
 @dataclass(frozen=True, eq=False)

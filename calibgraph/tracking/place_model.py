@@ -26,6 +26,7 @@ from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
+from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
@@ -197,14 +198,33 @@ def summary_factor(
 def _quadratic(
     state: State, sums: PlaceSums, camera: int, names: Sequence[str]
 ) -> QuadraticByPlace:
-    """The quadratics of a camera at some places."""
+    """The quadratics of a camera at some places.
+
+    As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
+    last epoch, and the Hessian by the weights of the matches there.
+    """
     rows = {name: row for row, name in enumerate(sums.names) if sums.frames[row, camera]}
     places = np.array([place for place, name in enumerate(names) if name in rows], dtype=np.int64)
-    own = [rows[names[place]] for place in places]
-    information = sums.reweighted[own, camera] + WEAK
-    steps = np.linalg.solve(information, -sums.gradient[own, camera][..., None])[..., 0]
-    poses = [state.references[camera].retract(step) for step in steps]
-    return QuadraticByPlace(places, poses, information)
+    own, poses = [rows[names[place]] for place in places], []
+    for row in own:
+        true, gradient = sums.hessian[row, camera], sums.gradient[row, camera]
+        pose = _pose_at(state, sums.names[row], camera)
+        if pose is None:
+            true = convex_hessian(true, sums.reweighted[row, camera])
+            step = np.linalg.solve(true + WEAK, -gradient)
+        else:
+            step = step_between(state.references[camera], pose)
+            information = sums.reweighted[row, camera] + WEAK
+            step = step - np.linalg.solve(information, gradient + true @ step)
+        poses.append(state.references[camera].retract(step))
+    return QuadraticByPlace(places, poses, sums.reweighted[own, camera] + WEAK)
+
+
+def _pose_at(state: State, place: str, camera: int) -> gtsam.Pose3 | None:
+    """Of a place at the optimum of the last epoch; None if a camera drifts, or was not there."""
+    if state.optimum is None or state.cameras[camera].summary.walk:
+        return None
+    return state.optimum.pose_at(place, camera)
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:

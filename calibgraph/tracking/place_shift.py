@@ -66,7 +66,7 @@ def agrees_at_its_place(state: State, camera: int, own: OutlierFrame) -> bool:
     step, covariance = steps_of(state)[camera], before
     there = places.names.index(state.live_frames[-1].place), camera
     if is_determined(places.hessian[there]):
-        shown = np.linalg.solve(places.reweighted[there], -places.gradient[there]) - step
+        shown = np.linalg.solve(places.hessian[there], -places.gradient[there]) - step
         of_frames = _sandwich(places.hessian[there], places.frames[there] * noise)
         gain = _gain(covariance, of_frames)
         step, covariance = step + gain @ shown, covariance - gain @ covariance

@@ -31,7 +31,7 @@ class PlacePart:
     Attributes:
         name: of the place.
         hessian: (n, 6, 6) true Hessian, per camera.
-        gradient: (n, 6) at the references, by the reweighted Hessian from where it is taken.
+        gradient: (n, 6) at the references.
         reweighted: (n, 6, 6) Hessian by the matches' weights in the loss, positive semidefinite.
         score: (n, 6) sum of the frames' gradients, each at the estimate of its time.
         scatter: (n, 6, 6) sum of the outer products of the same.
@@ -63,7 +63,6 @@ def _part(frames: Sequence[LiveFrame], steps: Array, name: str) -> PlacePart:
     hessian = np.array([frame.hessian for frame in frames])
     gradient = np.array([frame.gradient for frame in frames])
     scores = gradient + np.einsum("fnij,nj->fni", hessian, steps)
-    reweighted = sum((frame.reweighted for frame in frames), np.zeros_like(hessian[0]))
     counts = np.zeros((len(frames), len(steps)))
     for row, frame in enumerate(frames):
         for camera, inliers in frame.inliers.items():
@@ -71,8 +70,8 @@ def _part(frames: Sequence[LiveFrame], steps: Array, name: str) -> PlacePart:
     return PlacePart(
         name,
         hessian.sum(axis=0),
-        scores.sum(axis=0) - np.einsum("nij,nj->ni", reweighted, steps),
-        reweighted,
+        gradient.sum(axis=0),
+        sum((frame.reweighted for frame in frames), np.zeros_like(hessian[0])),
         scores.sum(axis=0),
         np.einsum("fni,fnj->nij", scores, scores),
         np.count_nonzero(counts, axis=0).astype(np.float64),
@@ -87,7 +86,7 @@ class PlaceSums:
     Attributes:
         names: (P,) of the places, the last visited last.
         hessian: (P, n, 6, 6) true Hessian of each camera's robust cost.
-        gradient: (P, n, 6) at the references, which ``State`` holds, by the reweighted Hessian.
+        gradient: (P, n, 6) at the references, which ``State`` holds.
         reweighted: (P, n, 6, 6) Hessian by the matches' weights in the loss.
         score: (P, n, 6) sum of the frames' gradients, each at the estimate of its time; 0 for older
             places.
@@ -161,7 +160,7 @@ class PlaceSums:
     def shift_reference(self, steps: Array) -> PlaceSums:
         """The sums about references that are moved by (n, 6) tangent steps."""
         return replace(
-            self, gradient=self.gradient + np.einsum("pnij,nj->pni", self.reweighted, steps)
+            self, gradient=self.gradient + np.einsum("pnij,nj->pni", self.hessian, steps)
         )
 
     def add(self, parts: Iterable[PlacePart]) -> PlaceSums:
