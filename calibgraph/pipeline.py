@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.io.dataset import Dataset
-from calibgraph.model.calibration import Calibration
+from calibgraph.model.calibration import Calibration, pair_covariances
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -144,6 +144,9 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
+        pair_covariance=pair_covariances(
+            evidence.mount_covariance, solution.T_camera_lidar, solution.held
+        ),
         camera_verdicts=verdicts,
         residuals=evidence.residuals,
         counts={name: dict(counts) for name, counts in solution.counts.items()},

@@ -31,6 +31,7 @@ def calibrate(
     bootstrap: options.BootstrapOption = None,
     tolerance_deg: options.ToleratedDegOption = None,
     tolerance_cm: options.ToleratedCmOption = None,
+    of: options.OfOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
@@ -38,7 +39,7 @@ def calibrate(
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
-        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "of": of}
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed)
@@ -107,6 +108,7 @@ def solve(
     tolerance_cm: options.ToleratedCmOption = None,
     common_deg: options.CommonDegOption = None,
     common_cm: options.CommonCmOption = None,
+    of: options.OfOption = None,
     print_graph: options.PrintGraphOption = False,
     graph: options.GraphOption = None,
     as_json: options.JsonOption = False,
@@ -126,6 +128,7 @@ def solve(
             "tolerance_cm": tolerance_cm,
             "common_deg": common_deg,
             "common_cm": common_cm,
+            "of": of,
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
