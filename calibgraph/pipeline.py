@@ -14,10 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.io.dataset import Dataset
-from calibgraph.model.calibration import Calibration, pair_covariances
+from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress

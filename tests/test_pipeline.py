@@ -31,7 +31,7 @@ from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call
 from tests.matching.structure.data import with_noise_images
 
-pytestmark = pytest.mark.usefixtures("blank_diagrams")
+pytestmark = pytest.mark.usefixtures("blank_diagrams", "no_image_checks")
 
 FRAMES = 6
 STATED = {

@@ -7,17 +7,19 @@ to these pixels, all of equal weight.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from calibgraph import Camera, Rig, load_dataset
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera, twist_between
 from calibgraph.simulation.lidar import lidar_of
 from calibgraph.simulation.scan_errors import ScanErrors
 from factors import ProjectionBlock, block_factor
 
+ALIGNMENT = "alignment.yaml"
 _MOST = 20_000  # points of a camera
 
 
@@ -73,3 +75,13 @@ def _align(camera: Camera, points: np.ndarray, met: np.ndarray) -> np.ndarray:
     values.insert(0, to_T_lidar_camera(T))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return to_T_camera_lidar(found.atPose3(0))
+
+
+def mean_poses(several: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Per camera, the mean of near (4, 4) T_camera_lidar."""
+    first = several[0]
+    steps = {
+        name: np.mean([twist_between(of[name], first[name]) for of in several], axis=0)
+        for name in first
+    }
+    return {name: gtsam.Pose3.Expmap(step).matrix() @ first[name] for name, step in steps.items()}

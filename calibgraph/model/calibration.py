@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import combinations
@@ -19,8 +19,6 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.geometry import relative_covariance, relative_transform
-from calibgraph.model.result_files import RESULT, VERDICT_KEY, WRITTEN_KEY
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
@@ -30,9 +28,13 @@ from calibgraph.outputs import require_writable
 Array = NDArray[np.float64]
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
-_XI = "exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the"
-TANGENT_SENTENCE = f"T_camera_lidar = {_XI} camera's axes"
-PAIR_TANGENT_SENTENCE = f"A->B: T_B_A = {_XI} axes of B"
+TANGENT_SENTENCE = (
+    "T_camera_lidar = exp(xi) * estimate, "
+    "xi = (rotation [rad], translation [m]) in the camera's axes"
+)
+PAIR_TANGENT_SENTENCE = (
+    "A->B: T_B_A = exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the axes of B"
+)
 
 
 @dataclass(frozen=True)
@@ -168,9 +170,10 @@ class Calibration:
         return {name: geometry.invert(T) for name, T in self.T_camera_lidar.items()}
 
     def sigmas(self, name: str) -> tuple[Array, Array] | None:
-        """(3,) rotation [deg] and (3,) translation [cm] of a camera or pair "A->B", 1 sigma.
+        """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
 
-        Along the axes of the camera, or of B; None where not determined.
+        Returns:
+            (3,) rotation [deg], (3,) translation [cm]; None where not determined.
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else geometry.degrees_and_centimetres(covariance)
@@ -224,7 +227,10 @@ class Calibration:
         if table is None:
             path.unlink(missing_ok=True)
             return None
-        marks: dict[str, str] = {VERDICT_KEY: self.verdict.status, WRITTEN_KEY: RESULT}
+        marks: dict[str, str] = {
+            result_files.VERDICT_KEY: self.verdict.status,
+            result_files.WRITTEN_KEY: result_files.RESULT,
+        }
         replace(table, metadata={**table.metadata, **marks}).save(path)
         return sha256(path)
 
@@ -245,7 +251,7 @@ class Calibration:
             "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
-            "sigmas": {name: _by_part(self.covariance[name]) for name in self.rig.cameras},
+            "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in self.rig.cameras},
             "error_bar_holds": {
                 name: self.error_bar_holds(name)
                 for name in (*self.rig.cameras, *self.pair_covariance)
@@ -273,26 +279,8 @@ class Calibration:
         }
 
 
-def pair_covariances(
-    joint: Array | None, T_camera_lidar: Mapping[str, Array], without: Container[str] = ()
-) -> dict[str, Array]:
-    """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate; of none without a covariance.
-
-    Args:
-        joint: (6 N, 6 N) of all cameras.
-        T_camera_lidar: (4, 4) of each.
-        without: cameras that have no error bar.
-    """
-    if joint is None:
-        return {}
-    pairs = combinations(enumerate(T_camera_lidar.items()), 2)
-    return {
-        f"{a}->{b}": relative_covariance(joint, i, j, relative_transform(T_b, T_a))
-        for (i, (a, T_a)), (j, (b, T_b)) in pairs
-        if a not in without and b not in without
-    }
-
-
-def _by_part(covariance: Array | None) -> dict[str, list[float]] | None:
-    sigmas = None if covariance is None else np.sqrt(np.diag(covariance)).tolist()
-    return sigmas and {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}
+def _sigma_mapping(covariance: Array | None) -> dict[str, list[float]] | None:
+    if covariance is None:
+        return None
+    sigmas = np.sqrt(np.diag(covariance)).tolist()
+    return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.calibration import Calibration, Residuals, pair_covariances
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.model.calibration import Calibration, Residuals
+from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
