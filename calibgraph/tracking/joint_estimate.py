@@ -185,11 +185,11 @@ def joint_estimate(state: State, sums: Posterior, closed: ClosedPlaces) -> Joint
     places = _with_open_epoch(state, sums, closed)
     seen = closed.seen if closed.is_settled(state) else FrameSpread.of(state, places)
     fit, conflicts = closed.fit_with(state, places, seen)
-    estimates, values = state.T_lidar_camera, fit.linear.values
+    estimates = state.T_lidar_camera
     shown = fit.linear.model.components.distortion_vector.any()
     several = state.rig.relative_poses or shown or not places.is_of_one_place
     if state.config.preset == "auto" and several:
-        estimates = tuple(values.atPose3(camera_key(c)) for c in range(len(state.cameras)))
+        estimates = fit.T_lidar_camera
     covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
@@ -258,7 +258,8 @@ def _conflicts(
         return {}
     others = [name for name in state.names if name not in names]
     held = held_graph(state.names, _by_name(state), others)
-    linear = Linearization.at(replace(model, pose_graph=join(held, model.pose_graph)), values)
+    mounts = replace(model, pose_graph=join(held, model.pose_graph), of="mount")
+    linear = Linearization.at(mounts, values)
     found, rows = linear.values.retract(linear.step), _rows(known)
     covariance = linear.covariance[np.ix_(rows, rows)]
     T = {

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_difference, pose_rows, relative_transform
+from calibgraph.model.geometry import (
+    pose_difference,
+    pose_rows,
+    relative_transform,
+    twist_between,
+)
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
@@ -101,11 +106,23 @@ class Evidence:
 
         Cameras that are held are unknown by a radian and a metre.
         """
-        if self.covariance_of_matches is None or not self.posteriors:
-            return self.covariance_of_matches
+        return self._widened(self.covariance_of_matches)
+
+    @property
+    def mount_covariance(self) -> Array | None:
+        """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
+        mount = self.solution.marginals.mount
+        if mount.covariance is None:
+            return None
+        of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
+        away = np.concatenate([twist_between(of[name], T[name]) for name in T])
+        return self._widened(mount.covariance + np.outer(away, away))
+
+    def _widened(self, joint: Array | None) -> Array | None:
+        if joint is None or not self.posteriors:
+            return joint
         posteriors = self.posteriors.items()
-        moments = {self.cameras.index(name): found.moments for name, found in posteriors}
-        return widen(self.covariance_of_matches, moments)
+        return widen(joint, {self.cameras.index(name): of.moments for name, of in posteriors})
 
     @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
@@ -155,11 +172,6 @@ class Evidence:
         marginals, joint = self.solution.marginals, self.joint_covariance
         return marginals.pair_fits if not self.posteriors else marginals.fit_pairs_near(joint)
 
-    @cached_property
-    def pair_covariance(self) -> Array:
-        """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
-        return self.solution.marginals.known_or_prior(self.joint_covariance)
-
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
         return self._block(self.solution.marginals.scatter, camera)
@@ -188,7 +200,7 @@ class Evidence:
         errors = self.solution.marginals.errors
         if errors is None:
             return prior_shares(self.solution, self.solution.marginals.robust_hessians)
-        return shares_of_marginal(self.solution, errors.fit.covariance)
+        return shares_of_marginal(self.solution, errors.fit.of_mount.covariance)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:
