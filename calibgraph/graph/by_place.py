@@ -71,10 +71,10 @@ class BlockByPlace:
         runs = np.column_stack([self.edges[:-1], self.edges[1:]])
         return self.block.run_sums(np.ascontiguousarray(T_camera_cloud), runs)
 
-    def factor(self, place: int, cloud: int, matched: int) -> gtsam.NonlinearFactor:
+    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The correspondences of one place, lossless, on the variables of these keys."""
         rows = np.arange(self.edges[place], self.edges[place + 1])
-        return pair_block_factor(cloud, matched, self.block.select(rows))
+        return [pair_block_factor(cloud, matched, self.block.select(rows))] if len(rows) else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +91,10 @@ class QuadraticByPlace:
     T_lidar_camera: Sequence[gtsam.Pose3]
     information: Array
 
+    def with_variance(self, factor: float) -> QuadraticByPlace:
+        """Multiply the variance of the matches."""
+        return replace(self, information=self.information / factor)
+
     def sums(self, T_camera_cloud: Array) -> BlockSums:
         """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
         count = len(T_camera_cloud)
@@ -102,11 +106,53 @@ class QuadraticByPlace:
         gradient = np.einsum("pij,pj->pi", hessian, step)
         return BlockSums(hessian, gradient, np.einsum("pi,pi->p", gradient, step))
 
-    def factor(self, place: int, cloud: int, matched: int) -> gtsam.NonlinearFactor:
+    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The quadratic of one place, a stock factor on the variables of these keys."""
-        row = int(np.searchsorted(self.places, place))
-        noise = gtsam.noiseModel.Gaussian.Information(self.information[row])
-        return gtsam.BetweenFactorPose3(cloud, matched, self.T_lidar_camera[row], noise)
+        return [
+            gtsam.BetweenFactorPose3(
+                cloud,
+                matched,
+                self.T_lidar_camera[row],
+                gtsam.noiseModel.Gaussian.Information(self.information[row]),
+            )
+            for row in map(int, np.flatnonzero(self.places == place))
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class SummarizedByPlace:
+    """One camera's correspondences, and the quadratics that are left of earlier ones.
+
+    Attributes:
+        earlier: the quadratics.
+        recent: the correspondences.
+    """
+
+    earlier: QuadraticByPlace
+    recent: BlockByPlace
+
+    @property
+    def places(self) -> Numbers:
+        """(p,) the places that have either, in rising order."""
+        return np.union1d(self.earlier.places, self.recent.places)
+
+    def with_variance(self, factor: float) -> SummarizedByPlace:
+        """Multiply the variance of the matches; the loss keeps its tuning constant in pixels."""
+        return SummarizedByPlace(
+            self.earlier.with_variance(factor), self.recent.with_variance(factor)
+        )
+
+    def sums(self, T_camera_cloud: Array) -> BlockSums:
+        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
+        one, two = self.earlier.sums(T_camera_cloud), self.recent.sums(T_camera_cloud)
+        return BlockSums(
+            one.hessian + two.hessian, one.gradient + two.gradient, one.cost + two.cost
+        )
+
+    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
+        """Those of both, on the variables of these keys."""
+        parts = self.earlier, self.recent
+        return [factor for part in parts for factor in part.factors(place, cloud, matched)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.by_place import BlockByPlace, PairByPlace, QuadraticByPlace
+from calibgraph.graph.by_place import (
+    BlockByPlace,
+    PairByPlace,
+    QuadraticByPlace,
+    SummarizedByPlace,
+)
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
@@ -117,7 +122,7 @@ class LatentPoseModel:
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, BlockByPlace | QuadraticByPlace]
+    blocks: Mapping[str, BlockByPlace | QuadraticByPlace | SummarizedByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -212,11 +217,15 @@ def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 
 
 def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """One lossless factor per camera and place, and one per pair and place."""
+    """One factor per camera and place, and one per pair and place; lossless.
+
+    A summary of earlier correspondences is another factor of its camera and place.
+    """
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places():
         keys = cloud_at_key(place), matched_at_key(place, camera)
-        graph.add(model.blocks[model.cameras[camera]].factor(place, *keys))
+        for factor in model.blocks[model.cameras[camera]].factors(place, *keys):
+            graph.add(factor)
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, features in pair.at_each_place():

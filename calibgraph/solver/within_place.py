@@ -28,6 +28,7 @@ from factors import pose_sigmas
 Array = NDArray[np.float64]
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
+_ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits
 WEAK = np.diag(pose_sigmas(rotation_rad=1.0, translation_m=10.0) ** -2.0)
 """Information of a pose within sight, so that few matches have an inverse."""
 
@@ -72,7 +73,7 @@ class WithinPlace:
         shared = place_variance * self.efficiency * self.frames[:, None, None] * np.eye(6)
         inverse = np.linalg.inv(self.roots)
         covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
-        return (covariance + covariance.transpose(0, 2, 1)) / 2
+        return (covariance + covariance.transpose(0, 2, 1)) / 2 + _ROUNDING**2 * np.eye(6)
 
 
 def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> WithinPlace:

@@ -12,9 +12,11 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.posterior import Posterior, is_determined, posterior
+from calibgraph.tracking.posterior import Posterior, is_determined
 from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.trust.estimate import Estimate
@@ -33,11 +35,13 @@ class Assessment:
         joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
             with too few frames.
         verdicts: per camera.
+        fit: the error model at its optimum.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
+    fit: LatentPoseFit
 
 
 def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces) -> Assessment:
@@ -57,7 +61,7 @@ def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlace
         verdicts[name] = _verdict(
             state, sums, camera, joint.covariance, conflicts=own, halves=estimates
         )
-    return Assessment(joint.T_lidar_camera, joint.covariance, verdicts)
+    return Assessment(joint.T_lidar_camera, joint.covariance, verdicts, joint.fit)
 
 
 def _verdict(
@@ -156,21 +160,27 @@ def _counts(one: CameraState) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
-def to_calibration(state: State) -> Calibration:
+def second_moments(assessment: Assessment) -> Array:
+    """(6 n, 6 n) of the mounts about the estimates."""
+    mount = assessment.fit.of_mount
+    steps = zip(mount.T_lidar_camera, assessment.T_lidar_camera, strict=True)
+    away = np.concatenate([step_between(pose, estimate) for pose, estimate in steps])
+    return np.asarray(mount.covariance + np.outer(away, away))
+
+
+def to_calibration(state: State, assessment: Assessment) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    sums = posterior(state)
-    halves = SplitHalf.of_closed_epochs(state).add(state.epochs[-1].frames)
-    assessment = assess(state, sums, halves, ClosedPlaces.of(state))
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
+    mounts = None if known is None else second_moments(assessment)
     rig = state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,
-        pair_covariance=pair_covariances(known, rig.T_camera_lidar),
+        pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
         camera_verdicts=assessment.verdicts,
         residuals={
             name: recent_residuals(one)

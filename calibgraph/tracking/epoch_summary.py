@@ -19,7 +19,7 @@ epoch; the log-likelihoods of these predictions are its evidence, and the best o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -51,6 +51,7 @@ class EpochSummary:
         walk: which of the walks is selected.
         halves_hessian, halves_gradient: (2, 6, 6) and (2, 6) of every other epoch.
         next_half: which of the two the next epoch is added to.
+        ungated_hessian, ungated_gradient: (6, 6) and (6,) of all matches, outliers too.
     """
 
     hessian: Array
@@ -62,6 +63,8 @@ class EpochSummary:
     halves_hessian: Array
     halves_gradient: Array
     next_half: int
+    ungated_hessian: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    ungated_gradient: Array = field(default_factory=lambda: np.zeros(6))
 
     @staticmethod
     def empty() -> EpochSummary:
@@ -85,6 +88,7 @@ class EpochSummary:
             self,
             gradient=self.gradient + self.hessian @ step,
             halves_gradient=self.halves_gradient + self.halves_hessian @ step,
+            ungated_gradient=self.ungated_gradient + self.ungated_hessian @ step,
         )
 
     def add(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> EpochSummary:
@@ -101,6 +105,14 @@ class EpochSummary:
             halves_hessian=halves_hessian,
             halves_gradient=halves_gradient,
             next_half=1 - self.next_half,
+        )
+
+    def add_ungated(self, hessian: Array, gradient: Array) -> EpochSummary:
+        """The sums with those over all matches of an epoch added."""
+        return replace(
+            self,
+            ungated_hessian=self.ungated_hessian + hessian,
+            ungated_gradient=self.ungated_gradient + gradient,
         )
 
     def propagate(self, variance: Array, inflation: float) -> tuple[EpochSummary, Array]:
@@ -129,6 +141,8 @@ class EpochSummary:
             frames=self.frames * kept,
             halves_hessian=self.halves_hessian * kept[self.walk],
             halves_gradient=self.halves_gradient * kept[self.walk],
+            ungated_hessian=self.ungated_hessian * kept[self.walk],
+            ungated_gradient=self.ungated_gradient * kept[self.walk],
         )
         return summary, gains[self.walk]
 

@@ -10,17 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, merge
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.live_frames import Epoch
+from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import PlacePart
 from calibgraph.tracking.posterior import true_hessian
 from calibgraph.tracking.state import CameraState, State, block_diagonal
 
 Array = NDArray[np.float64]
+
+_GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
 
 
 def close_epoch(
@@ -47,7 +51,8 @@ def close_epoch(
         for camera_state in state.cameras
     )
     state = replace(state, cameras=cameras)
-    epochs = tuple(_regate(state, epoch) for epoch in state.epochs)
+    state = _regate(state)
+    epochs = state.epochs
     epochs = (*epochs[:-1], _with_bends(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
     return report_drift(replace(state, epochs=epochs))
 
@@ -60,19 +65,77 @@ def _with_bends(state: State, epoch: Epoch) -> Epoch:
     return epoch
 
 
-def _regate(state: State, epoch: Epoch) -> Epoch:
-    """The epoch with its frames gated at its newest estimate."""
-    T_camera_lidar = [*map(to_T_camera_lidar, epoch.T_lidar_camera)]
-    gates_px = [camera_state.scale.gate_px for camera_state in state.cameras]
-    frames = []
-    for frame in epoch.frames:
-        inliers = dict(frame.inliers)
-        for camera, raw in frame.raw.items():
-            rows = raw.within_gate(T_camera_lidar[camera], gates_px[camera])
-            if np.count_nonzero(rows) >= MIN_MATCHES:
-                inliers[camera] = rows
-        frames.append(replace(frame, inliers=inliers))
-    return replace(epoch, frames=tuple(frames))
+def _regate(state: State) -> State:
+    """The state with its live frames gated, and their gradients taken, at the newest estimates."""
+    frames = {
+        f.number: replace(
+            f,
+            inliers=dict(f.inliers),
+            hessian=f.hessian.copy(),
+            gradient=f.gradient.copy(),
+            reweighted=f.reweighted.copy(),
+        )
+        for f in state.live_frames
+    }
+    for camera, one in enumerate(state.cameras):
+        epochs = state.epochs if one.summary.walk else state.epochs[-1:]
+        for epoch in epochs:
+            group = epoch.frames if one.summary.walk else state.live_frames
+            own = [frames[f.number] for f in group if camera in f.raw]
+            if own:
+                _regate_camera(state, camera, own, epoch.T_lidar_camera[camera])
+    epochs = tuple(
+        replace(epoch, frames=tuple(frames[f.number] for f in epoch.frames))
+        for epoch in state.epochs
+    )
+    return replace(state, epochs=epochs)
+
+
+def _regate_camera(
+    state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
+) -> None:
+    """Fill in a camera's inliers of frames, and their sums at an estimate.
+
+    Hessians of frames are as they were, but for a share of what their sum is now.
+    """
+    scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
+    gate = _gate_pose(state, camera, raw, T_lidar_camera)
+    rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
+    for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True):
+        if np.count_nonzero(found) >= MIN_MATCHES:
+            frame.inliers[camera] = found
+    inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
+    block = inliers.with_scale(scale)
+    sums = block.frame_sums(T_lidar_camera, inliers.frame_edges)
+    robust = robust_hessian(block, T_lidar_camera)
+    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
+    missing = true - sum(frame.hessian[camera] for frame in frames)
+    shares = sums.hessian @ np.linalg.solve(sums.hessian.sum(axis=0) + WEAK, missing)
+    step = step_between(T_lidar_camera, state.references[camera])
+    for row, frame in enumerate(frames):
+        frame.hessian[camera] += (shares[row] + shares[row].T) / 2
+        frame.gradient[camera] = sums.gradient[row] + frame.hessian[camera] @ step
+        frame.reweighted[camera] = sums.hessian[row]
+
+
+def _gate_pose(
+    state: State, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
+) -> gtsam.Pose3:
+    """Where the gate is drawn: the minimum of all matches, as in a batch.
+
+    That of the matches within a gate is drawn to where the gate was before. A camera that drifts
+    keeps its estimate, which later epochs have a part in.
+    """
+    one, reference = state.cameras[camera], state.references[camera]
+    if one.summary.walk:
+        return T_lidar_camera
+    block, older = raw.with_scale(one.scale), one.summary
+    for _ in range(_GATE_STEPS):
+        sums, step = block.sums(T_lidar_camera), step_between(reference, T_lidar_camera)
+        pull = sums.gradient + older.ungated_gradient + older.ungated_hessian @ step
+        whole = sums.hessian + older.ungated_hessian + WEAK
+        T_lidar_camera = T_lidar_camera.retract(-np.linalg.solve(whole, pull))
+    return T_lidar_camera
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
@@ -116,7 +179,8 @@ class _PlaceInEpoch:
     Attributes:
         hessian: (6, 6).
         gradient: (6,) at the reference.
-        reweighted: (6, 6) Hessian by the matches' weights in the loss.
+        reweighted: (6, 6) Hessian by the matches' weights in the loss, at the pose of the place.
+        pull: (6,) gradient at the reference, from there.
         scores: (f, 6) gradients at the estimate, of all the epoch's frames; zero of others.
         frames, matches: how many.
     """
@@ -124,6 +188,7 @@ class _PlaceInEpoch:
     hessian: Array
     gradient: Array
     reweighted: Array
+    pull: Array
     scores: Array
     frames: int
     matches: int
@@ -132,13 +197,15 @@ class _PlaceInEpoch:
     def empty(frames: int) -> _PlaceInEpoch:
         """Of none of so many frames."""
         zero = np.zeros((6, 6))
-        return _PlaceInEpoch(zero, np.zeros(6), zero, np.zeros((frames, 6)), 0, 0)
+        none = np.zeros(6)
+        return _PlaceInEpoch(zero, none, zero, none, np.zeros((frames, 6)), 0, 0)
 
     def __add__(self, other: _PlaceInEpoch) -> _PlaceInEpoch:
         return _PlaceInEpoch(
             self.hessian + other.hessian,
             self.gradient + other.gradient,
             self.reweighted + other.reweighted,
+            self.pull + other.pull,
             self.scores + other.scores,
             self.frames + other.frames,
             self.matches + other.matches,
@@ -148,15 +215,14 @@ class _PlaceInEpoch:
 def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _PlaceInEpoch:
     numbers = np.array([frame.number for frame in epoch.frames])
     nothing = _PlaceInEpoch.empty(len(numbers))
-    raw = [f.raw[camera] for f in epoch.frames if camera in f.raw and f.place == place]
-    if not raw:
+    frames = [f for f in epoch.frames if camera in f.raw and f.place == place]
+    if not frames:
         return nothing
+    raw = [frame.raw[camera] for frame in frames]
+    rows = np.concatenate([frame.inliers[camera] for frame in frames])
     T_lidar_camera, scale = epoch.T_lidar_camera[camera], state.cameras[camera].scale
-    everything = merge(raw)
-    residuals = everything.at(to_T_camera_lidar(T_lidar_camera))
-    inliers = everything.select(residuals.inliers(scale))
-    if len(inliers.frame) < MIN_MATCHES:
-        return nothing
+    residuals = merge(raw).at(to_T_camera_lidar(T_lidar_camera))
+    inliers = residuals.block.select(rows)
     block = inliers.with_scale(scale)
     own, starts = np.unique(inliers.frame, return_index=True)
     by_frame = block.frame_sums(T_lidar_camera, np.append(starts, len(inliers.frame)))
@@ -165,8 +231,13 @@ def _sums_at_place(state: State, epoch: Epoch, camera: int, place: str) -> _Plac
     hessian = true_hessian(residuals, block, scale, T_lidar_camera)
     to_reference = step_between(T_lidar_camera, state.references[camera])
     gradient = by_frame.gradient.sum(axis=0) + hessian @ to_reference
-    reweighted = by_frame.hessian.sum(axis=0)
-    return _PlaceInEpoch(hessian, gradient, reweighted, scores, len(own), len(inliers.frame))
+    of_place = None if state.optimum is None else state.optimum.pose_at(place, camera)
+    here = block.sums(of_place or T_lidar_camera)
+    to_reference = step_between(of_place or T_lidar_camera, state.references[camera])
+    pull = here.gradient + hessian @ to_reference
+    return _PlaceInEpoch(
+        hessian, gradient, here.hessian, pull, scores, len(own), len(inliers.frame)
+    )
 
 
 def _summarize_oldest(state: State) -> State:
@@ -190,6 +261,7 @@ def _summarize_oldest(state: State) -> State:
         summary = camera_state.summary
         if s.frames:
             summary = summary.add(s.hessian, s.gradient, s.scores.T @ s.scores, s.frames)
+            summary = summary.add_ungated(*_ungated(state, epoch, camera))
         summary, gain = summary.propagate(
             state.walk_variance(len(epoch.frames)), state.overconfidence(camera)
         )
@@ -208,12 +280,21 @@ def _summarize_oldest(state: State) -> State:
     return _with_places(state, parts, drifted)
 
 
+def _ungated(state: State, epoch: Epoch, camera: int) -> tuple[Array, Array]:
+    """(6, 6) Hessian and (6,) gradient at the reference, of all matches of a camera in an epoch."""
+    pose = epoch.T_lidar_camera[camera]
+    raw = merge([frame.raw[camera] for frame in epoch.frames if camera in frame.raw])
+    sums = raw.with_scale(state.cameras[camera].scale).sums(pose)
+    step = step_between(pose, state.references[camera])
+    return sums.hessian, sums.gradient + sums.hessian @ step
+
+
 def _to_part(name: str, cameras: Sequence[_PlaceInEpoch]) -> PlacePart:
     """The sums of all cameras at one place."""
     return PlacePart(
         name,
         hessian=np.array([one.hessian for one in cameras]),
-        gradient=np.array([one.gradient for one in cameras]),
+        gradient=np.array([one.pull for one in cameras]),
         reweighted=np.array([one.reweighted for one in cameras]),
         score=np.array([one.scores.sum(axis=0) for one in cameras]),
         scatter=np.array([one.scores.T @ one.scores for one in cameras]),

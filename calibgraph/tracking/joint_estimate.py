@@ -15,18 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.linear_data import poses_of
 from calibgraph.graph.objective import join
-from calibgraph.graph.variables import (
-    CLOUD,
-    DISTORTION,
-    camera_key,
-    cloud_at_key,
-    matched_at_key,
-    matched_key,
-)
+from calibgraph.graph.variables import camera_key, cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.model.geometry import (
+    invert_each,
+    pose_rows,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
+)
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import (
@@ -37,8 +36,11 @@ from calibgraph.solver.elimination import (
 )
 from calibgraph.solver.error_model import held_graph
 from calibgraph.solver.variance_components import estimate_variance_ratios
+from calibgraph.tracking.epoch_summary import step_between
+from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
+    PlaceData,
     marginals_of_places,
     place_model,
     summary_factor,
@@ -56,44 +58,61 @@ NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 3  # of fits and estimates of the variance ratios, as in a batch
-_TOLERANCE = 1e-3  # relative change of the cost, of which the residuals of matches are no part
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedPlaces:
-    """The sums over the frames of closed epochs, and the optimum of their graph.
+    """The frames of closed epochs, and the graph of their places.
 
     Attributes:
         sums: per place; of a camera that drifts, none.
+        linear: the same, linearized at the pose that each place has there.
         findings: with which the rest was made.
         seen: by the frames of each camera.
-        rows: of ``sums``, the places of the graph.
+        data: of the places of the graph.
         fit: its optimum.
+        optimum: the poses there.
     """
 
     sums: PlaceSums
+    linear: PlaceSums
     findings: MatcherFindings
     seen: FrameSpread
-    rows: Rows
+    data: PlaceData
     fit: LatentPoseFit
+    optimum: Optimum
     _summaries: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
     _pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
 
     @staticmethod
-    def of(state: State) -> ClosedPlaces:
-        """Of a state's closed epochs."""
+    def of(state: State, *, at_optimum: bool = False) -> ClosedPlaces:
+        """Of a state's closed epochs.
+
+        Args:
+            state: of the tracker.
+            at_optimum: stay at the one that the state has, if it has one.
+        """
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
-        sums = state.places.add(parts_of(frames, steps_of(state)))
+        sums, earlier = state.places.add(parts_of(frames, steps_of(state))), state.places
         for camera, one in enumerate(state.cameras):
             if one.summary.walk:
-                sums = sums.without(camera)
+                sums, earlier = sums.without(camera), earlier.without(camera)
         seen = FrameSpread.of(state, sums)
-        rows = tuple(int(row) for row in np.flatnonzero(sums.frames.any(axis=1)))
-        model = place_model(state, sums, seen, rows)
-        values = start_values(model, _by_name(state))
-        pose_graphs = {NO_ROWS: pose_priors(state)}
-        fit, _ = _fit(state, sums, model, values, pose_graphs=pose_graphs)
-        return ClosedPlaces(sums, state.findings, seen, rows, fit, _pose_graphs=pose_graphs)
+        rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
+        data = PlaceData.of(state, earlier, frames, rows)
+        model = place_model(state, sums, seen, data)
+        pose_graphs, found = {NO_ROWS: pose_priors(state)}, state.optimum
+        values = _start(state, model, data.names)
+        if found is None or not at_optimum:
+            fit, contradicting, _ = _fit(state, sums, model, values, pose_graphs=pose_graphs)
+            found = Optimum.of(model, fit.linear.values, data.names, contradicting)
+        else:
+            model = _with_pose_graph(state, model, found.contradicting, pose_graphs)
+            fit = LatentPoseFit(Linearization.at(model, values), 0, True)
+        linear = linearized(state, sums, data, fit)
+        return ClosedPlaces(
+            sums, linear, state.findings, seen, data, fit, found, _pose_graphs=pose_graphs
+        )
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
@@ -106,49 +125,58 @@ class ClosedPlaces:
         cameras = zip(state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def fit_with(
-        self, state: State, places: PlaceSums, seen: FrameSpread
-    ) -> tuple[LatentPoseFit, Conflicts]:
+    def fit_with(self, state: State, sums: Posterior) -> tuple[LatentPoseFit, Conflicts]:
         """The optimum with the frames of the open epoch, and the relative poses that contradict.
 
         Args:
             state: of the tracker.
-            places: sums of all frames.
-            seen: by the frames of each camera.
+            sums: over its summaries and live frames.
         """
-        live = state.live_frames[-1:]
-        touched = {frame.place for frame in (*state.epochs[-1].frames, *live)}
-        names, kept = self.sums.names, NO_ROWS
-        if len(places.names) == 1:  # the weights of a preset of the paper
-            touched = set(places.names)
-        else:
-            kept = tuple(i for i, row in enumerate(self.rows) if names[row] not in touched)
-        present = np.flatnonzero(places.frames.any(axis=1))
-        rows = [int(row) for row in present if places.names[row] in touched]
-        if not rows and kept:  # the scan distortion needs a place
-            kept, rows = kept[:-1], [places.names.index(names[self.rows[kept[-1]]])]
+        frames = state.epochs[-1].frames
+        every = self.sums.add(parts_of(frames, steps_of(state)))
+        every, earlier = (_with_drifting(state, sums, own) for own in (every, self.linear))
+        seen = self.seen if self.is_settled(state) else FrameSpread.of(state, every)
+        if state.config.preset == "auto":
+            kept, rows = self._split(every, {f.place for f in (*frames, *state.live_frames[-1:])})
+        else:  # the weights of a preset of the paper
+            earlier = every = every.bounded(most=0)
+            frames, kept, rows = (), NO_ROWS, [0] if every.frames.any() else []
         if kept not in self._summaries:
             chosen = [self.marginals[i] for i in kept]
             self._summaries[kept] = summary_factor(chosen, self.fit.linear.values)
-        model = place_model(state, places, seen, rows)
+        data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
+        model = place_model(state, every, seen, data)
         model = replace(model, pose_graph=self._summaries[kept])
-        values = self._start(state, model)
-        return _fit(state, places, model, values, pose_graphs=self._pose_graphs)
+        values = _start(state, model, data.names)
+        fit, _, conflicts = _fit(state, every, model, values, pose_graphs=self._pose_graphs)
+        return fit, conflicts
 
-    def _start(self, state: State, model: LatentPoseModel) -> gtsam.Values:
-        """What all places share as at the optimum, the places where they are expected by it."""
-        values, closed = start_values(model, _by_name(state)), self.fit.linear.values
-        for key in model.shared_keys:
-            if closed.exists(key) and key != DISTORTION:
-                values.update(key, closed.atPose3(key))
-        if model.is_distorted and closed.exists(DISTORTION):
-            values.update(DISTORTION, closed.atVector(DISTORTION))
-        for place, camera in model.matched_places():
-            values.update(matched_at_key(place, camera), values.atPose3(matched_key(camera)))
-        cloud = values.atPose3(CLOUD)
-        for place in range(model.places):
-            values.update(cloud_at_key(place), cloud)
-        return values
+    def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
+        """Which of the closed places a summary stands for, and the rows of the other places."""
+        names, present = self.data.names, np.flatnonzero(every.frames.any(axis=1))
+        kept = tuple(i for i, name in enumerate(names) if name not in touched)
+        rows = [int(row) for row in present if every.names[row] in touched]
+        if not rows and kept:  # the scan distortion needs a place
+            kept, rows = kept[:-1], [every.names.index(names[kept[-1]])]
+        return kept, rows
+
+
+def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFit) -> PlaceSums:
+    """The sums with the quadratics that all matches have at the pose of their place in a fit."""
+    gradient, reweighted = np.zeros_like(sums.gradient), np.zeros_like(sums.reweighted)
+    values, count = fit.linear.values, len(data.rows)
+    clouds = poses_of(values, map(cloud_at_key, range(count)))
+    for camera, matches in data.cameras.items():
+        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
+        keys = [matched_at_key(int(place), camera) for place in places]
+        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
+        here = matches.sums(T_camera_cloud)
+        for place, row in zip(places, data.rows[places], strict=True):
+            pose = to_T_lidar_camera(T_camera_cloud[place])
+            step = step_between(pose, state.references[camera])
+            reweighted[row, camera] = here.hessian[place]
+            gradient[row, camera] = here.gradient[place] + here.hessian[place] @ step
+    return replace(sums, hessian=reweighted, gradient=gradient, reweighted=reweighted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,30 +210,25 @@ def joint_estimate(state: State, sums: Posterior, closed: ClosedPlaces) -> Joint
     """
     if closed.findings != state.findings:
         closed = ClosedPlaces.of(state)
-    places = _with_open_epoch(state, sums, closed)
-    seen = closed.seen if closed.is_settled(state) else FrameSpread.of(state, places)
-    fit, conflicts = closed.fit_with(state, places, seen)
-    estimates = state.T_lidar_camera
-    shown = fit.linear.model.components.distortion_vector.any()
-    several = state.rig.relative_poses or shown or not places.is_of_one_place
-    if state.config.preset == "auto" and several:
-        estimates = fit.T_lidar_camera
+    fit, conflicts = closed.fit_with(state, sums)
+    estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
     covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
 
 
-def with_sizes(state: State) -> State:
-    """The state with the variance ratios that its closed epochs show."""
+def close_places(state: State) -> tuple[State, ClosedPlaces]:
+    """The state with the optimum of its closed epochs, and the variance ratios that these show."""
+    closed = ClosedPlaces.of(state)
     for _ in range(_ROUNDS):
-        closed = ClosedPlaces.of(state)
         if closed.sums.is_of_one_place and not state.rig.relative_poses:
-            return state
+            break
         found = estimate_variance_ratios(closed.fit, state.sizes)
         if found.is_near(state.sizes):
             break
-        state = replace(state, sizes=found)
-    return state
+        state = replace(state, sizes=found, optimum=closed.optimum)
+        closed = ClosedPlaces.of(state)
+    return replace(state, optimum=closed.optimum), closed
 
 
 def _fit(
@@ -215,7 +238,7 @@ def _fit(
     values: gtsam.Values,
     *,
     pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-) -> tuple[LatentPoseFit, Conflicts]:
+) -> tuple[LatentPoseFit, Rows, Conflicts]:
     """The optimum with priors and relative poses, and the conflicts of these with the data.
 
     Args:
@@ -228,14 +251,23 @@ def _fit(
     conflicts = _conflicts(state, sums, model, values)
     limit = error_components().contradiction_sigmas
     dropped = tuple(place for place, one in conflicts.items() if one.largest > limit)
+    fit = fit_latent_poses(_with_pose_graph(state, model, dropped, pose_graphs), values)
+    if fit is None:
+        raise RuntimeError("a direction of a camera is not determined")
+    return fit, dropped, conflicts
+
+
+def _with_pose_graph(
+    state: State,
+    model: LatentPoseModel,
+    dropped: Rows,
+    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
+) -> LatentPoseModel:
+    """The model with the priors, without contradicting relative poses."""
     if dropped not in pose_graphs:
         without = tuple(sorted({*state.dropped_pairs, *dropped}))
         pose_graphs[dropped] = pose_priors(replace(state, dropped_pairs=without))
-    model = replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
-    fit = fit_latent_poses(model, values, relative_tolerance=_TOLERANCE)
-    if fit is None:
-        raise RuntimeError("a direction of a camera is not determined")
-    return fit, conflicts
+    return replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
 
 
 def _conflicts(
@@ -272,10 +304,15 @@ def _conflicts(
     }
 
 
-def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> PlaceSums:
-    """The sums over all frames; those of a camera that drifts at the present place."""
-    frames = state.epochs[-1].frames
-    places = closed.sums.add(parts_of(frames, steps_of(state)))
+def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:
+    """Values near the optimum of a model, of places of these names."""
+    if state.optimum is None:
+        return start_values(model, _by_name(state))
+    return state.optimum.values(model, names, state.references)
+
+
+def _with_drifting(state: State, sums: Posterior, places: PlaceSums) -> PlaceSums:
+    """The sums of places, with those of cameras that drift at the present one."""
     live = state.live_frames
     for camera, one in enumerate(state.cameras):
         if one.summary.walk and live:
@@ -288,7 +325,7 @@ def _with_open_epoch(state: State, sums: Posterior, closed: ClosedPlaces) -> Pla
             )
             used = state.matches_of_frame(camera)
             places = places.with_camera_at(live[-1].place, camera, own, used)
-    return places if state.config.preset == "auto" else places.bounded(most=0)
+    return places
 
 
 def _rows(cameras: Sequence[int]) -> NDArray[np.intp]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.bends import BendSums
 
@@ -118,3 +118,12 @@ class OutlierFrame:
     number: int
     raw: CameraBlock
     T_lidar_camera: gtsam.Pose3
+
+
+def inliers_of(frames: Iterable[LiveFrame], camera: int) -> CameraBlock | None:
+    """A camera's matches within the gate, of frames; None if there are none."""
+    own = [frame for frame in frames if camera in frame.raw]
+    if not own:
+        return None
+    rows = np.concatenate([frame.inliers[camera] for frame in own])
+    return merge([frame.raw[camera] for frame in own]).select(rows)

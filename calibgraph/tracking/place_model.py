@@ -1,34 +1,39 @@
-"""The error model of the batch (``calibgraph.graph.latent_poses``) on sums over places.
+"""The error model of the batch (``calibgraph.graph.latent_poses``) while frames come in.
 
-A camera's matches at a place are one quadratic. The places that no frame of the open epoch is of
-are one ``HessianFactor``, their marginal on the cloud and the cameras as matches show them.
+Matches that are kept are the batch's factors. Those of earlier frames are a quadratic per camera
+and place. The places that no frame of the open epoch is of are one ``HessianFactor``, their
+marginal on the cloud and the cameras as matches show them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.by_place import QuadraticByPlace
+from calibgraph.graph.by_place import BlockByPlace, QuadraticByPlace, SummarizedByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian
+from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
+from calibgraph.tracking.epoch_summary import step_between
+from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
 
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
@@ -39,13 +44,12 @@ class FrameSpread:
     """What the frames of each camera show of their errors.
 
     Attributes:
-        root: (n, 6, 6) R: with L L^T the reweighted Hessian, the true one is L R R^T L^T; the sums
-            over a place are too few for a true Hessian of its own.
         covariance: (n, 6, 6) K of ``calibgraph.solver.within_place``.
+        efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
     """
 
-    root: Array
     covariance: Array
+    efficiency: Array
 
     @staticmethod
     def of(state: State, sums: PlaceSums) -> FrameSpread:
@@ -58,7 +62,7 @@ class FrameSpread:
         scatter, frames, left = sums.of_all
         hessian, reweighted = sums.hessian.sum(axis=0), sums.reweighted.sum(axis=0)
         matches = sums.matches.sum(axis=0)
-        found = FrameSpread(*np.tile(np.eye(6), (2, len(frames), 1, 1)))
+        found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
         correlation = error_components().frame_correlation
         for camera in np.flatnonzero(frames):
             count, seen = frames[camera], left[camera] + 1.0
@@ -71,24 +75,66 @@ class FrameSpread:
             whole = with_pseudo_frames(own, true, np.full(6, seen), usual) * count / seen
             outer = np.linalg.cholesky(reweighted[camera] + WEAK)
             inverse = np.linalg.inv(true + WEAK)
-            found.root[camera] = np.linalg.cholesky(_whiten(outer, true + WEAK))
+            found.efficiency[camera] = np.trace(outer.T @ inverse @ outer) / 6
             found.covariance[camera] = outer.T @ inverse @ whole @ inverse @ outer
         return found
 
     def within(self, sums: PlaceSums, camera: int, rows: Numbers) -> WithinPlace:
         """As of a batch, of some places."""
-        inverse = np.linalg.inv(self.root[camera])
         return WithinPlace.of(
             self.covariance[camera],
-            float(np.square(inverse).sum()) / 6,
+            float(self.efficiency[camera]),
             roots=np.linalg.cholesky(sums.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
 
 
+@dataclass(frozen=True, eq=False)
+class PlaceData:
+    """The matches of some places, as if all were independent.
+
+    Attributes:
+        names: of the places.
+        rows: (p,) theirs, in the sums over all frames.
+        cameras: per camera (by its place in the rig) that has some.
+    """
+
+    names: Sequence[str]
+    rows: Numbers
+    cameras: Mapping[int, Data]
+
+    @staticmethod
+    def of(
+        state: State, earlier: PlaceSums, frames: Sequence[LiveFrame], places: Mapping[str, int]
+    ) -> PlaceData:
+        """Of frames whose matches are kept, and the sums over earlier ones.
+
+        Args:
+            state: of the tracker.
+            earlier: those sums; those of a camera that drifts are over all frames.
+            frames: the others.
+            places: the rows by their names.
+        """
+        numbers = [
+            np.array([frame.number for frame in frames if frame.place == name], dtype=np.int64)
+            for name in places
+        ]
+        kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
+        for camera, one in enumerate(state.cameras):
+            quadratic = _quadratic(state, earlier, camera, [*places])
+            own = None if one.summary.walk else inliers_of(kept, camera)
+            if own is not None:
+                block = block_by_place(own, one.scale, numbers)
+                several = len(quadratic.places) > 0
+                cameras[camera] = SummarizedByPlace(quadratic, block) if several else block
+            elif len(quadratic.places):
+                cameras[camera] = quadratic
+        return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
+
+
 def place_model(
-    state: State, sums: PlaceSums, seen: FrameSpread, rows: Sequence[int]
+    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData
 ) -> LatentPoseModel:
     """The graph of some places, without any prior of a camera.
 
@@ -96,16 +142,14 @@ def place_model(
         state: of the tracker.
         sums: of all frames.
         seen: by the frames of each camera.
-        rows: of ``sums``, the places.
+        data: the matches of the places.
     """
-    chosen, names = np.asarray(rows, dtype=np.int64), state.names
+    chosen, names = data.rows, state.names
     blocks, shown = {}, {}
-    for camera in np.flatnonzero(sums.frames.any(axis=0)):
-        name, within = names[camera], seen.within(sums, int(camera), chosen)
-        quadratic = _quadratic(state, sums, seen.root[camera], int(camera), rows=chosen)
-        information = quadratic.information / within.least
-        blocks[name] = replace(quadratic, information=information)
-        shown[name] = within, _distortion(state, int(camera), len(chosen))
+    for camera, matches in data.cameras.items():
+        within = seen.within(sums, camera, chosen)
+        blocks[names[camera]] = matches.with_variance(within.least)
+        shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
     alike = np.where(sums.frames[chosen] > 0, sums.places[chosen], np.inf).min(axis=1)
     clouds = components.cloud_at_place / alike[:, None, None]
@@ -153,16 +197,35 @@ def summary_factor(
 
 
 def _quadratic(
-    state: State, sums: PlaceSums, root: Array, camera: int, *, rows: Numbers
+    state: State, sums: PlaceSums, camera: int, names: Sequence[str]
 ) -> QuadraticByPlace:
-    """The matches of a camera, as if all were independent."""
-    present = np.flatnonzero(sums.frames[rows, camera])
-    reweighted = sums.reweighted[rows[present], camera] + WEAK
-    outer = np.linalg.cholesky(reweighted) @ root
-    pull = -sums.gradient[rows[present], camera][..., None]
-    steps = np.linalg.solve(outer.swapaxes(1, 2), np.linalg.solve(outer, pull))[..., 0]
-    poses = [state.references[camera].retract(step) for step in steps]
-    return QuadraticByPlace(present, poses, reweighted)
+    """The quadratics of a camera at some places.
+
+    As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
+    last epoch, and the Hessian by the weights of the matches there.
+    """
+    rows = {name: row for row, name in enumerate(sums.names) if sums.frames[row, camera]}
+    places = np.array([place for place, name in enumerate(names) if name in rows], dtype=np.int64)
+    own, poses = [rows[names[place]] for place in places], []
+    for row in own:
+        true, gradient = sums.hessian[row, camera], sums.gradient[row, camera]
+        pose = _pose_at(state, sums.names[row], camera)
+        if pose is None:
+            true = convex_hessian(true, sums.reweighted[row, camera])
+            step = np.linalg.solve(true + WEAK, -gradient)
+        else:
+            step = step_between(state.references[camera], pose)
+            information = sums.reweighted[row, camera] + WEAK
+            step = step - np.linalg.solve(information, gradient + true @ step)
+        poses.append(state.references[camera].retract(step))
+    return QuadraticByPlace(places, poses, sums.reweighted[own, camera] + WEAK)
+
+
+def _pose_at(state: State, place: str, camera: int) -> gtsam.Pose3 | None:
+    """Of a place at the optimum of the last epoch; None if a camera drifts, or was not there."""
+    if state.optimum is None or state.cameras[camera].summary.walk:
+        return None
+    return state.optimum.pose_at(place, camera)
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:
@@ -187,12 +250,6 @@ def _count(sums: PlaceSums) -> float:
     """Number of places."""
     older = sums.places[0].max() if sums.frames[0].any() else 0.0
     return float(np.count_nonzero(sums.frames[1:].any(axis=1)) + older)
-
-
-def _whiten(root: Array, matrix: Array) -> Array:
-    """(6, 6) R^-1 M R^-T of a symmetric M."""
-    found = np.linalg.solve(root, np.linalg.solve(root, matrix).T)
-    return np.asarray((found + found.T) / 2)
 
 
 def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -> Array:

@@ -27,6 +27,7 @@ from calibgraph.tracking.noise import (
     no_groups,
     widening,
 )
+from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 
 Array = NDArray[np.float64]
@@ -123,6 +124,7 @@ class State:
         bends: what the matches of older epochs have to do with bends of the cloud.
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
+        optimum: of the graph of the closed epochs; None where it is not known.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -143,6 +145,7 @@ class State:
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
+    optimum: Optimum | None = None
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0

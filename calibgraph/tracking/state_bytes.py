@@ -36,6 +36,7 @@ from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
+from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
@@ -51,7 +52,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, BendSums, MatcherFindings, VarianceRatios,
+                 EpochSummary, PlaceSums, Optimum, BendSums, MatcherFindings, VarianceRatios,
                  ResidualHistogram, ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
 }  # fmt: skip
 _DATACLASSES["Sizes"] = VarianceRatios  # its name in earlier releases

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -34,7 +35,7 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import ClosedPlaces, with_sizes
+from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
@@ -112,7 +113,19 @@ class IncrementalCalibrator:
 
     def calibration(self) -> Calibration:
         """The present estimate as a result of the same type as a batch solve's."""
-        return to_calibration(self._state)
+        return to_calibration(self._state, self._assess())
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
+
+        Its variables are those of ``calibgraph.graph.variables``. Places that no frame of the open
+        epoch is of are one factor. With a preset of the paper it is Eq. 5, whose optimum alone is
+        reported.
+        """
+        if self.config.preset != "auto":
+            return self._window.graph
+        return latent_pose_graph(self._assess().fit.linear.model)
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
@@ -227,18 +240,18 @@ class IncrementalCalibrator:
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
 
-    def _resume(self, state: State) -> None:
+    def _resume(self, state: State, closed: ClosedPlaces | None = None) -> None:
         """Continue from a state: at the start, at each new epoch, and after an error."""
         self._state = state
         self._epoch_start = state
         self._since_epoch_start = []
-        self._rebuild()
+        self._rebuild(closed)
 
-    def _rebuild(self) -> None:
+    def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
+        self._closed_places = closed or ClosedPlaces.of(self._state, at_optimum=True)
         self._window = Window(self._state)
         self._copy_estimates()
-        self._closed_places = ClosedPlaces.of(self._state)
         self._closed = closed_posterior(self._state)
         self._closed_halves = SplitHalf.of_closed_epochs(self._state)
 
@@ -317,5 +330,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(with_sizes(self._state))
+        self._resume(*close_places(self._state))
         return events

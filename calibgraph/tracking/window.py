@@ -22,9 +22,9 @@ import numpy as np
 from calibgraph.graph.objective import join, objective_graph, pose_key
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import RelativePose
-from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.tracking.epoch_summary import STRENGTHS
-from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.state import State
 from factors import ProjectionBlock, block_factor
 
@@ -57,6 +57,15 @@ class Window:
         self._added: dict[int, ProjectionBlock] = {}
         self._places: dict[int, int] = {}
         self._tried: tuple[int, ...] = ()
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Its factors."""
+        held, graph = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for index in range(held.size()):
+            if held.exists(index):  # others were removed
+                graph.push_back(held.at(index))
+        return graph
 
     def fit(self, blocks: Mapping[int, ProjectionBlock]) -> None:
         """The first pass of a frame: one step with its blocks."""
@@ -112,10 +121,9 @@ class Window:
                 if camera in frame.raw:
                     seen.setdefault(self._key(place, camera), []).append(frame)
         return {
-            key: merge([frame.raw[camera] for frame in frames]).select(
-                np.concatenate([frame.inliers[camera] for frame in frames])
-            )
+            key: block
             for key, frames in seen.items()
+            if (block := inliers_of(frames, camera)) is not None
         }
 
     def _summary_graph(self, state: State) -> gtsam.NonlinearFactorGraph:

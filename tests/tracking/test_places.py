@@ -19,10 +19,13 @@ from calibgraph import (
     concatenate,
     simulate_correspondences,
 )
+from calibgraph.graph.variables import camera_key
 from calibgraph.model.geometry import (
     adjoint_camera_lidar,
     relative_covariance,
     relative_transform,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
     twist_between,
 )
 from calibgraph.simulation.place_draws import Drawn, draw_places, tied
@@ -35,7 +38,7 @@ from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.joint_estimate import ClosedPlaces
-from calibgraph.tracking.place_model import FrameSpread, place_model
+from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
 from calibgraph.tracking.place_shift import shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, parts_of
 from calibgraph.tracking.posterior import steps_of
@@ -82,9 +85,9 @@ def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
     ("places", "frames", "rounds"), [(1, 20, 1), (2, 10, 1), (6, 5, 1), (3, 5, 2)]
 )
 def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, tie: bool) -> None:
-    """Within 0.15 sigma root mean square, and 8 % in the sigmas, of cameras and of the pair.
+    """Within 0.1 sigma root mean square, and 8 % in the sigmas, of cameras and of the pair.
 
-    The graph is the same, with the same losses; a place is a quadratic here.
+    The graph is the same; the gate is drawn at, and the spread measured by, other estimates.
     """
     drawn = drawn_of(places, frames, rounds, tie=tie)
     T, joint = batch_of(drawn)
@@ -93,7 +96,7 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     assert found is not None
     apart = [twist_between(result.T_camera_lidar[name], T[name]) for name in T]
     sigmas = np.sqrt(np.diag(joint))
-    assert np.sqrt(np.mean(np.square(np.concatenate(apart) / sigmas))) < 0.15
+    assert np.sqrt(np.mean(np.square(np.concatenate(apart) / sigmas))) < 0.1
     np.testing.assert_allclose(np.sqrt(np.diag(found)), sigmas, rtol=0.08)
     np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.08)
 
@@ -190,11 +193,12 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
     sums = PlaceSums.empty(2).add([replace(part("a", 0), gradient=np.zeros((2, 6)))])
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
-    seen = FrameSpread(np.tile(np.eye(6), (2, 1, 1)), spread)
+    seen = FrameSpread(spread, np.ones(2))
     shifts = np.random.default_rng(0).normal(size=(2, 6, 3))
     bends = replace(BendSums.empty(2), hessian=np.tile(np.eye(6), (2, 1, 1)))
     bends = replace(bends, pull=(bends.hessian + WEAK) @ shifts)
-    model = place_model(replace(tracker._state, bends=bends), sums, seen, [1])
+    state = replace(tracker._state, bends=bends)
+    model = place_model(state, sums, seen, PlaceData.of(state, sums, (), {"a": 1}))
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
     assert found is not None
     parts, A = model.components, [*map(adjoint_camera_lidar, tracker._state.references)]
@@ -210,22 +214,65 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     np.testing.assert_allclose(found.covariance / units, expected / units, atol=1e-3)
 
 
+def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalCalibrator, Update]:
+    drawn = drawn_of(3, 5, 2, tie=True)
+    tracker = IncrementalCalibrator(drawn.rig, Config(**config))
+    for frame in range(frames):
+        update = tracker.update(drawn.table.select(drawn.table.frame == frame))
+    return tracker, update
+
+
+def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
+    """By GTSAM's LM and Marginals: within 0.01 sigma, and a thousandth of the covariance."""
+    tracker, update = tracked_at_three_places(24)
+    linear, graph = tracker._assess().fit.linear, tracker.graph
+    start, keys = linear.values, linear.model.reported_keys
+    values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    marginals = gtsam.Marginals(graph, values)
+    for camera, name in enumerate(("left", "right")):
+        reported = update.covariance[name]
+        assert reported is not None
+        found = marginals.marginalCovariance(keys[camera])
+        np.testing.assert_allclose(
+            found,
+            reported,
+            atol=1e-3 * np.sqrt(np.outer(np.diag(reported), np.diag(reported))).max(),
+        )
+        T = to_T_camera_lidar(values.atPose3(keys[camera]))
+        apart = twist_between(update.T_camera_lidar[name], T) / np.sqrt(np.diag(reported))
+        assert np.abs(apart).max() < 0.01
+
+
+def test_with_a_preset_of_the_paper_the_graph_is_equation_5() -> None:
+    tracker, update = tracked_at_three_places(12, preset="kitti")
+    graph, values = tracker.graph, gtsam.Values()
+    for camera, T in enumerate(update.T_camera_lidar.values()):
+        values.insert(camera_key(camera), to_T_lidar_camera(T))
+    assert graph.keyVector() == [camera_key(0), camera_key(1)]
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    for camera, (name, T) in enumerate(update.T_camera_lidar.items()):
+        own, covariance = (
+            to_T_camera_lidar(found.atPose3(camera_key(camera))),
+            update.covariance[name],
+        )
+        assert covariance is not None
+        assert np.abs(twist_between(own, T) / np.sqrt(np.diag(covariance))).max() < 0.01
+
+
 def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     """Places that the open epoch does not touch are one factor there.
 
     Within 0.02 sigma: their losses have the weights of the optimum at the end of the last epoch.
     """
-    drawn = drawn_of(3, 5, 2, tie=True)
-    tracker = IncrementalCalibrator(drawn.rig)
-    for frame in range(24):
-        update = tracker.update(drawn.table.select(drawn.table.frame == frame))
-    state, closed = tracker._state, tracker._closed_places
+    tracker, update = tracked_at_three_places(24)
+    state, closed, joint = tracker._state, tracker._closed_places, tracker._assess()
     places = closed.sums.add(parts_of(state.epochs[-1].frames, steps_of(state)))
-    joint = tracker._assess()
-    seen = closed.seen if closed.is_settled(state) else FrameSpread.of(state, places)
-    model = place_model(state, places, seen, [1, 2, 3])
+    data = PlaceData.of(
+        state, state.places, state.live_frames, {places.names[row]: row for row in (1, 2, 3)}
+    )
+    model = place_model(state, places, FrameSpread.of(state, places), data)
     model = replace(model, pose_graph=pose_priors(state))
-    whole = fit_latent_poses(model, start_values(model, drawn.rig.T_camera_lidar))
+    whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
     assert whole is not None
     sigmas = np.sqrt(np.diag(whole.covariance)).reshape(2, 6)
     for own, (name, T) in zip(sigmas, whole.T_camera_lidar.items(), strict=True):
