@@ -37,7 +37,7 @@ coverage: $(VENV)/test ## Measure the branches of graph, solver, trust and facto
 	$(PYTEST) --cov --cov-report term tests/factors tests/solver tests/trust
 
 test-ci: $(VENV)/test ## Run a short choice of the slow tests
-	$(PYTEST) -m ci
+	$(PYTEST) -m ci $$(grep -rl --include='test_*.py' 'mark\.ci' tests)
 
 test-slow: $(VENV)/test ## Run the slow tests, on real data too, and the statistics (many minutes)
 	$(PYTEST) -m "slow or realdata or statistics"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, Call
 
 EVALUATE = f"evaluate {SAMPLE} {SAMPLE}/reference.yaml"
 
@@ -37,10 +38,14 @@ def test_a_reader_that_has_gone_is_no_error(
 
 
 @pytest.mark.parametrize(
-    ("to", "message"), [(">&-", "is closed"), ("> /dev/full", "cannot be written to")]
+    ("to", "message"), [(None, "is closed"), ("/dev/full", "cannot be written to")]
 )
-def test_json_that_cannot_be_printed_is_one_line(to: str, message: str) -> None:
-    code, stderr = run_in_shell(f"{EVALUATE} --json {to}")
+def test_json_that_cannot_be_printed_is_one_line(
+    to: str | None, message: str, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open(to, "w") if to else nullcontext() as stdout, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", stdout)
+        code, _, stderr = call(*EVALUATE.split(), "--json")
     assert code == 2
     assert stderr.startswith("calibgraph: standard output") and message in stderr
     assert stderr.count("\n") == 1
