@@ -57,7 +57,7 @@ Rows = tuple[int, ...]
 NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
-_ROUNDS = 3  # of fits and estimates of the variance ratios, as in a batch
+_ROUNDS = 2  # of fits and estimates of the variance ratios; the next epoch goes on from there
 
 
 @dataclass(frozen=True, eq=False)
