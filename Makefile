@@ -2,8 +2,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# Compiled modules are kept also where the environment forbids it: each process would compile them all.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .PHONY: help install run test coverage test-ci test-slow lint type docs web bench clean
@@ -33,11 +36,11 @@ test: $(VENV)/test ## Run the tests
 coverage: $(VENV)/test ## Measure the branches of graph, solver, trust and factors that their tests reach
 	$(PYTEST) --cov --cov-report term tests/factors tests/solver tests/trust
 
-test-ci: $(VENV)/test ## Run a short choice of the slow tests (about 3 minutes)
-	$(PYTEST) --dist worksteal -m ci
+test-ci: $(VENV)/test ## Run a short choice of the slow tests
+	$(PYTEST) -m ci
 
 test-slow: $(VENV)/test ## Run the slow tests, on real data too, and the statistics (many minutes)
-	$(PYTEST) --dist worksteal -m "slow or realdata or statistics"
+	$(PYTEST) -m "slow or realdata or statistics"
 
 lint: type ## Check style, types and the layers
 	$(BIN)/ruff check .

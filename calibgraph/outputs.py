@@ -11,10 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_file
 
 _PNG_HEADER_BYTES = 33  # signature and IHDR
 _SEARCHED_BYTES = 2**20  # at the beginning, and at the end: Parquet has its metadata there
+PAGE_MARK = b'<meta name="generator" content="calibgraph">'
+AUDIT_PAGE_MARK = b'<meta name="generator" content="calibgraph check">'
+DOT_MARK = "// calibgraph graph"
+VIEW_MARK = "calibgraph-view"
+WEIGHTS_MARK = "calibgraph-cmrnext/1"
 _DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
 
 
@@ -59,6 +63,8 @@ def require_writable(outputs: Iterable[Output], read: Iterable[Path] = ()) -> No
     Raises:
         FileError: if one of the outputs cannot be written, is read, or exists and is not ours.
     """
+    from calibgraph.files import require_place_for_file  # the help of commands needs none of it
+
     read = [path for path in read if path.exists()]
     for output in outputs:
         path = output.path

@@ -18,6 +18,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
@@ -144,6 +145,9 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
+        pair_covariance=pair_covariances(
+            evidence.mount_covariance, solution.T_camera_lidar, solution.held
+        ),
         camera_verdicts=verdicts,
         residuals=evidence.residuals,
         counts={name: dict(counts) for name, counts in solution.counts.items()},

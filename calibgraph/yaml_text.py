@@ -93,6 +93,7 @@ def describe_value(value: object) -> str:
 
 
 _FastLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_FastDumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
@@ -151,7 +152,7 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _construct_number)
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(_FastDumper):  # type: ignore[misc, valid-type]
     """YAML with numpy values, and sequences of plain numbers on one line."""
 
     def ignore_aliases(self, data: object) -> bool:

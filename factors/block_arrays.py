@@ -1,7 +1,5 @@
 """Shared by blocks of correspondences: the scale of the loss, and read-only arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Self, TypeVar
 

@@ -1,7 +1,5 @@
 """The sums H, b and c of a block of correspondences, and the root that GTSAM is given."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ constants that the file imports, nor the options, so that a kernel with and one 
 taken for each other. Here the name of a file holds the fingerprint of all of these.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import logging

@@ -1,7 +1,5 @@
 """Hessians of poses in units in which radians and metres can be compared: with a unit diagonal."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

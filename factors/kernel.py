@@ -5,8 +5,6 @@ tile goes through a few loops that the compiler vectorizes: ``kernel_projection`
 and derivatives, ``kernel_sums`` weighs and adds them up.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 

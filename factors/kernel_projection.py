@@ -5,8 +5,6 @@ the rows that are taken out before a loop, and Python's exception on a division 
 ``error_model="numpy"``.
 """
 
-from __future__ import annotations
-
 from factors.compiled import compiled
 from factors.lens_kernels import MIN_DEPTH_M, project_one, subtract_columns
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z

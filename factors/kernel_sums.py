@@ -1,7 +1,5 @@
 """The sums over a tile: whitening, the loss and its weights, and the 28 sums of H, b and c."""
 
-from __future__ import annotations
-
 import math
 
 from factors.compiled import compiled

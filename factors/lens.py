@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -76,7 +77,7 @@ class Lens:
             ValueError: on another number of coefficients, or a focal length that is not positive.
         """
         coefficients = _checked(fx, fy, distortion, "pinhole")
-        limit = _radtan_limit(coefficients)
+        limit = _radtan_limit(tuple(coefficients.tolist()))
         kind = RADTAN if np.any(coefficients) else PINHOLE
         return Lens(kind, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
 
@@ -197,11 +198,14 @@ def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
     return float(real.min()) if len(real) else math.inf
 
 
-def _radtan_limit(coefficients: Array) -> float:
+@lru_cache(maxsize=64)  # the same few lenses are built for every copy of a rig
+def _radtan_limit(coefficients: tuple[float, ...]) -> float:
     """Radius at which d/dr [r N(r^2) / D(r^2)] first vanishes or D does, without tangential terms.
 
     At most the radius of a ray 85 degrees off the axis: polynomials are not fitted beyond.
     """
+    if not any(coefficients):
+        return math.inf
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
     denominator = np.polynomial.Polynomial([1.0, k4, k5, k6])
@@ -210,7 +214,7 @@ def _radtan_limit(coefficients: Array) -> float:
         numerator.deriv() * denominator - numerator * denominator.deriv()
     )
     root = math.sqrt(min(_smallest_positive_root(p.coef) for p in (slope, denominator)))
-    return min(root, math.tan(_MAX_RADTAN_ANGLE_RAD)) if np.any(coefficients) else math.inf
+    return min(root, math.tan(_MAX_RADTAN_ANGLE_RAD))
 
 
 def _fisheye_limit(coefficients: Array) -> float:

@@ -1,7 +1,5 @@
 """The projections of the lens models, as kernels: which kinds there are, and their formulas."""
 
-from __future__ import annotations
-
 import math
 
 from factors.compiled import compiled

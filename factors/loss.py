@@ -6,8 +6,6 @@ exactly zero beyond, so far outliers do not pull at all, and a start from which 
 beyond the bound gives no gradient and cannot be improved. Start such a solve with Cauchy.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal, get_args
 

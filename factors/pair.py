@@ -14,8 +14,6 @@ Where the range follows the pose of A (``factors.surface``), both poses enter, a
 square root has 13 rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import gtsam

@@ -4,8 +4,6 @@ All act on variables ``X = T_lidar_camera``. GTSAM's cost is half the squared wh
 paper weight lambda is a sigma of 1 / sqrt(lambda).
 """
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

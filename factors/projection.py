@@ -4,8 +4,6 @@ It is the method in stock GTSAM terms, and the reference in tests of the block f
 Python call per correspondence; use ``factors.block`` for real work.
 """
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

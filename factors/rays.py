@@ -1,7 +1,5 @@
 """Viewing rays of pixels: the inverse of :class:`factors.lens.Lens`, for any lens."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -3,8 +3,6 @@
 A tile is a (ROWS, TILE) array; each row holds one quantity, so that the loops over it vectorize.
 """
 
-from __future__ import annotations
-
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 """The arithmetic that LLVM may assume; NaN and infinity keep their meaning."""
 

@@ -6,8 +6,6 @@ centre, and is distorted there as by a pinhole's lens. OpenCV's ``omnidir`` and 
 are the same.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

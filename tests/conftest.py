@@ -24,7 +24,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.report import plots
-from calibgraph.trust import image_checks
+from calibgraph.trust import assess, image_checks, inputs
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -151,17 +151,23 @@ def calibrate_sample(folder: Path) -> CommandRun:
 
 @pytest.fixture
 def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Build the diagrams of reports without drawing them, for tests of all else.
+    """Do not draw the diagrams of reports, for tests of all else.
 
     Session fixtures such as ``calibrated_sample`` are made before, with drawn ones.
     """
-    monkeypatch.setattr(plots, "to_data_uri", lambda figure: "data:image/png;base64,")
+    for name in (
+        "convergence", "coverage", "distances", "error_bars", "residual_by_distance",
+        "residual_map", "residual_scatter",
+    ):  # fmt: skip
+        monkeypatch.setattr(plots, name, lambda *_: "data:image/png;base64,")
 
 
 @pytest.fixture
-def no_time_offsets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not track images in the images before and after, for tests of all else."""
-    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
+def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not check results and guesses against the images, for tests of all else."""
+    monkeypatch.setattr(image_checks, "check_images", lambda *_, **__: {})
+    for module in (assess, inputs):
+        monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
 
 
 def make_pair() -> Rig:

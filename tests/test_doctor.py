@@ -40,6 +40,7 @@ def test_the_sample_has_nothing_to_fix(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Path) -> None:
     (folder / "cameras/left/000002.jpg").unlink()
     for name in ("000000", "000001"):
@@ -63,6 +64,7 @@ def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Pat
     assert not (folder / "pictures").exists()
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
     shutil.copy(folder / "lidar/000001.npy", folder / "lidar/000004.npy")
     for name in ("000003", "000005"):
@@ -80,6 +82,7 @@ def test_repeated_clouds_and_images_are_named(folder: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
     for camera in (folder / "cameras").iterdir():
         for name in ("000003", "000004"):
@@ -135,6 +138,7 @@ def test_clouds_in_other_units_are_named_with_their_distance(
     assert texts(diagnose([folder]), "warning") == [f"median distance of the points {expected}"]
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_clouds_joined_with_a_wrong_extrinsic_are_named_with_how_far_apart(folder: Path) -> None:
     def join(cloud: np.ndarray) -> np.ndarray:
         moved = cloud.copy()
@@ -147,6 +151,7 @@ def test_clouds_joined_with_a_wrong_extrinsic_are_named_with_how_far_apart(folde
     assert "deg and 0.3 m apart: clouds joined with a wrong extrinsic" in warning
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     call: Call, folder: Path
 ) -> None:
@@ -162,6 +167,7 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     assert "no such folder or ROS bag" in err
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Call) -> None:
     """Mend, run again: also with another rig; a picture of the user's stays."""
     given = ("doctor", SAMPLE, "--out", tmp_path / "pictures")

@@ -98,6 +98,7 @@ def test_a_single_camera_is_untouched(data: Dataset, truth: Rig) -> None:
     assert refine_with_camera_pairs(run, no_progress) is run
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: Path) -> None:
     result = calibgraph.calibrate(data, truth, table_of(truth))
     assert result.camera_matches is not None

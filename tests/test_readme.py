@@ -95,7 +95,7 @@ def test_the_table_of_the_last_round_repeats_the_solve(result: calibgraph.Calibr
         assert T.shape == (4, 4)
 
 
-@pytest.mark.usefixtures("no_time_offsets")
+@pytest.mark.usefixtures("no_image_checks")
 def test_a_matcher_and_a_tracker_as_in_the_examples(
     monkeypatch: pytest.MonkeyPatch, folder: Path
 ) -> None:

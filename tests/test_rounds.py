@@ -14,7 +14,7 @@ from tests.conftest import SAMPLE
 from tests.matching.structure.data import with_noise_images
 
 
-@pytest.mark.usefixtures("no_time_offsets")
+@pytest.mark.usefixtures("no_image_checks")
 def test_a_camera_that_nothing_determines_fails_and_the_others_are_calibrated(
     tmp_path: Path,
 ) -> None:

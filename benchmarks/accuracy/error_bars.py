@@ -9,6 +9,7 @@ street --sensor-errors SIZE --vary-layout``, those of the lenses of half the siz
 are to choose by, 116 to 179 are kept out. The second table solves again with the correspondences of
 one, two, five, ten and twenty of a group's streets, as far as it has as many; the third with those
 of five, changed: a relative pose is known, a camera has no matches or few, frames are repeated.
+Errors of cameras are of their alignment, those of pairs of their mounts.
 NEES is the squared error in the metric of its covariance; its mean over 6 should be 1.
 """
 
@@ -26,6 +27,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.accuracy import ledger
+from benchmarks.accuracy.alignment import ALIGNMENT, aligned_rig, mean_poses
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import (
@@ -51,7 +53,6 @@ from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.evidence import Evidence
 
 STREETS = 5
 _FURTHER = 100_000  # seeds of more streets than that
@@ -143,14 +144,17 @@ def run_case(case: Key, scenes: Path) -> Record:
     _, make_rig, beams = RIGS[group % len(RIGS)]
     folder, truth = scenes / f"scene_{case.seed}", make_rig()
     size, rng = float(case.data), np.random.default_rng([7, group])
+    errors = draw_scan_errors(beams, size, rng)
     if not (folder / "rig.yaml").exists():
         shutil.rmtree(folder, ignore_errors=True)
         simulate_street(
             folder, truth, beams=beams, frames=FRAMES, step_m=STEP_M, seed=case.seed,
-            sensor_errors=draw_scan_errors(beams, size, rng), vary_layout=True,
+            sensor_errors=errors, vary_layout=True,
         )  # fmt: skip
+    aligned = aligned_rig(truth, folder, beams, errors).T_camera_lidar
     truth = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
     truth.save(folder / "reference.yaml")
+    truth.moved_to(aligned).save(folder / ALIGNMENT)
     guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
     guess.save(folder / "rig.yaml")
     result = calibrate(load_dataset(folder), guess)
@@ -160,7 +164,7 @@ def run_case(case: Key, scenes: Path) -> Record:
         result.camera_matches.save(folder / "camera_matches.parquet")
     result.rig.save(folder / "result.yaml")
     spreads = {name: r.sigma_px for name, r in result.residuals.items()}
-    return {**ledger.to_record(result, truth), "spread_px": spreads,
+    return {**ledger.to_record(result, truth.moved_to(aligned)), "spread_px": spreads,
             "z_score": dict(result.correspondences.findings.z_score),
             "probability": {n: v.error_probability and v.error_probability.probability
                             for n, v in result.camera_verdicts.items()}}  # fmt: skip
@@ -263,12 +267,14 @@ class Streets:
 
     Attributes:
         truth: the rig as it is.
+        aligned: per camera, the mean of the streets' alignments.
         start: the rig to start from, with relative poses if any are known.
         table: of all streets, with places.
         matches: of pairs of cameras; None without any.
     """
 
     truth: Rig
+    aligned: dict[str, np.ndarray]
     start: Rig
     table: Correspondences
     matches: CameraMatches | None
@@ -288,7 +294,8 @@ def load_streets(folders: Sequence[Path]) -> Streets:
     stated = asdict(error_components().matchers["structure"])  # also where tables are older
     joined = replace(joined, metadata={**joined.metadata, **stated, "places": places})
     matches = concatenate_camera_matches(pairs) if pairs else None
-    return Streets(truth, load_rig(folders[0] / "result.yaml"), joined, matches)
+    aligned = mean_poses([load_rig(folder / ALIGNMENT).T_camera_lidar for folder in folders])
+    return Streets(truth, aligned, load_rig(folders[0] / "result.yaml"), joined, matches)
 
 
 def solve_streets(streets: Streets) -> Iterator[Found]:
@@ -298,17 +305,18 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
         camera_matches=streets.matches,
     )  # fmt: skip
-    joint = Evidence(solved, guess=truth).joint_covariance
-    assert joint is not None
-    errors, T = [], solved.T_camera_lidar
+    joint, mount = solved.covariance, solved.marginals.mount
+    assert joint is not None and mount.covariance is not None
+    errors, T = [], mount.T_camera_lidar
     for place, name in enumerate(T):
         errors.append(twist_between(T[name], truth.cameras[name].T_camera_lidar))
         rows = slice(6 * place, 6 * place + 6)
-        yield _found("camera", errors[-1], joint[rows, rows])
+        error = twist_between(solved.T_camera_lidar[name], streets.aligned[name])
+        yield _found("camera", error, joint[rows, rows])
         if place:
             T_b_a = relative_transform(T[name], T[list(T)[place - 1]])
             between = errors[place] - gtsam.Pose3(T_b_a).AdjointMap() @ errors[place - 1]
-            of_pair = relative_covariance(joint, place - 1, place, T_b_a)
+            of_pair = relative_covariance(mount.covariance, place - 1, place, T_b_a)
             yield _found("pair", between, of_pair)
 
 

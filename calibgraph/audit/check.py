@@ -1,7 +1,5 @@
 """``check``: is the calibration that is deployed still right?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 from calibgraph.audit.judgement import (
@@ -19,9 +17,9 @@ from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
+from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places

@@ -11,8 +11,6 @@ from F frames is itself uncertain, so that deviations follow Student's law, with
 freedom as Welch and Satterthwaite's formula gives for the sum of P_r and M_r on an axis.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

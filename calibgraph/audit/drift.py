@@ -1,7 +1,5 @@
 """``drift``: which of several results of one rig deviates, of which camera, in which axis?"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

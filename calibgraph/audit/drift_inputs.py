@@ -1,7 +1,5 @@
 """The results that are compared: read, named, and checked to be of one rig."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

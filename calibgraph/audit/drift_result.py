@@ -1,7 +1,5 @@
 """The comparison of several results: per camera and result the deviation and its status."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -16,8 +16,6 @@ WRONG: an axis is significant and beyond the tolerance. OK: all axes are certain
 smallest detectable changes are below the tolerance. Else the data cannot tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np

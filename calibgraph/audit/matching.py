@@ -1,7 +1,5 @@
 """Rounds of matching that begin at a deployed rig, without a search."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,12 +1,9 @@
 """The page of an audit: is the deployed calibration still right?"""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.audit.page_camera import camera_sections
 from calibgraph.audit.result import Audit, twist_cells
@@ -15,18 +12,7 @@ from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.summary import Reason
 from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import depth_scale
-
-MARK = b'<meta name="generator" content="calibgraph check">'
-
-_CALIBRATE = (
-    "Do not use it any longer. Fasten what is loose, and calibrate again: calibgraph calibrate. If "
-    "nothing can have moved, check the intrinsics and the distances of the LiDAR: where these have "
-    "changed, it looks like a motion."
-)
-_RECORD = (
-    "Record again, and check that: 30 frames or more, at different places, with walls, poles and "
-    "vehicles near and far, and all over the image. The reasons name what is missing."
-)
+from calibgraph.report.worked_point import matrix_text
 
 
 def write_audit_report(audit: Audit, path: Path | str) -> Path:
@@ -58,29 +44,13 @@ def audit_html(audit: Audit) -> str:
         date=datetime.now(UTC).date().isoformat(),
         cameras=cameras,
         pictures_left_out=left_out,
-        answer=_answer(audit),
         reasons=_reasons(audit),
-        advice=_advice(audit),
         detectable=_detectable(audit),
-        lidar=_lidar(audit),
-        tolerance=twist_cells(_tolerance(audit), ".2f"),
+        twist_cells=twist_cells,
+        matrix_text=matrix_text,
         depth_scale=depth_scale(),
         frames_sentence=FRAMES_SENTENCE,
     )
-
-
-def _answer(audit: Audit) -> str:
-    """Is it still right? In a sentence or two."""
-    unknown = [name for name, camera in audit.cameras.items() if camera.status == "CANNOT TELL"]
-    if audit.status == "OK":
-        return "Yes. No axis of any camera deviates by more than the tolerance."
-    if audit.status == "CANNOT TELL":
-        return (
-            f"This recording cannot tell for {', '.join(unknown)}. Nothing was found to be wrong."
-        )
-    verb, them = ("is", "it") if len(audit.wrong) == 1 else ("are", "them")
-    wrong = f"No. {', '.join(audit.wrong)} {verb} not where the calibration has {them}."
-    return f"{wrong} For {', '.join(unknown)} this recording cannot tell." if unknown else wrong
 
 
 def _reasons(audit: Audit) -> list[Reason]:
@@ -92,14 +62,6 @@ def _reasons(audit: Audit) -> list[Reason]:
         key = camera.status, camera.reason
         alike[key] = (*alike.get(key, ()), name)
     return [Reason(status, names, text) for (status, text), names in alike.items()]
-
-
-def _advice(audit: Audit) -> list[str]:
-    """Advice by status: calibrate again, record again, or nothing."""
-    statuses = {camera.status for camera in audit.cameras.values()}
-    wrong = [_CALIBRATE] if "WRONG" in statuses else []
-    unknown = [_RECORD] if "CANNOT TELL" in statuses else []
-    return wrong + unknown or ["Nothing: keep it in use."]
 
 
 def _detectable(audit: Audit) -> str:
@@ -117,17 +79,3 @@ def _detectable(audit: Audit) -> str:
     if missing:
         sentences += [f"Unknown for {', '.join(missing)}."]
     return " ".join(sentences)
-
-
-def _tolerance(audit: Audit) -> NDArray[np.float64]:
-    """(6,) rotation [rad], translation [m]."""
-    degrees, centimetres = audit.tolerance_deg, audit.tolerance_cm
-    return np.repeat([np.radians(degrees), centimetres / 100], 3)
-
-
-def _lidar(audit: Audit) -> list[tuple[str, list[str]]]:
-    """The rows of the table of the LiDAR's motion; none if it is not named."""
-    if audit.lidar is None:
-        return []
-    of = audit.lidar
-    return [("motion", twist_cells(of.motion, "+z.2f")), ("sigma", twist_cells(of.sigma, ".2f"))]

@@ -1,7 +1,5 @@
 """One camera's section of an audit page: numbers, charts, points on an image."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -9,11 +7,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.audit.result import Audit, CameraAudit, twist_cells
+from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 from calibgraph.report.page_overlays import PICTURES_BYTES, draw_by_depth, width_on_page
-from calibgraph.report.worked_point import matrix_text
 
 Array = NDArray[np.float64]
 
@@ -168,36 +165,38 @@ class Section:
         name: of the camera.
         anchor: of its section in the page.
         audit: of the camera.
-        rows: label and six cells each: deviation, sigma, smallest detectable change.
         charts: rotations and translations; none where nothing was measured.
         pictures: None if they cannot be drawn.
-        matrices: title and rows of T_camera_lidar, as deployed and as measured.
+        deployed, measured: the camera; None if it is not known, or nothing was measured.
     """
 
     name: str
     anchor: str
     audit: CameraAudit
-    rows: tuple[tuple[str, list[str]], ...]
     charts: tuple[Chart, ...]
     pictures: Pictures | None
-    matrices: tuple[tuple[str, str], ...]
+    deployed: Camera | None
+    measured: Camera | None
 
 
 def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
     """The sections of all cameras; the reason why pictures are missing, None if none are."""
     pictures, left_out = _draw(audit)
-    sections = [
-        Section(
-            name=name,
-            anchor=f"camera-{number}",
-            audit=camera,
-            rows=_rows(camera),
-            charts=charts_of(camera, audit.tolerance_deg, audit.tolerance_cm),
-            pictures=pictures.get(name),
-            matrices=_matrices(audit, name),
+    cameras = {} if audit.deployed is None else audit.deployed.cameras
+    sections = []
+    for number, (name, camera) in enumerate(audit.cameras.items()):
+        deployed = cameras.get(name)
+        sections.append(
+            Section(
+                name=name,
+                anchor=f"camera-{number}",
+                audit=camera,
+                charts=charts_of(camera, audit.tolerance_deg, audit.tolerance_cm),
+                pictures=pictures.get(name),
+                deployed=deployed,
+                measured=None if deployed is None else measured_camera(deployed, camera),
+            )
         )
-        for number, (name, camera) in enumerate(audit.cameras.items())
-    ]
     return sections, left_out
 
 
@@ -207,25 +206,6 @@ def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:
         return None
     T_now_deployed = gtsam.Pose3.Expmap(-audit.deviation).matrix()
     return deployed.moved_to(np.asarray(T_now_deployed @ deployed.T_camera_lidar))
-
-
-def _rows(camera: CameraAudit) -> tuple[tuple[str, list[str]], ...]:
-    return (
-        ("deviation", twist_cells(camera.deviation, "+z.2f")),
-        ("sigma", twist_cells(camera.sigma, ".2f")),
-        ("detectable", twist_cells(camera.detectable, ".2f")),
-    )
-
-
-def _matrices(audit: Audit, name: str) -> tuple[tuple[str, str], ...]:
-    if audit.deployed is None:
-        return ()
-    deployed = audit.deployed.cameras[name]
-    measured = measured_camera(deployed, audit.cameras[name])
-    both = (("as deployed", deployed), ("as measured", measured))
-    return tuple(
-        (title, matrix_text(camera.T_camera_lidar)) for title, camera in both if camera is not None
-    )
 
 
 def _draw(audit: Audit) -> tuple[dict[str, Pictures], str | None]:

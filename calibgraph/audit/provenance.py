@@ -1,7 +1,5 @@
 """Whether a calibration was made from the recording that it is checked with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic import BaseModel

@@ -1,7 +1,5 @@
 """The slope of measured deviations over time, or over any other number."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

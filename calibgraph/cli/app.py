@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
 
@@ -26,7 +26,6 @@ from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet
 from calibgraph.cli.fleet_report import fleet_model, fleet_report
-from calibgraph.cli.former_options import with_present_options
 from calibgraph.cli.guess import guess, init
 from calibgraph.cli.inspect import evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
@@ -34,9 +33,6 @@ from calibgraph.cli.pick import pick
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
-
-if TYPE_CHECKING:
-    from calibgraph.outputs import Output
 
 _INTERRUPTED = 130
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
@@ -85,12 +81,12 @@ def _options(
     remote.require_known(context.invoked_subcommand)
 
 
-COMMANDS: dict[Callable[..., None], Callable[[outputs.Given], list[Output]]] = {
+COMMANDS: dict[Callable[..., None], outputs.Outputs] = {
     calibrate: outputs.result,
     check: outputs.page_of_audit,
     drift: outputs.plot_of_drift,
     match: outputs.table,
-    solve: outputs.result,
+    solve: outputs.solved,
     report: outputs.page,
     view: outputs.recordings,
     evaluate: outputs.nothing,
@@ -131,7 +127,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
-    sys.argv[1:] = _repeat_weights_option(with_present_options(sys.argv[1:]))
+    sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
     try:
         _require_utf8(sys.argv[1:])
         code = _run_app()

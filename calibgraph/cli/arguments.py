@@ -132,7 +132,9 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def config_from(config: Path | None, preset_name: str | None, **given: float | None) -> Config:
+def config_from(
+    config: Path | None, preset_name: str | None, **given: float | str | None
+) -> Config:
     """The settings of a file or of a preset; options that are given replace theirs."""
     from calibgraph.model.config import load_config, preset
 

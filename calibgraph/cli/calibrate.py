@@ -31,6 +31,7 @@ def calibrate(
     bootstrap: options.BootstrapOption = None,
     tolerance_deg: options.ToleratedDegOption = None,
     tolerance_cm: options.ToleratedCmOption = None,
+    of: options.OfOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
@@ -38,7 +39,7 @@ def calibrate(
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
-        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "of": of}
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed)
@@ -107,17 +108,17 @@ def solve(
     tolerance_cm: options.ToleratedCmOption = None,
     common_deg: options.CommonDegOption = None,
     common_cm: options.CommonCmOption = None,
+    of: options.OfOption = None,
     print_graph: options.PrintGraphOption = False,
     graph: options.GraphOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.files import sha256, write_text
-    from calibgraph.graph.variables import DOT_MARK, to_dot
+    from calibgraph.graph.variables import to_dot
     from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
-    from calibgraph.outputs import Output, require_writable
     from calibgraph.pipeline import solve
     from calibgraph.report.result_files import write_result
 
@@ -127,6 +128,7 @@ def solve(
             "tolerance_cm": tolerance_cm,
             "common_deg": common_deg,
             "common_cm": common_cm,
+            "of": of,
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
@@ -136,9 +138,6 @@ def solve(
             raise ValueError("a server returns no graph; leave --print-graph and --graph out")
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
-        if graph is not None:
-            drawing = Output(graph, "solve --graph", (DOT_MARK.encode(),), (".dot",))
-            require_writable([drawing], [rig, correspondences])
     if remote.SERVER.get() is not None:
         remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
         _print_and_exit(*remote_result, as_json=as_json)

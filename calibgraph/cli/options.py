@@ -176,6 +176,15 @@ PresetOption = Annotated[
     str | None,
     typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
 ]
+OfOption = Annotated[
+    str | None,
+    typer.Option(
+        "--of",
+        metavar="alignment|mount",
+        help="Poses to report: where the LiDAR's points meet the images, or where the sensors are "
+        "mounted, less certain. (default: alignment)",
+    ),
+]
 TermsOption = Annotated[
     str,
     typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),

@@ -1,75 +1,76 @@
 """What each command writes, and what it reads: checked before any work, in one place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from calibgraph.outputs import Output
+from calibgraph.model.result_files import MATCH, REPORT_FILE, outputs_of_result, table_mark
+from calibgraph.outputs import (
+    AUDIT_PAGE_MARK,
+    DOT_MARK,
+    PAGE_MARK,
+    VIEW_MARK,
+    WEIGHTS_MARK,
+    Output,
+    marked_yaml,
+    png_mark,
+    require_outside_dataset,
+    require_writable,
+)
 
 Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
+Outputs = Callable[[Given], list[Output]]
+"""The files that a command writes with given arguments."""
 
 TABLE_SUFFIXES, PAGE_SUFFIXES = (".parquet", ".csv"), (".html", ".htm")
-WRITTEN = ("out", "rerun", "mcap", "plot", "page")
+WRITTEN = ("out", "rerun", "mcap", "plot", "page", "graph")
 """The options that name what a command writes."""
+
+
+def named(option: str, command: str, mark: bytes | str, *suffixes: str) -> Outputs:
+    """The file that an option of a command names, if it is given."""
+    marks = (mark if isinstance(mark, bytes) else mark.encode(),)
+
+    def outputs(given: Given) -> list[Output]:
+        path = given[option]
+        return [] if path is None else [Output(path, command, marks, suffixes)]
+
+    return outputs
+
+
+table = named("out", "match", table_mark(MATCH), *TABLE_SUFFIXES)
+"""A table of correspondences; a CSV file has no place for a mark."""
+plot_of_drift = named("plot", "drift", png_mark("drift"), ".png")
+page_of_audit = named("page", "check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
+fleet_page = named("out", "fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
+weights = named("out", "weights", WEIGHTS_MARK, ".safetensors")
+_graph = named("graph", "solve --graph", DOT_MARK, ".dot")
+_rerun = named("rerun", "view", VIEW_MARK, ".rrd")
+_mcap = named("mcap", "view", VIEW_MARK, ".mcap")
 
 
 def result(given: Given) -> list[Output]:
     """The files of a result in the folder of ``--out``."""
-    from calibgraph.model.result_files import outputs_of_result
-
     return outputs_of_result(given["out"])
 
 
-def table(given: Given) -> list[Output]:
-    """A table of correspondences; a CSV file has no place for a mark."""
-    from calibgraph.model.result_files import MATCH, table_mark
-    from calibgraph.outputs import Output
-
-    return [Output(given["out"], "match", (table_mark(MATCH),), TABLE_SUFFIXES)]
+def solved(given: Given) -> list[Output]:
+    """The files of a result, and its graph if that is wanted."""
+    return result(given) + _graph(given)
 
 
 def page(given: Given) -> list[Output]:
     """The page of a report, in the folder of the result if it is not named."""
-    from calibgraph.model.result_files import PAGE_MARK, REPORT_FILE
-    from calibgraph.outputs import Output
-
     folder = given["result"] if given["result"].is_dir() else given["result"].parent
-    return [Output(given["out"] or folder / REPORT_FILE, "report", (PAGE_MARK,), PAGE_SUFFIXES)]
+    marks = (PAGE_MARK,)
+    return [Output(given["out"] or folder / REPORT_FILE, "report", marks, PAGE_SUFFIXES)]
 
 
 def recordings(given: Given) -> list[Output]:
     """A result for viewers."""
-    from calibgraph.view.mcap_file import PROFILE
-    from calibgraph.view.rerun_file import APPLICATION
-
-    rerun = _if_wanted(given["rerun"], "view", APPLICATION.encode(), (".rrd",))
-    return rerun + _if_wanted(given["mcap"], "view", PROFILE.encode(), (".mcap",))
-
-
-def plot_of_drift(given: Given) -> list[Output]:
-    """The picture of a comparison, if it is wanted."""
-    from calibgraph.outputs import png_mark
-
-    return _if_wanted(given["plot"], "drift", png_mark("drift"), (".png",))
-
-
-def page_of_audit(given: Given) -> list[Output]:
-    """The page of an audit, if it is wanted."""
-    from calibgraph.audit.page import MARK
-
-    return _if_wanted(given["page"], "check", MARK, PAGE_SUFFIXES)
-
-
-def fleet_page(given: Given) -> list[Output]:
-    """The page of a fleet."""
-    from calibgraph.model.result_files import PAGE_MARK
-
-    return _if_wanted(given["out"], "fleet-report", PAGE_MARK, PAGE_SUFFIXES)
+    return _rerun(given) + _mcap(given)
 
 
 def fleet_model(given: Given) -> list[Output]:
@@ -86,37 +87,19 @@ def exported(given: Given) -> list[Output]:
     return outputs_of_export(given["out"], given["format"])
 
 
-def rig_of(command: str) -> Callable[[Given], list[Output]]:
+def rig_of(command: str) -> Outputs:
     """The rig file of a command, if it is wanted."""
-
-    def outputs(given: Given) -> list[Output]:
-        from calibgraph.outputs import marked_yaml
-
-        return [] if given["out"] is None else [marked_yaml(given["out"], command)]
-
-    return outputs
+    return lambda given: [] if given["out"] is None else [marked_yaml(given["out"], command)]
 
 
 def pictures(given: Given) -> list[Output]:
     """The guess on images."""
-    from calibgraph.outputs import Output, png_mark
-
-    folder = given["out"]
-    found = [] if folder is None else sorted(folder.glob("guess_*.png"))
+    found = [] if given["out"] is None else sorted(given["out"].glob("guess_*.png"))
     return [Output(path, "doctor", (png_mark("doctor"),)) for path in found]
-
-
-def weights(given: Given) -> list[Output]:
-    """Converted weights, if they are wanted."""
-    from calibgraph.matching.cmrnext import CONVERTED
-
-    return _if_wanted(given["out"], "weights", CONVERTED.encode(), (".safetensors",))
 
 
 def training(given: Given) -> list[Output]:
     """Settings beside the weights, which the library refuses to replace but with ``--resume``."""
-    from calibgraph.outputs import marked_yaml
-
     path = given["out"].with_suffix(".settings.yaml")
     return [] if given["resume"] else [marked_yaml(path, "train")]
 
@@ -133,9 +116,7 @@ def nothing(given: Given) -> list[Output]:
     return []
 
 
-def keep_files(
-    command: Callable[..., None], outputs: Callable[[Given], list[Output]]
-) -> Callable[..., None]:
+def keep_files(command: Callable[..., None], outputs: Outputs) -> Callable[..., None]:
     """A command that refuses, before any work, to replace what it reads or did not write.
 
     Args:
@@ -146,8 +127,6 @@ def keep_files(
 
     @wraps(command)
     def run(**given: Any) -> None:
-        from calibgraph.outputs import require_outside_dataset, require_writable
-
         files, read = outputs(given), [given[name] for name in given if name not in WRITTEN]
         require_writable(files, [path for each in read for path in _files_at(each)])
         for output in files:
@@ -188,11 +167,3 @@ def _exists(path: Path) -> bool:
         return path.exists()
     except OSError:
         return False
-
-
-def _if_wanted(
-    path: Path | None, command: str, mark: bytes, suffixes: tuple[str, ...]
-) -> list[Output]:
-    from calibgraph.outputs import Output
-
-    return [] if path is None else [Output(path, command, (mark,), suffixes)]

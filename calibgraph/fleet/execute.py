@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.task import CameraResult, Outcome, Task, describe_failure
 from calibgraph.fleet.uris import fetch
-from calibgraph.model.calibration import package_versions
+from calibgraph.model.versions import package_versions
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration

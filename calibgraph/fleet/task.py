@@ -2,12 +2,11 @@
 
 import traceback
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
+from calibgraph.model.versions import version_of
 
 ErrorKind = Literal[
     "bad input", "io", "out of memory", "timeout", "worker died", "internal error"
@@ -88,10 +87,6 @@ class Outcome:
     log: str = ""
 
 
-@cache
 def release() -> str:
     """The version of this package."""
-    try:
-        return version("calibgraph")
-    except PackageNotFoundError:
-        return "not installed as a package"
+    return version_of("calibgraph")

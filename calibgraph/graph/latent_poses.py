@@ -2,11 +2,16 @@
 
     prior         o at the identity, d at zero, each by its variance components
     distortion    d by the residuals of the matches, which no pose can follow
-    camera        x_c to m_c, and x_c to n_c, displaced by the scan distortion d
+    alignment     x_c to y_c, displaced by the scan distortion d, exactly
+    camera        y_c to m_c; x_c to n_c, displaced by the scan distortion as pairs see it
     place         o to o_p, and m_c to a_cp, with a robust loss
     data          correspondences of camera c at place p, on o_p and a_cp;
                   camera-to-camera matches at place p, on o_p, n_a and n_b
     pose graph    priors and measured relative poses, on x_c
+
+What is reported is y_c, the alignment: the pose that puts the points, as this sensor delivers them,
+on this camera's image. The mount x_c is where the sensor is; what is unknown of its beams is added.
+Images show relative poses of cameras without the cloud, so these are of mounts.
 
 The names are those of ``calibgraph.graph.variables``. Without errors of sensor and matcher all
 poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
@@ -32,15 +37,20 @@ from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
+    aligned_key,
     camera_key,
     cloud_at_key,
     matched_at_key,
     matched_key,
     paired_key,
 )
+from calibgraph.model.config import Reported
 from factors import biased_between_factor, placed_pair_factor, robust_noise
 
 Array = NDArray[np.float64]
+
+EXACT = 1e-5
+"""Standard deviation [rad and m] of what holds exactly; less is lost in rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +118,7 @@ class LatentPoseModel:
         pose_graph: priors and measured relative poses, on ``x_c``; marginals of places that are
             not in the graph, on ``o`` and ``m_c``.
         components: of the errors.
+        of: the poses that are reported.
     """
 
     cameras: tuple[str, ...]
@@ -115,6 +126,7 @@ class LatentPoseModel:
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
+    of: Reported = "alignment"
 
     @property
     def places(self) -> int:
@@ -125,6 +137,22 @@ class LatentPoseModel:
     def camera_keys(self) -> list[int]:
         """Keys of ``x_c``."""
         return [camera_key(number) for number in range(len(self.cameras))]
+
+    @property
+    def aligned(self) -> dict[int, Array]:
+        """Per camera whose alignment differs from its mount, the (6, B) displacement by ``d``."""
+        parts = self.components
+        if not self.is_distorted:
+            return {}
+        pairs = {number: parts.pair_distortion_jacobian[number] for number in self.paired}
+        return pairs | {number: parts.distortion_jacobian[number] for number in self.matched}
+
+    @property
+    def reported_keys(self) -> list[int]:
+        """Keys of the poses that are reported, in the order of the cameras."""
+        aligned = self.aligned if self.of == "alignment" else {}
+        numbers = range(len(self.cameras))
+        return [aligned_key(n) if n in aligned else camera_key(n) for n in numbers]
 
     @property
     def matched(self) -> list[int]:
@@ -167,10 +195,12 @@ class LatentPoseModel:
 
     @property
     def shared_keys(self) -> list[int]:
-        """Keys of the variables that no place has of its own; ``x_c`` last."""
+        """Keys of the variables that no place has of its own; the reported ones last."""
         distortion = [DISTORTION] if self.is_distorted else []
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
-        return [CLOUD, *shown, *distortion, *self.camera_keys]
+        poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
+        others = [key for key in poses if key not in self.reported_keys]
+        return [CLOUD, *shown, *distortion, *others, *self.reported_keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -212,14 +242,18 @@ def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """Priors of what all places share; x_c to m_c and to n_c."""
+    """Priors of what all places share; x_c to y_c and n_c, y_c to m_c."""
     parts, graph = model.components, gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
     if model.is_distorted:
         graph.push_back(_distortion_graph(parts))
+    for number, jacobian in model.aligned.items():
+        edge = camera_key(number), aligned_key(number)
+        graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
+    seen = aligned_key if model.is_distorted else camera_key
     for number in model.matched:
-        edge = camera_key(number), matched_key(number)
-        graph.add(_displaced(model, edge, parts.distortion_jacobian[number], parts.camera))
+        edge = seen(number), matched_key(number)
+        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(parts.camera)))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)
         graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))
@@ -229,7 +263,7 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 def _displaced(
     model: LatentPoseModel, edge: tuple[int, int], jacobian: Array, covariance: Array
 ) -> gtsam.NonlinearFactor:
-    """From a camera to its pose as its data show it, displaced by the scan distortion."""
+    """From a camera to where its data show it, displaced by the scan distortion."""
     noise = _noise(covariance)
     if not model.is_distorted:
         return gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise)

@@ -4,8 +4,6 @@ The variables are ``T_lidar_camera``, one ``Pose3`` per camera: in this directio
 prior and between factors are the paper's terms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Literal

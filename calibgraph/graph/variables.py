@@ -1,7 +1,8 @@
 """Keys of the variables. All are ``Pose3`` in the LiDAR frame but the scan distortion, a vector.
 
-x_c   camera c as it is: ``T_lidar_camera``, the estimate
+x_c   the mount of camera c: ``T_lidar_camera`` of the two sensors as bodies
 d     the scan distortion, in standard deviations of its prior
+y_c   the alignment of camera c: where the points, as the LiDAR delivers them, meet its image
 m_c   camera c as its matches show it at every place
 n_c   camera c as its pairs with other cameras show it
 o     the cloud as it is displaced at every place
@@ -9,14 +10,13 @@ o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
 """
 
-from __future__ import annotations
-
 import gtsam
+
+from calibgraph.outputs import DOT_MARK
 
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
-DOT_MARK = "// calibgraph graph"
 """First line of a graph in Graphviz's language."""
 
 MOST_CAMERAS = 1000
@@ -26,6 +26,11 @@ MOST_CAMERAS = 1000
 def camera_key(camera: int) -> int:
     """Key of ``x_c``."""
     return int(gtsam.symbol("x", camera))
+
+
+def aligned_key(camera: int) -> int:
+    """Key of ``y_c``."""
+    return int(gtsam.symbol("y", camera))
 
 
 def matched_key(camera: int) -> int:

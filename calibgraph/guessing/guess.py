@@ -1,7 +1,5 @@
 """A rig with a guess per camera: by words, by a file, or by a search over all headings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The search for cameras without any guess: over all headings, by images and clouds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

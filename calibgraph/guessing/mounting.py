@@ -1,7 +1,5 @@
 """Mountings in words: "rear-left 60 deg right, 20 deg down, 0.4 m ahead of the LiDAR"."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping

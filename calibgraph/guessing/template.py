@@ -1,8 +1,7 @@
 """A rig file to fill in, from the images and clouds of a dataset folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -22,29 +21,6 @@ from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
 from calibgraph.model.rig import RIG_FORMAT
 from calibgraph.outputs import yaml_mark
 from calibgraph.yaml_text import yaml_text
-
-_HEAD = """{mark}
-# Replace every {fill_in}; then: calibgraph doctor {folder}
-# Found are {clouds} clouds in lidar, and images of {cameras}.
-#
-# lidar           its name, which export uses as its frame
-# cameras         by name, as the folders in cameras/; remove those that you do not calibrate
-# intrinsics_px   focal lengths and principal point [px] of the images as recorded, for exactly
-#                 this width and height; pixel (0, 0) is the centre of the top-left pixel
-# model           pinhole (OpenCV, ROS plumb_bob), fisheye (Kannala-Brandt, ROS equidistant),
-#                 omnidirectional or equirectangular
-# distortion      in OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] of a pinhole lens, k1 to k4
-#                 of a fisheye; [] for rectified images
-# T_camera_lidar  the guess, right to 20 deg and 1.5 m: p_camera = T_camera_lidar * p_lidar [m];
-#                 camera: x right, y down, z forward; LiDAR: usually x forward, y left, z up.
-#                 At the LiDAR, level: front [[0,-1,0,0], [0,0,-1,0], [1,0,0,0], [0,0,0,1]]
-#                              left  [[1,0,0,0], [0,0,-1,0], [0,1,0,0], [0,0,0,1]]
-#                              right [[-1,0,0,0], [0,0,-1,0], [0,-1,0,0], [0,0,0,1]]
-#                              rear  [[0,1,0,0], [0,0,-1,0], [-1,0,0,0], [0,0,0,1]]
-#                 calibgraph init {folder} --mount "NAME=front, 0.4 m ahead"
-#                 writes it from words (with --force, in place of this file)
-# relative_poses  optional: measured poses between cameras, with sigmas; see docs/files.md
-"""
 
 
 def write_rig_template(
@@ -98,7 +74,8 @@ def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "
         name: _camera(name, _size(source), mountings.get(name), forward)
         for name, source in sources.items()
     }
-    head = _HEAD.format(
+    head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
+    head = head.format(
         mark=yaml_mark("init"), fill_in=FILL_IN, folder=folder, clouds=clouds,
         cameras=", ".join(cameras),
     )  # fmt: skip

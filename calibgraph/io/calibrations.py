@@ -135,6 +135,7 @@ class _Parts(BaseModel):
     config: dict[str, Any]
     covariance: dict[str, Covariance | None]
     joint_covariance: JointCovariance | None
+    pair_covariance: dict[str, Covariance]
     bootstrap_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Matrix4]
     camera_verdicts: dict[str, _Checks]
@@ -189,9 +190,9 @@ _OF_SOME_CAMERAS = (
     "error_sources",
 )
 _PLAIN = (
-    "covariance", "joint_covariance", "stage1_T_camera_lidar", "residuals", "weaknesses", "rounds",
-    "counts", "timings_s", "terms", "prior_share", "error_sources", "inputs", "versions",
-    "date", "warnings",
+    "covariance", "joint_covariance", "pair_covariance", "stage1_T_camera_lidar", "residuals",
+    "weaknesses", "rounds", "counts", "timings_s", "terms", "prior_share", "error_sources",
+    "inputs", "versions", "date", "warnings",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

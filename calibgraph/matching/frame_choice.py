@@ -1,7 +1,5 @@
 """Choose the frames of a long recording that are matched: distant places, sharp and bright."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -12,8 +12,6 @@ order:
 6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -121,9 +119,7 @@ class MatcherWithDefaults:
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
-        self.image_checks_can_fail = bool(
-            getattr(matcher, "image_checks_can_fail", getattr(matcher, "fails_on_images", False))
-        )  # fails_on_images: its former name
+        self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
         self._locate = getattr(matcher, "locate", None)
         self._release = getattr(matcher, "release", None)
 

@@ -1,7 +1,5 @@
 """The result of matching and solving in rounds: the input of the checks on images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

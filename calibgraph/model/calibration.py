@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,24 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.files import sha256, write_yaml
+from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.geometry import invert, relative_covariance, relative_transform
-from calibgraph.model.result_files import (
-    CALIBRATION_FILE,
-    CALIBRATION_FORMAT,
-    CAMERA_MATCHES_FILE,
-    CORRESPONDENCES_FILE,
-    RESULT,
-    VERDICT_KEY,
-    WRITTEN_KEY,
-    outputs_of_calibration,
-)
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
+from calibgraph.model.versions import package_versions
 from calibgraph.outputs import require_writable
 
 Array = NDArray[np.float64]
@@ -47,20 +35,6 @@ TANGENT_SENTENCE = (
 PAIR_TANGENT_SENTENCE = (
     "A->B: T_B_A = exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the axes of B"
 )
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of this package and of the libraries that results depend on."""
-    packages = ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy")
-    return {"python": platform.python_version()} | {name: _version(name) for name in packages}
-
-
-@cache  # reading the metadata of a package takes a millisecond
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed as a package"
 
 
 @dataclass(frozen=True)
@@ -94,6 +68,8 @@ class Calibration:
             findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None where not determined.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
+        pair_covariance: per pair "A->B" of cameras with error bars, (6, 6) of xi in T_B_A = exp(xi)
+            estimate, in B's axes: of the cameras as they are mounted, whatever the cloud.
         camera_verdicts: per camera.
         residuals: per camera that had correspondences.
         counts: per camera, correspondences left after each filter and the gate, and frames.
@@ -130,6 +106,7 @@ class Calibration:
     timings_s: dict[str, float]
     terms: Terms
     config: Config
+    pair_covariance: dict[str, Array] = field(default_factory=dict)
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
     weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
     prior_share: dict[str, float] = field(default_factory=dict)
@@ -190,7 +167,7 @@ class Calibration:
     @property
     def T_lidar_camera(self) -> dict[str, Array]:
         """The (4, 4) inverses, each camera's pose in the LiDAR frame, as ROS's tf has it."""
-        return {name: invert(T) for name, T in self.T_camera_lidar.items()}
+        return {name: geometry.invert(T) for name, T in self.T_camera_lidar.items()}
 
     def sigmas(self, name: str) -> tuple[Array, Array] | None:
         """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
@@ -199,14 +176,13 @@ class Calibration:
             (3,) rotation [deg], (3,) translation [cm]; None where not determined.
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
-        return None if covariance is None else degrees_and_centimetres(covariance)
+        return None if covariance is None else geometry.degrees_and_centimetres(covariance)
 
     @property
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
-        if self.rig.relative_poses:
-            return "errors of the intrinsics are not included"
-        return "errors of the intrinsics, and of the clouds' scale, are not included"
+        scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
+        return f"errors of the intrinsics{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.
@@ -221,23 +197,6 @@ class Calibration:
         """The standard deviations of :meth:`sigmas` where they hold, else None."""
         return self.sigmas(name) if self.error_bar_holds(name) else None
 
-    @property
-    def pair_covariance(self) -> dict[str, Array]:
-        """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate, in B's axes.
-
-        Without the pairs of cameras that have no error bar.
-        """
-        if self.joint_covariance is None:
-            return {}
-        T = self.T_camera_lidar
-        return {
-            f"{a}->{b}": relative_covariance(
-                self.joint_covariance, i, j, relative_transform(T[b], T[a])
-            )
-            for (i, a), (j, b) in combinations(enumerate(T), 2)
-            if self.covariance[a] is not None and self.covariance[b] is not None
-        }
-
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
         """The same result with the SHA-256 of its input files, by path."""
         return replace(self, inputs=dict(inputs))
@@ -250,15 +209,15 @@ class Calibration:
         Raises:
             FileError: if a file of these names is there that is not of a result.
         """
-        path = Path(folder) / CALIBRATION_FILE
-        require_writable(outputs_of_calibration(path.parent))
+        path = Path(folder) / result_files.CALIBRATION_FILE
+        require_writable(result_files.outputs_of_calibration(path.parent))
+        tables = {
+            result_files.CORRESPONDENCES_FILE: self.correspondences,
+            result_files.CAMERA_MATCHES_FILE: self.camera_matches,
+        }
         hashes = {
-            "correspondences_sha256": self._save_table(
-                self.correspondences, path.with_name(CORRESPONDENCES_FILE)
-            ),
-            "camera_matches_sha256": self._save_table(
-                self.camera_matches, path.with_name(CAMERA_MATCHES_FILE)
-            ),
+            f"{Path(name).stem}_sha256": self._save_table(table, path.with_name(name))
+            for name, table in tables.items()
         }
         write_yaml(path, {**self._to_mapping(), **hashes})
         return path
@@ -268,27 +227,23 @@ class Calibration:
         if table is None:
             path.unlink(missing_ok=True)
             return None
-        marks = {VERDICT_KEY: self.verdict.status, WRITTEN_KEY: RESULT}
+        marks: dict[str, str] = {
+            result_files.VERDICT_KEY: self.verdict.status,
+            result_files.WRITTEN_KEY: result_files.RESULT,
+        }
         replace(table, metadata={**table.metadata, **marks}).save(path)
         return sha256(path)
 
     def __repr__(self) -> str:
         return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"
 
-    def _sigma_mapping(self, name: str) -> dict[str, list[float]] | None:
-        covariance = self.covariance[name]
-        if covariance is None:
-            return None
-        sigmas = np.sqrt(np.diag(covariance)).tolist()
-        return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}
-
     def _to_mapping(self) -> dict[str, Any]:
         return {
-            "format": CALIBRATION_FORMAT,
-            "verdict": _verdict_mapping(self.verdict),
+            "format": result_files.CALIBRATION_FORMAT,
+            "verdict": self.verdict.to_mapping(),
             "summary": self.summary.to_mapping(),
             "camera_verdicts": {
-                name: {**_verdict_mapping(verdict), "checks": [vars(c) for c in verdict.checks]}
+                name: {**verdict.to_mapping(), "checks": [vars(c) for c in verdict.checks]}
                 for name, verdict in self.camera_verdicts.items()
             },
             "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
@@ -296,7 +251,7 @@ class Calibration:
             "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
             "frames": FRAMES_SENTENCE,
             "T_camera_lidar": self.T_camera_lidar,
-            "sigmas": {name: self._sigma_mapping(name) for name in self.rig.cameras},
+            "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in self.rig.cameras},
             "error_bar_holds": {
                 name: self.error_bar_holds(name)
                 for name in (*self.rig.cameras, *self.pair_covariance)
@@ -324,16 +279,8 @@ class Calibration:
         }
 
 
-def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
-    """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
-    sigmas = np.sqrt(np.diag(covariance))
-    return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
-
-
-def _verdict_mapping(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "status": verdict.status,
-        "cannot_tell": verdict.cannot_tell,
-        "error_probability": verdict.error_probability and vars(verdict.error_probability),
-        "reasons": list(verdict.reasons),
-    }
+def _sigma_mapping(covariance: Array | None) -> dict[str, list[float]] | None:
+    if covariance is None:
+        return None
+    sigmas = np.sqrt(np.diag(covariance)).tolist()
+    return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.files import write_atomically
 from calibgraph.model.correspondences import MAX_COORDINATE
-from calibgraph.model.table_columns import write_parquet
+from calibgraph.model.table_columns import write_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -117,11 +116,7 @@ class CameraMatches:
 
     def save(self, path: Path | str) -> None:
         """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
-        from pyarrow import csv
-
-        path, arrow = Path(path), self.to_arrow()
-        write = csv.write_csv if path.suffix == ".csv" else write_parquet
-        write_atomically(path, lambda part: write(arrow, part))
+        write_table(self.to_arrow(), Path(path))
 
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""

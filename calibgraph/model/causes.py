@@ -4,8 +4,6 @@ A check without its own action takes the action of its cause. Causes stand in th
 they explain each other: a wrong guess makes matches wrong, and not the other way round.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -16,6 +16,7 @@ Terms = Literal["stage1", "reprojection", "priors", "full"]
 TERMS: tuple[Terms, ...] = get_args(Terms)
 Stage1Source = Literal["pnp", "rig"]
 PresetName = Literal["kitti", "walkley", "auto"]
+Reported = Literal["alignment", "mount"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
@@ -86,6 +87,8 @@ class Config(StrictNumbers):
             table share, if the table does not state it; 0 if they share none.
         bootstrap: how many times to solve again with frames drawn with replacement, as a check
             of the covariance; 0 for none.
+        of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
+            them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """
@@ -114,6 +117,7 @@ class Config(StrictNumbers):
     common_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
     bootstrap: Annotated[int, Field(ge=0, le=100_000), AfterValidator(_not_one)] = 0
+    of: Reported = "alignment"
     seed: Seed = 0
     tracking: Tracking = Tracking()
 

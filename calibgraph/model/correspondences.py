@@ -20,6 +20,7 @@ from calibgraph.model.table_columns import (
     INFORMATION,
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
+    rows_where,
     write_table,
 )
 
@@ -124,14 +125,13 @@ class Correspondences:
         one = isinstance(camera, str) and n > 0  # not sorted, as the names of many rows are
         of_rows = np.asarray([camera] if one else np.broadcast_to(np.asarray(camera), n))
         names, index = np.unique(of_rows, return_inverse=True)
-        given = np.ones(n) if confidence is None else confidence
         return Correspondences(
             cameras=tuple(str(name) for name in names),
             camera_index=np.zeros(n, np.int32) if one else index.astype(np.int32),
             frame=np.array(np.broadcast_to(np.asarray(frame, dtype=np.int64), n)),
             pixels_px=pixels,
             points_lidar_m=np.asarray(points_lidar_m, dtype=np.float64),
-            confidence=as_confidence(given),
+            confidence=as_confidence(np.ones(n) if confidence is None else confidence),
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
             point_index=_optional(point_index, np.int64),
@@ -223,8 +223,7 @@ class Correspondences:
         return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
-        u, v = self.pixels_px, self.points_lidar_m
-        for what, values in (("pixel", u), ("point", v)):
+        for what, values in (("pixel", self.pixels_px), ("point", self.points_lidar_m)):
             good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
             self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         c = self.confidence
@@ -242,16 +241,11 @@ class Correspondences:
             self._require(good, "information", i, "be positive semidefinite and not zero")
 
     def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
-        if good.all():
-            return
-        row = int(np.flatnonzero(~good)[0])
-        camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
-        raise CorrespondenceError(
-            f"{what} must {rule}, found {found[row].tolist()}; drop or correct the row",
-            camera=camera,
-            frame=frame,
-            row=row,
-        )
+        if not good.all():
+            row = int(np.flatnonzero(~good)[0])
+            camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
+            text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct the row"
+            raise CorrespondenceError(text, camera=camera, frame=frame, row=row)
 
 
 _WIDTHS = {
@@ -261,14 +255,6 @@ _WIDTHS = {
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {
     "cameras", "metadata", "findings", "places",
 }  # fmt: skip
-
-
-def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:
-    """The rows of a mask; a slice, which makes a view, where they follow each other."""
-    first, count = int(mask.argmax()) if len(mask) else 0, int(np.count_nonzero(mask))
-    if mask[first : first + count].all():
-        return slice(first, first + count)
-    return np.flatnonzero(mask)
 
 
 def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
@@ -300,15 +286,12 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
          for number, t in zip(numbers, tables, strict=True)]
     )  # fmt: skip
     if any(table.information_px is not None for table in tables):
-        columns["information_px"] = np.concatenate([_information(t) for t in tables])
+        columns["information_px"] = np.concatenate([
+            np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px
+            for t in tables
+        ])  # fmt: skip
     for name in ("stamp_ns", "point_index"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
     return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
-
-
-def _information(table: Correspondences) -> Array:
-    if table.information_px is not None:
-        return table.information_px
-    return np.tile([1.0, 0.0, 1.0], (len(table), 1))

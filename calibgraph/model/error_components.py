@@ -4,12 +4,12 @@ The file states how each number was got. Its format has a version of its own; a 
 into the metadata of its tables, so that a table remains what it was when the file changes.
 """
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
@@ -90,32 +90,21 @@ def error_components() -> ErrorComponents:
     content = json.loads(text)
     if content["format"] != FORMAT:
         raise ValueError(f"error_components.json: expected {FORMAT}, found {content['format']!r}")
-    pairs, frames, sizes = content["pairs"], content["frames"], content["sizes"]
+    frames = _sizes(content["frames"])
     return ErrorComponents(
         matchers={
-            name: MatcherComponents(
-                systematic_rotation_rad=float(np.radians(one["systematic_rotation_deg"])),
-                systematic_translation_m=one["systematic_translation_m"],
-                camera_share=one["camera_share"],
-                elevation_rad=float(np.radians(one["elevation_deg"])),
-                elevation_stretch=one["elevation_stretch"],
-                scan_motion_m=one["scan_motion_m"],
-                place_rotation_rad=float(np.radians(one["place_rotation_deg"])),
-                place_translation_m=one["place_translation_m"],
-                place_variance=one["place_variance"],
-            )
-            for name, one in content["matchers"].items()
+            name: MatcherComponents(**_sizes(one)) for name, one in content["matchers"].items()
         },
-        pair_rotation_rad=float(np.radians(pairs["rotation_deg"])),
-        pair_translation_m=pairs["translation_m"],
-        pair_correlation=pairs["correlation"],
-        frame_correlation=frames["correlation"],
-        prior_frames=frames["prior_frames"],
-        pseudo_frames=frames["pseudo_frames"],
-        shared_dof=sizes["shared_dof"],
-        place_dof=sizes["place_dof"],
-        least_places=sizes["least_places"],
-        robust_sigmas=sizes["robust_sigmas"],
-        robust_places=sizes["robust_places"],
-        contradiction_sigmas=sizes["contradiction_sigmas"],
+        **{f"pair_{name}": size for name, size in _sizes(content["pairs"]).items()},
+        frame_correlation=frames.pop("correlation"),
+        **frames,
+        **_sizes(content["sizes"]),
     )
+
+
+def _sizes(part: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of a part of the file, by the names of their fields: angles in radians."""
+    sizes = {name: value for name, value in part.items() if isinstance(value, (int, float))}
+    for name in [name for name in sizes if name.endswith("_deg")]:
+        sizes[f"{name.removesuffix('_deg')}_rad"] = float(np.radians(sizes.pop(name)))
+    return sizes

@@ -5,9 +5,9 @@
 Tangent vectors are (rotation [rad], translation [m]).
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Container, Mapping
+from itertools import combinations
 
 import gtsam
 import numpy as np
@@ -213,3 +213,29 @@ def crosses(v: Array) -> Array:
     """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
     (x, y, z), zero = v.T, np.zeros(len(v))
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:
+    """The standard deviations of a (6, 6): (3,) rotation [deg], (3,) translation [cm]."""
+    sigmas = np.sqrt(np.diag(covariance))
+    return np.degrees(sigmas[:3]), sigmas[3:] * 100.0
+
+
+def pair_covariances(
+    joint: Array | None, T_camera_lidar: Mapping[str, Array], without: Container[str] = ()
+) -> dict[str, Array]:
+    """Per pair "A->B", (6, 6) of xi in T_B_A = exp(xi) estimate; of none without a covariance.
+
+    Args:
+        joint: (6 N, 6 N) of all cameras.
+        T_camera_lidar: (4, 4) of each.
+        without: cameras that have no error bar.
+    """
+    if joint is None:
+        return {}
+    T = T_camera_lidar
+    return {
+        f"{a}->{b}": relative_covariance(joint, i, j, relative_transform(T[b], T[a]))
+        for (i, a), (j, b) in combinations(enumerate(T), 2)
+        if a not in without and b not in without
+    }

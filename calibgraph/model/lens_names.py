@@ -1,7 +1,5 @@
 """Other names of the lens models, in any spelling."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Final

@@ -1,7 +1,5 @@
 """The paper's metrics: an estimate against a reference, per camera and between cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Perturbed initial guesses: the paper's protocol, T_init = T_delta T_GT."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Values of a rig that cannot be right, or seldom are: units, an image of another size, a lens."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ As GTSAM's, of twists (rotation [rad], translation [m]). Below a small angle, se
 are as exact as the closed formulas.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -92,75 +90,3 @@ def logarithms(steps):  # type: ignore[no-untyped-def]
             w - c / 2.0 + inward * (x * b - y * a),
         )
     return out
-
-
-@compiled()
-def _multiply(a, b, out):  # type: ignore[no-untyped-def]
-    """Fill (6, 6) ``out`` with a b."""
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += a[i, k] * b[k, j]
-            out[i, j] = total
-
-
-@compiled()
-def _fill_cross(x, y, z, out):  # type: ignore[no-untyped-def]
-    """Fill (3, 3) ``out`` with [v]x; its diagonal is zero already."""
-    out[0, 1], out[0, 2], out[1, 0] = -z, y, z
-    out[1, 2], out[2, 0], out[2, 1] = -x, -y, x
-
-
-@compiled()
-def _relative_poses(one, two):  # type: ignore[no-untyped-def]
-    """(n, 4, 4) one^-1 two of rigid transforms."""
-    out = np.zeros((len(one), 4, 4))
-    for n in range(len(one)):
-        for i in range(3):
-            for k in range(3):
-                for j in range(3):
-                    out[n, i, j] += one[n, k, i] * two[n, k, j]
-                out[n, i, 3] += one[n, k, i] * (two[n, k, 3] - one[n, k, 3])
-        out[n, 3, 3] = 1.0
-    return out
-
-
-@compiled()
-def _fill_inverse_adjoint(T, cross, out):  # type: ignore[no-untyped-def]
-    """Fill (6, 6) ``out`` with Ad(T^-1) = [R^T, 0; -R^T [t]x, R^T]; ``cross`` is (3, 3) scratch."""
-    _fill_cross(T[0, 3], T[1, 3], T[2, 3], cross)
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = out[3 + i, 3 + j] = T[j, i]
-            out[i, 3 + j] = out[3 + i, j] = 0.0
-            for k in range(3):
-                out[3 + i, j] -= T[k, i] * cross[k, j]
-
-
-@compiled()
-def between_errors(one, two):  # type: ignore[no-untyped-def]
-    """(n, 6) log(one^-1 two) of (n, 4, 4) transforms; (n, 6, 6) its derivatives by both tangents.
-
-    That of the second is the inverse of the right Jacobian, by the series of Bernoulli numbers up
-    to the fourth power: displacements are far below a radian. That of the first is minus it, times
-    Ad(two^-1 one).
-    """
-    relative = _relative_poses(one, two)
-    errors, by_one = logarithms(relative), np.empty((len(one), 6, 6))
-    by_two, ad, inverse = np.empty((len(one), 6, 6)), np.zeros((6, 6)), np.empty((6, 6))
-    squared, fourth, cross = np.empty((6, 6)), np.empty((6, 6)), np.zeros((3, 3))
-    for n in range(len(one)):
-        x, y, z, u, v, w = errors[n]
-        _fill_cross(x, y, z, ad[:3, :3])
-        _fill_cross(x, y, z, ad[3:, 3:])
-        _fill_cross(u, v, w, ad[3:, :3])
-        _multiply(ad, ad, squared)
-        _multiply(squared, squared, fourth)
-        for i in range(6):
-            for j in range(6):
-                by_two[n, i, j] = ad[i, j] / 2 + squared[i, j] / 12 - fourth[i, j] / 720
-            by_two[n, i, i] += 1.0
-        _fill_inverse_adjoint(relative[n], cross, inverse)
-        _multiply(by_two[n], -inverse, by_one[n])
-    return errors, by_one, by_two

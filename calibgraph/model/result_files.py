@@ -1,10 +1,8 @@
 """The files of a result in its folder, and the marks by which they are recognised."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
-from calibgraph.outputs import Output, is_marked
+from calibgraph.outputs import PAGE_MARK, Output, is_marked
 
 CALIBRATION_FORMAT = "calibgraph-calibration/1"
 CALIBRATION_FILE = "calibration.yaml"
@@ -22,7 +20,6 @@ WRITTEN_KEY, MATCH, RESULT = "written_by", "calibgraph match", "calibgraph calib
 
 _CALIBRATION_MARK = f"format: {CALIBRATION_FORMAT}\n".encode()
 _TABLE_MARK = f'"{VERDICT_KEY}": '.encode()
-PAGE_MARK = b'<meta name="generator" content="calibgraph">'
 
 
 def outputs_of_result(folder: Path) -> list[Output]:

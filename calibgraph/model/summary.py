@@ -3,8 +3,6 @@
 Terminal, report, service, fleet and files show the same :class:`Summary`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

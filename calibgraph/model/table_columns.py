@@ -1,9 +1,12 @@
-"""The columns of a correspondence table on disk: their names and types, and the writer."""
+"""The columns of a correspondence table: their names and types on disk, the writer, their rows."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
@@ -25,20 +28,15 @@ _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 def write_table(arrow: pa.Table, path: Path) -> None:
     """Write a table as Parquet, or as CSV if the name ends in .csv, atomically."""
-    from pyarrow import csv
+    from pyarrow import csv, parquet
 
-    if path.suffix == ".csv":
-        strings = arrow.set_column(0, "camera", arrow["camera"].cast("string"))
-        write_atomically(path, lambda part: csv.write_csv(strings, part))
-    else:
-        write_atomically(path, lambda part: write_parquet(arrow, part))
+    def write(part: Path) -> None:
+        if path.suffix == ".csv":
+            csv.write_csv(arrow, part)
+        else:
+            parquet.write_table(arrow, part, write_page_checksum=True)
 
-
-def write_parquet(arrow: pa.Table, path: Path) -> None:
-    """Write a Parquet file with checksums of its pages."""
-    from pyarrow import parquet
-
-    parquet.write_table(arrow, path, write_page_checksum=True)
+    write_atomically(path, write)
 
 
 def check_schema(schema: pa.Schema) -> None:
@@ -88,3 +86,11 @@ def _check_type(field: pa.Field) -> None:
         kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
     if not right:
         raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")
+
+
+def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:
+    """The rows of a mask; a slice, which makes a view, where they follow each other."""
+    first, count = int(mask.argmax()) if len(mask) else 0, int(np.count_nonzero(mask))
+    if mask[first : first + count].all():
+        return slice(first, first + count)
+    return np.flatnonzero(mask)

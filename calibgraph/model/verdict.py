@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
 
@@ -207,11 +207,6 @@ class Verdict:
         return {check.kind or check.name for check in self.checks if check.status != "PASS"}
 
     @property
-    def doubt(self) -> ErrorProbability | None:
-        """Former name of ``error_probability``, for one release."""
-        return self.error_probability
-
-    @property
     def cannot_tell(self) -> bool:
         """Whether it is WARN because the data determine too little, not because something is odd.
 
@@ -237,6 +232,15 @@ class Verdict:
             return tuple(texts)
         found = self.error_probability
         return (f"{found.sentence} of {found.percent}{found.advice}", *texts)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As plain values, without the checks."""
+        return {
+            "status": self.status,
+            "cannot_tell": self.cannot_tell,
+            "error_probability": self.error_probability and vars(self.error_probability),
+            "reasons": list(self.reasons),
+        }
 
 
 def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:

@@ -16,7 +16,7 @@ from calibgraph.report.figure import (
     set_octave_ticks,
     to_data_uri,
 )
-from calibgraph.report.image_cells import count_per_cell, grid_shape, mean_residuals
+from calibgraph.report.image_cells import mean_residuals, sum_per_cell
 from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def coverage(camera: Camera, errors: ReprojectionErrors) -> str:
     figure, axes = image_figure(camera, right_in=0.5)
     pixels = errors.select(errors.is_inlier).pixels_px
     extent = ((-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5))
-    counts = count_per_cell(pixels, camera, grid_shape(camera, _COVERAGE_COLUMNS))
+    counts = sum_per_cell(pixels, camera, _COVERAGE_COLUMNS)
     shown = np.where(counts > 0, counts, np.nan)
     image = axes.imshow(
         shown, extent=(*extent[0], *extent[1][::-1]), cmap="YlGnBu", vmin=0,

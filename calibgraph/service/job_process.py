@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,15 @@ _NOTE_EVERY_S = 0.1
 _KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
 
 
+@dataclass(frozen=True)
+class _Inputs:
+    """The inputs of a job, made ready."""
+
+    rig: Path | None
+    table: Path | None
+    recordings: list[Path]
+
+
 def run_job(task: JobTask, note: Note) -> JobOutcome:
     """Run a job; what is wrong with its data is part of the outcome.
 
@@ -65,15 +75,12 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
 
 def _run(task: JobTask, progress: Progress) -> JobOutcome:
     """Make the result."""
-    job = task.job
-    rig = _found(task, RIG)
-    table = _found(task, TABLE)
-    recordings = [
-        path for i in range(job.recordings) if (path := _found(task, recording_name(i))) is not None
-    ]
-    run: Callable[[JobTask, Path | None, Path | None, list[Path], Progress], JobOutcome]
-    run = {"solve": _solve, "calibration": _calibrate, "check": _check}[job.kind]
-    return run(task, rig, table, recordings, progress)
+    found = (_found(task, recording_name(i)) for i in range(task.job.recordings))
+    recordings = [path for path in found if path is not None]
+    inputs = _Inputs(_found(task, RIG), _found(task, TABLE), recordings)
+    run: Callable[[JobTask, _Inputs, Progress], JobOutcome]
+    run = {"solve": _solve, "calibration": _calibrate, "check": _check}[task.job.kind]
+    return run(task, inputs, progress)
 
 
 def _found(task: JobTask, name: str) -> Path | None:
@@ -135,14 +142,13 @@ def _link(task: JobTask, uri: str, name: str) -> Path:
     return link
 
 
-def _solve(
-    task: JobTask, rig: Path | None, table: Path | None, _: list[Path], progress: Progress
-) -> JobOutcome:
+def _solve(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome:
     from calibgraph.files import sha256
     from calibgraph.io.rigs import load_rig
     from calibgraph.pipeline import solve
 
     settings = SolveSettings.model_validate(task.job.settings)
+    rig, table = inputs.rig, inputs.table
     if rig is None or table is None:
         raise ValueError("a solve needs a rig and correspondences")
     progress("solving", 0, 1)
@@ -151,16 +157,15 @@ def _solve(
     return _write(task, result, None, with_report=settings.report)
 
 
-def _calibrate(
-    task: JobTask, rig: Path | None, table: Path | None, recordings: list[Path], progress: Progress
-) -> JobOutcome:
+def _calibrate(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome:
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.structure import StructureMatcher
     from calibgraph.pipeline import calibrate
 
     settings = CalibrationSettings.model_validate(task.job.settings)
-    data = load_dataset(recordings, load_rig(rig) if rig else None, frames=settings.frames)
+    rig, table = load_rig(inputs.rig) if inputs.rig else None, inputs.table
+    data = load_dataset(inputs.recordings, rig, frames=settings.frames)
     options: dict[str, Any] = {"search_deg": settings.search_deg, "search_m": settings.search_m}
     if settings.search:
         options = {name: value for name, value in options.items() if value is not None}
@@ -189,9 +194,7 @@ def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) 
     return JobOutcome(result.verdict.status, result.verdict.cannot_tell)
 
 
-def _check(
-    task: JobTask, rig: Path | None, _: Path | None, recordings: list[Path], progress: Progress
-) -> JobOutcome:
+def _check(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome:
     from calibgraph.audit import audit_summary, check
     from calibgraph.audit.page import write_audit_report
     from calibgraph.io.dataset import load_dataset
@@ -199,13 +202,13 @@ def _check(
     from calibgraph.matching.structure import StructureMatcher
 
     settings = CheckSettings.model_validate(task.job.settings)
-    if rig is None:
+    if inputs.rig is None:
         raise ValueError("a check needs the deployed rig")
-    deployed = load_rig(rig)
+    deployed = load_rig(inputs.rig)
     options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
     audit = check(
         deployed,
-        load_dataset(recordings, deployed, frames=settings.frames),
+        load_dataset(inputs.recordings, deployed, frames=settings.frames),
         tolerance_deg=settings.tolerance_deg,
         tolerance_cm=settings.tolerance_cm,
         matcher=StructureMatcher(seed=settings.seed, **options),

@@ -64,6 +64,23 @@ class JobRecord:
     note: str | None = None
 
     @property
+    def title(self) -> str:
+        """Its name, else its kind and id."""
+        return self.name or f"{self.kind} {self.id[:8]}"
+
+    @property
+    def result(self) -> str:
+        """The verdict of its result, else its state."""
+        return self.verdict or self.state
+
+    @property
+    def took_s(self) -> float | None:
+        """How long it ran; None if it has not ended."""
+        if self.started_s is None or self.finished_s is None:
+            return None
+        return self.finished_s - self.started_s
+
+    @property
     def is_finished(self) -> bool:
         """Whether its state is final."""
         return self.state in FINISHED

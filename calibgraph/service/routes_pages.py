@@ -16,7 +16,6 @@ from calibgraph.service import pages
 from calibgraph.service.access import COOKIE, Caller, Gate
 from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
-from calibgraph.service.pages import form_of
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import JobKind
 from calibgraph.service.routes_jobs import find_job
@@ -61,8 +60,8 @@ def jobs_page(
     """The jobs, with their verdicts."""
     records = state.jobs.newest(caller, _PER_PAGE, before)
     following = records[-1].number if len(records) == _PER_PAGE else None
-    views = [pages.job_view(record, state.runner.step(record.id)) for record in records]
-    return _page(request, "jobs.html.j2", jobs=views, next=following, is_later=before is not None)
+    is_later = before is not None
+    return _page(request, "jobs.html.j2", jobs=records, next=following, is_later=is_later)
 
 
 @router.get("/jobs/{id}")
@@ -71,15 +70,14 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
     record = find_job(state, caller, id)
     folder = state.folder.of_job(id) / RESULT
     summary = pages.read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
-    columns, cameras = pages.camera_table(summary.get("cameras", {}))
     return _page(
         request,
         "job.html.j2",
-        job=pages.job_view(record, state.runner.step(id)),
+        job=record,
+        step=state.runner.step(id),
         actions=pages.actions_of(summary),
         reasons=pages.reasons_of(summary),
-        columns=columns,
-        cameras=cameras,
+        cameras=summary.get("cameras", {}),
         page=_explanation(state, record),
         links=_links(record),
     )
@@ -113,7 +111,7 @@ def _links(record: JobRecord) -> list[dict[str, str]]:
 @router.get("/new/{kind}")
 def new_page(kind: JobKind, request: Request, caller: Visitor) -> Response:
     """The form of a new job."""
-    return _page(request, "new.html.j2", problem=None, **form_of(kind))
+    return _page(request, "new.html.j2", problem=None, kind=kind)
 
 
 @router.post("/new/{kind}")
@@ -125,18 +123,14 @@ async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor
         record, _ = await submit(state, request, caller, kind, key=None)
     except (Problem, CalibrationError) as error:
         status = error.status if isinstance(error, Problem) else 422
-        return _page(request, "new.html.j2", status, problem=str(error), **form_of(kind))
+        return _page(request, "new.html.j2", status, problem=str(error), kind=kind)
     return RedirectResponse(f"/jobs/{record.id}", 303)
 
 
 @router.get("/trackers")
 def trackers_page(request: Request, state: State, caller: Visitor) -> Response:
     """The trackers."""
-    trackers = [
-        {"id": record.id, "name": record.name, "created": pages.minute_of(record.created_s)}
-        for record in state.tracker_table.list(caller)
-    ]
-    return _page(request, "trackers.html.j2", trackers=trackers)
+    return _page(request, "trackers.html.j2", trackers=state.tracker_table.list(caller))
 
 
 @router.get("/trackers/{id}")
@@ -144,18 +138,16 @@ async def tracker_page(id: str, request: Request, state: State, caller: Visitor)
     """A tracker: its verdict, its alarms, its extrinsics over time."""
     record = await run_in_threadpool(find_tracker, state, caller, id)
     found: dict[str, Any] = await ask_tracker(state, caller, id, "state")
-    columns, cameras = pages.camera_table(found["cameras"])
     return _page(
         request,
         "tracker.html.j2",
-        tracker={"name": record.name, "created": pages.minute_of(record.created_s)},
+        tracker=record,
         verdict_word=found["verdict"],
         frame=found["frame"],
         reasons=found["reasons"],
         events=[event["text"] for event in reversed(found["events"])],
         plot=f"/v1/trackers/{id}/drift.png",
-        columns=columns,
-        cameras=cameras,
+        cameras=found["cameras"],
     )
 
 

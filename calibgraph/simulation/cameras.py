@@ -1,7 +1,5 @@
 """Cameras in a simulated world: the rays of a lens, and pictures."""
 
-from __future__ import annotations
-
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Simulated correspondences: a rig, a scene and a matcher's errors, from one seed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

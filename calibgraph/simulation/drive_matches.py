@@ -1,7 +1,5 @@
 """Simulated drives: correspondences frame by frame, of cameras that move, fail and are blind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 

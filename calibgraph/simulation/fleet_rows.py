@@ -1,7 +1,5 @@
 """Simulated fleets with known deviations: rows as `calibgraph fleet` writes them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

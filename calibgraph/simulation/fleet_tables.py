@@ -1,7 +1,5 @@
 """A simulated fleet of tables: a manifest, and per vehicle a table and its true rig."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pyarrow as pa

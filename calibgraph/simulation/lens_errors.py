@@ -1,7 +1,5 @@
 """Lenses as a target's calibration states them, which is not quite as they are."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """A spinning LiDAR in a simulated world."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The errors of a simulated matcher."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Painted triangles: the solids of a street, and ribbons of ground along a line."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -3,8 +3,6 @@
 Albedos have four linear channels: blue, green, red, and near infrared, which the LiDAR sees.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

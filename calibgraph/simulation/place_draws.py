@@ -1,7 +1,5 @@
 """Tables of several places that state the errors which were drawn, with the truth beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import gtsam

@@ -1,7 +1,5 @@
 """A simulated recording: the dataset of a rig that drives along a street."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,8 +1,6 @@
 """Rigs to simulate with, by name; their extrinsics are the truth."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera, Intrinsics, Rig
+from factors import LensModel
 
 Array = NDArray[np.float64]
+Cameras = dict[str, Camera]
+Views = Mapping[str, tuple[Array | tuple[float, ...], tuple[float, ...]]]
+"""By camera, its position in the LiDAR's frame [m], and yaw, pitch and roll [deg]."""
 
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Rotation of a camera that looks along the LiDAR's x axis; the LiDAR's z axis is up."""
@@ -37,116 +39,67 @@ def rig_of(name: str) -> Rig:
     return Rig(cameras=_RIGS[name]())
 
 
-def _kitti() -> dict[str, Camera]:
-    places = {"image_2": 0.06, "image_3": -0.48}
-    return {
-        name: Camera(
-            width_px=1241,
-            height_px=376,
-            intrinsics_px=Intrinsics(fx=718.856, fy=718.856, cx=607.1928, cy=185.2157),
-            T_camera_lidar=_mounted((0.27, y, -0.08), (-0.1, 0.9, -0.4)),
-        )
-        for name, y in places.items()
-    }
+def _kitti() -> Cameras:
+    lens = (718.856, 718.856, 607.1928, 185.2157)
+    places = {"image_2": (0.27, 0.06, -0.08), "image_3": (0.27, -0.48, -0.08)}
+    views = {name: (xyz_m, (-0.1, 0.9, -0.4)) for name, xyz_m in places.items()}
+    return _alike(views, (1241, 376), lens)
 
 
-def _sample() -> dict[str, Camera]:
+def _sample() -> Cameras:
     """Small images: two cameras ahead, and a distorted one to the left."""
-    wide = (-0.14, 0.035, 0.0006, -0.0004, -0.003)
-    views = {
-        "front_left": ((481.3, 480.6, 318.9, 181.2), (), (0.42, 0.26, -0.34), (6, 4, 0.5)),
-        "front_right": ((478.2, 478.9, 321.4, 178.6), (), (0.41, -0.25, -0.35), (-7, 3.5, -0.7)),
-        "left": ((476.5, 477.1, 320.7, 180.9), wide, (0.08, 0.40, -0.30), (75, 5, 0.9)),
-    }
+    left, right = ((0.42, 0.26, -0.34), (6, 4, 0.5)), ((0.41, -0.25, -0.35), (-7, 3.5, -0.7))
+    to_the_left = ((0.08, 0.40, -0.30), (75, 5, 0.9))
+    wide, size = (-0.14, 0.035, 0.0006, -0.0004, -0.003), (640, 360)
     return {
-        name: Camera(
-            width_px=640,
-            height_px=360,
-            intrinsics_px=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
-            distortion=distortion,
-            T_camera_lidar=_mounted(xyz_m, turns_deg),
-        )
-        for name, ((fx, fy, cx, cy), distortion, xyz_m, turns_deg) in views.items()
+        **_alike({"front_left": left}, size, (481.3, 480.6, 318.9, 181.2)),
+        **_alike({"front_right": right}, size, (478.2, 478.9, 321.4, 178.6)),
+        **_alike({"left": to_the_left}, size, (476.5, 477.1, 320.7, 180.9), wide),
     }
 
 
-def _walkley() -> dict[str, Camera]:
+def _walkley() -> Cameras:
     """The image size is the paper's; lenses and placement are ours."""
-    lens = (-0.11, 0.07, 0.0004, -0.0003)
-    views = {"primary": (0.3, (1.2, 2.1, 0.3)), "secondary": (-0.3, (-0.8, 1.6, -0.5))}
-    return {
-        name: Camera(
-            width_px=1920,
-            height_px=1200,
-            intrinsics_px=Intrinsics(fx=1362.4, fy=1361.7, cx=958.3, cy=604.6),
-            distortion=lens,
-            T_camera_lidar=_mounted((0.35, y, -0.25), turns),
-        )
-        for name, (y, turns) in views.items()
+    views: Views = {
+        "primary": ((0.35, 0.3, -0.25), (1.2, 2.1, 0.3)),
+        "secondary": ((0.35, -0.3, -0.25), (-0.8, 1.6, -0.5)),
     }
+    distortion = (-0.11, 0.07, 0.0004, -0.0003)
+    return _alike(views, (1920, 1200), (1362.4, 1361.7, 958.3, 604.6), distortion)
 
 
-def _surround() -> dict[str, Camera]:
-    cameras = {}
-    for index, (name, yaw) in enumerate(_SURROUND_YAW_DEG.items()):
-        outwards = Rotation.from_euler("z", yaw, degrees=True).as_matrix()[:, 0]
-        tilt, roll = 3.0 + 0.4 * index, 0.5 - 0.3 * index
-        cameras[name] = Camera(
-            width_px=1280,
-            height_px=800,
-            intrinsics_px=Intrinsics(fx=905.2, fy=904.6, cx=642.1, cy=396.8),
-            distortion=(-0.16, 0.05, 0.0003, -0.0002),
-            T_camera_lidar=_mounted(0.45 * outwards + [0.1, 0.0, -0.3], (yaw, tilt, roll)),
-        )
-    return cameras
+def _surround() -> Cameras:
+    views: Views = {
+        name: (0.45 * _outwards(yaw) + [0.1, 0.0, -0.3], (yaw, 3.0 + 0.4 * i, 0.5 - 0.3 * i))
+        for i, (name, yaw) in enumerate(_SURROUND_YAW_DEG.items())
+    }
+    distortion = (-0.16, 0.05, 0.0003, -0.0002)
+    return _alike(views, (1280, 800), (905.2, 904.6, 642.1, 396.8), distortion)
 
 
-def _fisheye() -> dict[str, Camera]:
-    cameras = {}
-    for index, (name, yaw) in enumerate(_FISHEYE_YAW_DEG.items()):
-        outwards = Rotation.from_euler("z", yaw, degrees=True).as_matrix()[:, 0]
-        cameras[name] = Camera(
-            model="fisheye",
-            width_px=1280,
-            height_px=960,
-            intrinsics_px=Intrinsics(fx=385.0, fy=384.4, cx=641.5, cy=478.2),
-            distortion=(0.05, -0.015, 0.004, -0.001),
-            T_camera_lidar=_mounted(outwards * [1.6, 0.85, 0] + [0, 0, -0.7], (yaw, 20 + index, 0)),
-        )
-    return cameras
+def _fisheye() -> Cameras:
+    views: Views = {
+        name: (_outwards(yaw) * [1.6, 0.85, 0] + [0, 0, -0.7], (yaw, 20 + i, 0))
+        for i, (name, yaw) in enumerate(_FISHEYE_YAW_DEG.items())
+    }
+    lens, distortion = (385.0, 384.4, 641.5, 478.2), (0.05, -0.015, 0.004, -0.001)
+    return _alike(views, (1280, 960), lens, distortion, model="fisheye")
 
 
-def _omni() -> dict[str, Camera]:
-    places = {
+def _omni() -> Cameras:
+    views: Views = {
         "front": ((0.35, 0.0, -0.2), (2.0, 8.0, 0.5)),
         "back": ((-0.4, 0.05, -0.25), (179, 9, 0)),
     }
-    return {
-        name: Camera(
-            model="omnidirectional",
-            width_px=1280,
-            height_px=1280,
-            intrinsics_px=Intrinsics(fx=900.0, fy=898.5, cx=641.2, cy=637.4),
-            distortion=(1.3, -0.02, 0.04, 0.0003, -0.0002),
-            T_camera_lidar=_mounted(xyz_m, turns_deg),
-        )
-        for name, (xyz_m, turns_deg) in places.items()
-    }
+    lens, distortion = (900.0, 898.5, 641.2, 637.4), (1.3, -0.02, 0.04, 0.0003, -0.0002)
+    return _alike(views, (1280, 1280), lens, distortion, model="omnidirectional")
 
 
-def _panorama() -> dict[str, Camera]:
+def _panorama() -> Cameras:
     width, height = 2048, 1024
-    return {
-        "panorama": Camera(
-            model="equirectangular",
-            width_px=width,
-            height_px=height,
-            intrinsics_px=Intrinsics(
-                fx=width / (2 * np.pi), fy=height / np.pi, cx=(width - 1) / 2, cy=(height - 1) / 2
-            ),
-            T_camera_lidar=_mounted((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0)),
-        )
-    }
+    lens = (width / (2 * np.pi), height / np.pi, (width - 1) / 2, (height - 1) / 2)
+    views: Views = {"panorama": ((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0))}
+    return _alike(views, (width, height), lens, model="equirectangular")
 
 
 _SURROUND_YAW_DEG = {
@@ -155,11 +108,39 @@ _SURROUND_YAW_DEG = {
 }  # fmt: skip
 _FISHEYE_YAW_DEG = {"front": 0.0, "left": 91.0, "back": 180.0, "right": -89.0}
 
-_RIGS: dict[str, Callable[[], dict[str, Camera]]] = {
+_RIGS: dict[str, Callable[[], Cameras]] = {
     "kitti": _kitti, "walkley": _walkley, "surround": _surround, "fisheye": _fisheye,
     "omni": _omni, "panorama": _panorama, "sample": _sample,
 }  # fmt: skip
 RIG_NAMES = tuple(_RIGS)
+
+
+def _alike(
+    views: Views,
+    size_px: tuple[int, int],
+    fx_fy_cx_cy: tuple[float, ...],
+    distortion: tuple[float, ...] = (),
+    *,
+    model: LensModel = "pinhole",
+) -> Cameras:
+    """Cameras with the same lens, each at its place."""
+    fx, fy, cx, cy = fx_fy_cx_cy
+    return {
+        name: Camera(
+            model=model,
+            width_px=size_px[0],
+            height_px=size_px[1],
+            intrinsics_px=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
+            distortion=distortion,
+            T_camera_lidar=_mounted(xyz_m, yaw_pitch_roll_deg),
+        )
+        for name, (xyz_m, yaw_pitch_roll_deg) in views.items()
+    }
+
+
+def _outwards(yaw_deg: float) -> Array:
+    """(3,) the horizontal direction of a heading."""
+    return np.asarray(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()[:, 0])
 
 
 def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, ...]) -> Array:

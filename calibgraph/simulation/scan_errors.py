@@ -1,7 +1,5 @@
 """The errors of real scans: wrong beam angles, wide beams, motion, bias."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

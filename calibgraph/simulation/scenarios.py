@@ -1,7 +1,5 @@
 """Named scenarios of correspondences: a rig, and the errors of its matcher."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A simulated matcher: correspondences of one camera and frame, with a matcher's errors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict

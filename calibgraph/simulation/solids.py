@@ -3,8 +3,6 @@
 Frames: x along the street, y to the left of it, z up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 

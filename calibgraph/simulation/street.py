@@ -4,8 +4,6 @@ Frames: world x is ahead on average, y left, z up; a place in the street is its 
 centreline and its distance y to the left of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 

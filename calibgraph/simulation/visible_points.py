@@ -1,7 +1,5 @@
 """Random LiDAR points that a camera sees: at random depths, or on a street."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Frame: z is up. Colours are linear, blue, green, red.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

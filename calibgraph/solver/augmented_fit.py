@@ -1,7 +1,5 @@
 """A robust fit of one camera's pose together with further unknowns, such as those of its lens."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

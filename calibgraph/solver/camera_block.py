@@ -165,10 +165,6 @@ class CameraBlock:
         errors_px, projectable = self.errors_px(T_camera_lidar)
         return np.asarray(projectable & (errors_px <= gate_px))
 
-    def gate_hessian(self, T_camera_lidar: Array, scale: ResidualScale) -> Array:
-        """As :meth:`BlockResiduals.gate_hessian`."""
-        return self.at(T_camera_lidar).gate_hessian(scale)
-
     def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
         """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
         if len(candidates) == 1:
@@ -188,21 +184,12 @@ class CameraBlock:
         sizes_px, sizes = self.all_sizes(T_camera_lidar[None])
         spread_px = robust_spread(sizes_px)
         spread = spread_px if sizes is sizes_px else robust_spread(sizes)
-        if spread < self._most_least_spread:
-            spread = max(spread, self.least_spread)
-        return scale_from(spread_px, spread, config)
+        return scale_from(spread_px, max(spread, self.least_spread), config)
 
     def _any_projectable(self, T_camera_lidar: Array) -> bool:
         """Whether any correspondence is in front of the camera: mostly, one of the first is."""
         first = self.select(np.arange(min(_FIRST, len(self.frame))))
         return any(some.at(T_camera_lidar).projectable.any() for some in (first, self))
-
-    @cached_property
-    def _most_least_spread(self) -> float:
-        """No less than the least spread, without a median."""
-        root = self.block.sqrt_information
-        largest = 1.0 if root is None or not len(root) else np.abs(root).max()
-        return float(2.0 * MIN_SIGMA_PX * largest)
 
     @cached_property
     def least_spread(self) -> float:

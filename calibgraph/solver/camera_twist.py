@@ -1,7 +1,5 @@
 """A camera under a twist of its extrinsic: its pose, its pixels, and their derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

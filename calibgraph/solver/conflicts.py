@@ -1,7 +1,5 @@
 """Measured relative poses beside the correspondences' own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

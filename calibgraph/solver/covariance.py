@@ -1,7 +1,5 @@
 """Cluster-robust covariance: matches of one frame share their errors, frames do not."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

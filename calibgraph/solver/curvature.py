@@ -1,7 +1,5 @@
 """Second derivatives of the cost at a solution: of the correspondences, and of all terms."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The correspondences and camera pairs of a solve, sorted by place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

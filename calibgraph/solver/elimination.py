@@ -20,6 +20,7 @@ from calibgraph.graph.linear_data import LinearData
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
+    aligned_key,
     camera_key,
     cloud_at_key,
     matched_at_key,
@@ -87,15 +88,15 @@ class Linearization:
 
     @cached_property
     def information(self) -> Array:
-        """(6 N, 6 N) marginal information of all x_c."""
+        """(6 N, 6 N) marginal information of all reported poses."""
         model = self.model
         return marginal_information(
-            self.graph, model.place_keys + model.shared_keys, model.camera_keys
+            self.graph, model.place_keys + model.shared_keys, model.reported_keys
         )
 
     @cached_property
     def covariance(self) -> Array:
-        """(6 N, 6 N) marginal covariance of all x_c, in their tangents."""
+        """(6 N, 6 N) marginal covariance of all reported poses, in their tangents."""
         return np.asarray(np.linalg.inv(self.information))
 
     @cached_property
@@ -167,17 +168,24 @@ class LatentPoseFit:
 
     @property
     def covariance(self) -> Array:
-        """(6 N, 6 N) marginal of all x_c, in their tangents."""
+        """(6 N, 6 N) marginal of all reported poses, in their tangents."""
         return self.linear.covariance
 
     @property
+    def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
+        """All reported poses, in the order of the cameras."""
+        return tuple(map(self.linear.values.atPose3, self.linear.model.reported_keys))
+
+    @property
     def T_camera_lidar(self) -> dict[str, Array]:
-        """Per camera, (4, 4)."""
-        model, values = self.linear.model, self.linear.values
-        return {
-            name: to_T_camera_lidar(values.atPose3(camera_key(number)))
-            for number, name in enumerate(model.cameras)
-        }
+        """Per camera, (4, 4) as reported."""
+        poses = map(to_T_camera_lidar, self.T_lidar_camera)
+        return dict(zip(self.linear.model.cameras, poses, strict=True))
+
+    @cached_property
+    def of_mount(self) -> LatentPoseFit:
+        """The same optimum; the mounts are reported."""
+        return self.with_model(replace(self.linear.model, of="mount"))
 
     @cached_property
     def distortion(self) -> tuple[Array, Array]:
@@ -242,6 +250,8 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
     poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in model.cameras]
     for number, pose in enumerate(poses):
         values.insert(camera_key(number), pose)
+    for number in model.aligned:
+        values.insert(aligned_key(number), poses[number])
     for number in model.matched:
         values.insert(matched_key(number), poses[number])
     for number in model.paired:

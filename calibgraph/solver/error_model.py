@@ -141,12 +141,13 @@ def fit_without_priors(
 def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
     """Without the relative poses that the correspondences of both their cameras contradict."""
     cameras, limit = free.model.cameras, error_components().contradiction_sigmas
-    measured, T = inliers.rig.relative_poses, free.T_camera_lidar
+    measured, mount = inliers.rig.relative_poses, free.fit.of_mount
+    T = mount.T_camera_lidar
     kept = tuple(
         pair
         for pair in measured
         if not {pair.a, pair.b} <= set(cameras)
-        or relative_pose_conflict(pair, cameras, T, free.fit.covariance).largest <= limit
+        or relative_pose_conflict(pair, cameras, T, mount.covariance).largest <= limit
     )
     if len(kept) == len(measured):
         return inliers
@@ -232,7 +233,8 @@ def error_model(
         ),
     )
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
-    return LatentPoseModel(cameras, blocks, pairs_by_place(pairs, places), graph, components)
+    features = pairs_by_place(pairs, places)
+    return LatentPoseModel(cameras, blocks, features, graph, components, inliers.config.of)
 
 
 def held_graph(

@@ -6,8 +6,6 @@ different factors are independent, and their variances C J^T M S M J C add up to
 the rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -91,7 +89,7 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
         shared = replace(model, components=parts).shared_graph.linearize(linear.values)
         graph = join_linear(shared, *times * [summary])
         found[times] = np.diag(
-            np.linalg.inv(marginal_information(graph, model.shared_keys, model.camera_keys))
+            np.linalg.inv(marginal_information(graph, model.shared_keys, model.reported_keys))
         )
     return found
 
@@ -108,7 +106,7 @@ def _of_shared(linear: Linearization) -> Variances:
     """
     model = linear.model
     summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
-    keys = model.camera_keys + model.shared_keys[: -len(model.cameras)]
+    keys = model.reported_keys + model.shared_keys[: -len(model.cameras)]
     sizes = [len(_DISTORTIONS) if key == DISTORTION else 6 for key in keys]
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))
     hessian = join_linear(linear.shared, summary).hessian(to_ordering(keys))[0]
@@ -126,7 +124,7 @@ def _of_shared(linear: Linearization) -> Variances:
             for name, part in zip(_DISTORTIONS, (moved**2).T, strict=True):
                 found[name] = found[name] + part
             continue
-        source = PAIRS if "n" in letters else COMMON if letters & {"m", "o"} else PRIORS
+        source = PAIRS if "n" in letters else COMMON if letters & {"m", "o", "y"} else PRIORS
         found[source] = found[source] + (moved**2).sum(axis=1)
     return found
 

@@ -1,7 +1,5 @@
 """The extrinsic of every frame by itself, and the spread of its residuals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Robust poses of many frames of one camera at once: Levenberg-Marquardt over stacked sums."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

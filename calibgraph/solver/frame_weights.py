@@ -8,8 +8,6 @@ matches; a frame far from where frames are densest has weight zero. Confidences 
 deviations by the residuals of the matches that have them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +27,6 @@ from calibgraph.solver.frame_poses import solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
-from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -49,7 +46,6 @@ _MAX_CANDIDATES = 200  # frames of which the own extrinsic is tried as a start
 _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
-_DIGIT, _DIGITS = 11, 3  # bits of a confidence that it is sorted by at a time
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
 
 
@@ -238,7 +234,7 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
         confidence: (n,) of the same matches.
     """
     known = np.flatnonzero(np.isfinite(sizes))
-    order = known[_order_of(confidence[known])]
+    order = known[np.argsort(confidence[known].astype(np.float32), kind="stable")]
     if count_groups(len(order)) == 1 or confidence[order[0]] == confidence[order[-1]]:
         return np.ones(len(sizes))
     groups = _equal_runs(len(order), count_groups(len(order)))
@@ -274,25 +270,3 @@ def falling_logarithms(spreads: Array, counts: NDArray[np.int64]) -> Array:
     logarithms = np.log(np.maximum(spreads, _MIN_SIZE))
     falling: Array = isotonic_regression(logarithms, weights=counts, increasing=False).x
     return falling
-
-
-@compiled()
-def _order_of(confidence):  # type: ignore[no-untyped-def]
-    """(n,) stable ascending order of positive numbers, in single precision.
-
-    By their bits, which order positive floats: digit by digit, the lowest first.
-    """
-    bits = confidence.astype(np.float32).view(np.int32)
-    order, other = np.arange(len(bits)), np.empty(len(bits), dtype=np.int64)
-    mask = (1 << _DIGIT) - 1
-    for shift in range(0, _DIGIT * _DIGITS, _DIGIT):
-        place = np.zeros((1 << _DIGIT) + 1, dtype=np.int64)
-        for i in range(len(bits)):
-            place[((bits[i] >> shift) & mask) + 1] += 1
-        place = np.cumsum(place)
-        for row in order:
-            digit = (bits[row] >> shift) & mask
-            other[place[digit]] = row
-            place[digit] += 1
-        order, other = other, order
-    return order

@@ -1,7 +1,5 @@
 """The best match of each cell of the image grid, in one pass over the matches."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

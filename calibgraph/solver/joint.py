@@ -1,7 +1,5 @@
 """The method: section 3 of the paper in one function, :func:`solve_joint`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -23,6 +23,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
 from calibgraph.solver.curvature import Curvature, curvature_at, robust_hessians
+from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,
@@ -41,16 +42,28 @@ _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unk
 
 
 @dataclass(frozen=True, eq=False)
-class DataOnly:
-    """The solution of the correspondences alone, without priors and relative poses.
+class JointPoses:
+    """Poses of several cameras, with the covariance of all.
 
     Attributes:
-        T_camera_lidar: per camera that has correspondences, (4, 4).
+        T_camera_lidar: per camera, (4, 4).
         covariance: (6 M, 6 M) in the order of ``T_camera_lidar``, or None.
+        errors: the error model that they are of; None where there is none.
     """
 
     T_camera_lidar: Transforms
     covariance: Array | None
+    errors: LatentPoseFit | None = None
+
+    @staticmethod
+    def of(errors: LatentPoseFit) -> JointPoses:
+        """Optimum and marginal of an error model."""
+        return JointPoses(errors.T_camera_lidar, errors.covariance, errors)
+
+    @property
+    def mount(self) -> JointPoses:
+        """The same of the mounts, between which relative poses are measured."""
+        return self if self.errors is None else JointPoses.of(self.errors.of_mount)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +184,16 @@ class Marginals:
     @cached_property
     def shared_variance_ratio(self) -> float:
         """Variance of the shared error relative to its prior, from co-visible features."""
-        own = self.alone
-        if own is None or own.covariance is None:
+        mount = None if self.alone is None else self.alone.mount
+        if self.alone is None or mount is None or mount.covariance is None:
             return 1.0
-        return shared_variance_ratio(own.at.T_camera_lidar, own.covariance, own.pair_fits)
+        return shared_variance_ratio(mount.T_camera_lidar, mount.covariance, self.alone.pair_fits)
+
+    @property
+    def mount(self) -> JointPoses:
+        """Poses and covariance of the mounts, between which images show relative poses."""
+        found = JointPoses(self.at.T_camera_lidar, self.covariance)
+        return found if self.errors is None else JointPoses.of(self.errors.fit.of_mount)
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
@@ -211,7 +230,7 @@ class Marginals:
         return curvature.sandwich(scatter)
 
     @cached_property
-    def data_only(self) -> DataOnly | None:
+    def data_only(self) -> JointPoses | None:
         """The solution of the correspondences alone; None where there is nothing else."""
         if not self.at.objective.uses_correspondences or not self.at.objective.pose_graph.size():
             return None
@@ -219,17 +238,17 @@ class Marginals:
             return found
         free = self.at.data_only()
         if self.at.objective.config.preset == "auto":
-            return DataOnly(free.T_camera_lidar, None)
+            return JointPoses(free.T_camera_lidar, None)
         curvature = curvature_at(free, robust_hessians(free))
         scatter = cluster_robust_covariance(free, curvature)
         if scatter is None:
-            return DataOnly(free.T_camera_lidar, None)
+            return JointPoses(free.T_camera_lidar, None)
         shared = self._shared(free.objective, curvature)
         between = error_between(free.T_camera_lidar, free.objective.pairs)
-        return DataOnly(free.T_camera_lidar, scatter + (shared + between))
+        return JointPoses(free.T_camera_lidar, scatter + (shared + between))
 
     @property
-    def _data_only_by_errors(self) -> DataOnly | None:
+    def _data_only_by_errors(self) -> JointPoses | None:
         """The same by the error model, None where there is none."""
         errors = self.errors
         if (
@@ -239,12 +258,12 @@ class Marginals:
         ):
             fit = errors.drop_pose_graph()  # near its minimum already
             if fit is not None and len(errors.model.blocks) == len(self.cameras):
-                return DataOnly(fit.T_camera_lidar, fit.covariance)
+                return JointPoses.of(fit)
         alone = None if errors is None else errors.without_priors
         if alone is None:
             places = self.table.places
             alone = fit_without_priors(self.at, self.findings, places)
-        return None if alone is None else DataOnly(alone.T_camera_lidar, alone.fit.covariance)
+        return None if alone is None else JointPoses.of(alone.fit)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
@@ -252,8 +271,9 @@ class Marginals:
         free, cameras = self.data_only, tuple(self.at.objective.blocks)
         if free is None:
             return ()
+        mount = free.mount
         return tuple(
-            relative_pose_conflict(pair, cameras, free.T_camera_lidar, free.covariance)
+            relative_pose_conflict(pair, cameras, mount.T_camera_lidar, mount.covariance)
             for pair in self.at.objective.rig.relative_poses
             if pair.a in cameras and pair.b in cameras
         )

@@ -3,8 +3,6 @@
 Every row has two parts, those of a pixel's u and v. Columns are (m, 2, n), contiguous along rows.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

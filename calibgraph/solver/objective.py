@@ -90,7 +90,7 @@ class Objective:
     def gate_hessian(self) -> dict[str, Array]:
         """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
         return {
-            name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()
+            name: block.at(T).gate_hessian(scale) for name, (block, T, scale) in self.gated.items()
         }
 
     def coarse(self, matches: int) -> Objective:

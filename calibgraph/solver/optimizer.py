@@ -1,7 +1,5 @@
 """GTSAM's Levenberg-Marquardt on a graph of the cameras' poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

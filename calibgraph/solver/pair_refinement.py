@@ -1,7 +1,5 @@
 """What cameras see in common: the last step of the joint solve, and a fit of one pair alone."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """One camera's extrinsic from its correspondences in single frames: robust PnP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
@@ -48,6 +46,18 @@ class Refined:
     T_camera_lidar: Array
     found: NDArray[np.bool_]
     inliers: NDArray[np.int64]
+
+
+def magsac(threshold: float, *, iterations: int, seed: int) -> cv2.UsacParams:
+    """Settings of OpenCV's RANSAC with the score of MAGSAC and a local optimization."""
+    parameters = cv2.UsacParams()
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.threshold = threshold
+    parameters.maxIterations = iterations
+    parameters.confidence = 0.999
+    parameters.randomGeneratorState = seed
+    return parameters
 
 
 def frame_pose(
@@ -115,13 +125,7 @@ def ransac_pnp(
     usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
     if np.count_nonzero(usable) < MIN_MATCHES:
         return None
-    parameters = cv2.UsacParams()
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    parameters.threshold = config.pnp_threshold_px
-    parameters.maxIterations = iterations
-    parameters.confidence = 0.999
-    parameters.randomGeneratorState = config.seed
+    parameters = magsac(config.pnp_threshold_px, iterations=iterations, seed=config.seed)
     focal = camera.lens.pixels_per_rad
     ideal = np.diag([focal, focal, 1.0])
     try:

@@ -1,7 +1,5 @@
 """The paper's correspondence preprocessing, with a count at every filter."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +10,9 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.correspondence_tables import parts_of_table
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
+from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.rig import Rig
+from calibgraph.model.table_columns import rows_where
 from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
 from calibgraph.solver.repeats import number_repeats
 from calibgraph.solver.shared_error import with_common_error

@@ -1,14 +1,12 @@
 """The variance components of the error model before the data refine them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.latent_poses import VarianceComponents
+from calibgraph.graph.latent_poses import EXACT, VarianceComponents
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.pair_refinement import pair_sigmas
@@ -16,8 +14,6 @@ from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
 
 Array = NDArray[np.float64]
-
-_LEAST_SIGMA = 1e-5  # rad and m: as exact is what is stated to be so; less is lost in rounding
 
 
 def variance_components(
@@ -82,4 +78,4 @@ def common_error(
 
 def pose_covariance(rotation_rad2: float, translation_m2: float) -> Array:
     """(6, 6), positive definite, from the variance per axis."""
-    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), _LEAST_SIGMA**2))
+    return np.diag(np.maximum(np.repeat([rotation_rad2, translation_m2], 3), EXACT**2))

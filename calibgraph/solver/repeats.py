@@ -4,8 +4,6 @@ While a vehicle stands, every frame has the same errors; so have copies of a fra
 independent, they would make the error bar too small, down to nothing.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -8,8 +8,6 @@ matches by an amount that depends on their points. The part that no pose can fol
 residuals and measures the distortion: informative for a panoramic camera, weak for a narrow one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The error that all frames of a recording share, which the scatter between frames cannot show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import gtsam

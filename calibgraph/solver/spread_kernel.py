@@ -4,8 +4,6 @@ Values go into bins by their leading bits, which order positive floats; only the
 wanted order statistic are sorted.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -25,12 +25,12 @@ from calibgraph.solver.pnp import (
     refine_frames,
     select_evenly,
 )
-from calibgraph.solver.rotation_median import median_rotation
 from factors import ProjectionBlock, to_runs
 
 Array = NDArray[np.float64]
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
+_MEDIAN_STEPS, _CONVERGED_RAD = 100, 1e-12  # far below any rotation that matters
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
 COMMON_SAMPLE = 1000
 """Matches of all frames, for a pose that single frames start from."""
@@ -243,8 +243,27 @@ def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:
 
 def geodesic_median(rotations: Rotation) -> Rotation:
     """Rotation with the least sum of angles to the given ones (Weiszfeld on SO(3))."""
-    quaternions = np.ascontiguousarray(rotations.as_quat())
-    return Rotation.from_quat(median_rotation(quaternions, quaternions[_medoid(rotations)]))
+    quaternions = rotations.as_quat()
+    median = quaternions[_medoid(rotations)]
+    for _ in range(_MEDIAN_STEPS):
+        turns = quaternions @ _right_factor(median * (-1.0, -1.0, -1.0, 1.0))  # q * median^-1
+        sines, cosines = np.linalg.norm(turns[:, :3], axis=1), turns[:, 3]
+        angles = 2.0 * np.arctan2(sines, np.abs(cosines))
+        weights = 1.0 / np.maximum(angles, _CONVERGED_RAD)
+        per_sine = np.where(sines > 0, angles / np.where(sines > 0, sines, 1.0), 2.0)
+        step = (weights * per_sine * np.copysign(1.0, cosines)) @ turns[:, :3] / weights.sum()
+        length = float(np.linalg.norm(step))
+        half = 0.5 * np.sinc(length / (2 * np.pi))  # sin(length / 2) / length
+        median = np.array([*(half * step), np.cos(length / 2)]) @ _right_factor(median)
+        if length < _CONVERGED_RAD:
+            break
+    return Rotation.from_quat(median)
+
+
+def _right_factor(quaternion: Array) -> Array:
+    """(4, 4) M with p q = p M, of a quaternion q, x y z w."""
+    x, y, z, w = quaternion
+    return np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]])
 
 
 def _medoid(rotations: Rotation) -> int:

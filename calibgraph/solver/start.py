@@ -1,7 +1,5 @@
 """The start of the joint solve, and whether every camera can be determined at all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

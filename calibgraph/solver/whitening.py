@@ -5,8 +5,6 @@ information of its pixel. A match on an edge has information of rank one: it con
 direction only.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

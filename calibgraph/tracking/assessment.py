@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
+from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.elimination import LatentPoseFit
@@ -163,11 +163,14 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
+    known = None if np.isnan(joint).any() else joint
+    rig = state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
     return Calibration(
-        rig=state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates}),
+        rig=rig,
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
-        joint_covariance=None if np.isnan(joint).any() else joint,
+        joint_covariance=known,
+        pair_covariance=pair_covariances(known, rig.T_camera_lidar),
         camera_verdicts=assessment.verdicts,
         residuals={
             name: recent_residuals(one)

@@ -211,9 +211,7 @@ def joint_estimate(state: State, sums: Posterior, closed: ClosedPlaces) -> Joint
     if closed.findings != state.findings:
         closed = ClosedPlaces.of(state)
     fit, conflicts = closed.fit_with(state, sums)
-    estimates, values = state.T_lidar_camera, fit.linear.values
-    if state.config.preset == "auto":
-        estimates = tuple(values.atPose3(camera_key(c)) for c in range(len(state.cameras)))
+    estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
     covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
@@ -292,7 +290,8 @@ def _conflicts(
         return {}
     others = [name for name in state.names if name not in names]
     held = held_graph(state.names, _by_name(state), others)
-    linear = Linearization.at(replace(model, pose_graph=join(held, model.pose_graph)), values)
+    mounts = replace(model, pose_graph=join(held, model.pose_graph), of="mount")
+    linear = Linearization.at(mounts, values)
     found, rows = linear.values.retract(linear.step), _rows(known)
     covariance = linear.covariance[np.ix_(rows, rows)]
     T = {

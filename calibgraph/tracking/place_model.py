@@ -161,7 +161,8 @@ def place_model(
         robust_scale=prior.robust_sigmas if robust else np.inf,
     )
     components = state.sizes.scale(components)
-    return LatentPoseModel(names, blocks, (), gtsam.NonlinearFactorGraph(), components)
+    none = gtsam.NonlinearFactorGraph()
+    return LatentPoseModel(names, blocks, (), none, components, state.config.of)
 
 
 def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_difference, pose_rows, relative_transform
+from calibgraph.model.geometry import (
+    pose_difference,
+    pose_rows,
+    relative_transform,
+    twist_between,
+)
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
@@ -22,9 +27,15 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors, widen
+from calibgraph.trust.pose_posterior import (
+    PosePosterior,
+    group_tied,
+    no_posteriors,
+    widen,
+)
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.thresholds import limit
+from factors import pose_sigmas
 
 Array = NDArray[np.float64]
 
@@ -34,6 +45,11 @@ Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
 
 
+MeasurePosteriors = Callable[
+    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
+]
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """A solution, the first guess, and the values that checks compute from them.
@@ -41,13 +57,14 @@ class Evidence:
     Attributes:
         solution: of the joint solve.
         guess: the rig as it was first guessed.
-        measure_posteriors: of the (6, 6) covariances by the matches, per camera, the posteriors by
-            the images' evidence; none where nothing but correspondences is known.
+        measure_posteriors: of the (6, 6) covariances by the matches, per camera, and of groups of
+            cameras that move together, the posteriors by the images' evidence; none where nothing
+            but correspondences is known.
     """
 
     solution: Solution
     guess: Rig
-    measure_posteriors: Callable[[Mapping[str, Array]], Mapping[str, PosePosterior]] = no_posteriors
+    measure_posteriors: MeasurePosteriors = no_posteriors
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -89,11 +106,23 @@ class Evidence:
 
         Cameras that are held are unknown by a radian and a metre.
         """
-        if self.covariance_of_matches is None or not self.posteriors:
-            return self.covariance_of_matches
+        return self._widened(self.covariance_of_matches)
+
+    @property
+    def mount_covariance(self) -> Array | None:
+        """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
+        mount = self.solution.marginals.mount
+        if mount.covariance is None:
+            return None
+        of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
+        away = np.concatenate([twist_between(of[name], T[name]) for name in T])
+        return self._widened(mount.covariance + np.outer(away, away))
+
+    def _widened(self, joint: Array | None) -> Array | None:
+        if joint is None or not self.posteriors:
+            return joint
         posteriors = self.posteriors.items()
-        moments = {self.cameras.index(name): found.moments for name, found in posteriors}
-        return widen(self.covariance_of_matches, moments)
+        return widen(joint, {self.cameras.index(name): of.moments for name, of in posteriors})
 
     @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
@@ -102,7 +131,19 @@ class Evidence:
             return {}
         free = [name for name in self.cameras if name not in self.solution.held]
         known = self.covariance_of_matches
-        return self.measure_posteriors({name: self._rows_of(known, name) for name in free})
+        own = {name: self._rows_of(known, name) for name in free}
+        return self.measure_posteriors(own, group_tied(free, self._relative_poses))
+
+    @property
+    def _relative_poses(self) -> Iterator[tuple[str, str, Array]]:
+        """Those that are known without the cloud, with (6, 6) covariances."""
+        for fit in self.solution.marginals.pair_fits:
+            yield fit.a, fit.b, fit.covariance
+        for pose in self.solution.inliers.rig.relative_poses:
+            sigmas = pose_sigmas(
+                rotation_rad=pose.rotation_sigma_rad, translation_m=pose.translation_sigma_m
+            )
+            yield pose.a, pose.b, np.diag(sigmas**2)
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
@@ -130,11 +171,6 @@ class Evidence:
         """The relative poses of pairs by images, the first camera held near the solution."""
         marginals, joint = self.solution.marginals, self.joint_covariance
         return marginals.pair_fits if not self.posteriors else marginals.fit_pairs_near(joint)
-
-    @cached_property
-    def pair_covariance(self) -> Array:
-        """(6 N, 6 N) covariance of the solution; a prior where it is not determined."""
-        return self.solution.marginals.known_or_prior(self.joint_covariance)
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
@@ -164,7 +200,7 @@ class Evidence:
         errors = self.solution.marginals.errors
         if errors is None:
             return prior_shares(self.solution, self.solution.marginals.robust_hessians)
-        return shares_of_marginal(self.solution, errors.fit.covariance)
+        return shares_of_marginal(self.solution, errors.fit.of_mount.covariance)
 
     @cached_property
     def even_frames(self) -> NDArray[np.int64]:

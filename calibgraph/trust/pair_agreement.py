@@ -58,8 +58,11 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     own = evidence.of_correspondences
     if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
         return {}
+    mount = own.solution.marginals.mount
+    rig = own.solution.rig.moved_to(mount.T_camera_lidar)
+    covariance = own.solution.marginals.known_or_prior(mount.covariance)
     found = [
-        pair_agreement(own.solution.solved_rig, fit, own.pair_covariance)
+        pair_agreement(rig, fit, covariance)
         for fit in own.pair_fits
         if own.fitted_blocks.keys() >= {fit.a, fit.b}
     ]
@@ -95,7 +98,7 @@ def pair_agreement(rig: Rig, fit: PairFit, covariance: Array | None) -> PairAgre
     """A pair by its images against a calibration.
 
     Args:
-        rig: at the calibration, which has not used the images' matches.
+        rig: mounts at the calibration, which has not used the images' matches.
         fit: with A held near it.
         covariance: (6 N, 6 N) of the calibration, in the rig's order; None if unknown.
     """

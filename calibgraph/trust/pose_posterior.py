@@ -4,21 +4,27 @@ The error bar of a solution is that of its matches, which were made near one pos
 tell poses a degree apart as little as chance does, matches agree all the same, and are wrong. So
 either the rounds ended where the matches say, by ``NEAR`` times their error bar, or elsewhere; the
 evidence of both, the likelihood's mean over their priors, tells how likely each is.
+
+Cameras whose relative pose images show, or which is measured, can only be elsewhere together: one
+motion of the cloud for all of them. Their images show the same surfaces, so the evidence is the
+mean, not the sum: with that the truth is as likely under it as by one camera alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
-from calibgraph.model.geometry import pose_rows
+from calibgraph.model.geometry import pose_rows, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.frame_scores import FrameScorer
@@ -37,6 +43,8 @@ rig, a car with six cameras and a 16-beam LiDAR, with their own clouds and with 
 frames; without any one of them it is 4 to 11. The weight of the evidence fits as 0.98, not 1."""
 REACH = pose_sigmas(rotation_rad=np.radians(1.0), translation_m=0.25)
 """(6,) standard deviations of the prior of rounds that ended elsewhere."""
+TIED = 0.1
+"""Share of ``REACH`` below which a relative pose ties two cameras: they are elsewhere together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +66,14 @@ class PosePosterior:
         """(6, 6) second moments of both together."""
         near, elsewhere = (_moments(samples) for samples in (self.near, self.elsewhere))
         return (1.0 - self.share) * near + self.share * elsewhere
+
+    def moved(self, adjoint: Array) -> PosePosterior:
+        """The same of another camera that moves with this one.
+
+        Args:
+            adjoint: (6, 6) from twists of this camera to those of the other.
+        """
+        return PosePosterior(self.near @ adjoint.T, self.elsewhere @ adjoint.T, self.share)
 
     def widest(self, covariance: Array) -> Array:
         """(6, 6): a covariance that is at least that of the poses elsewhere."""
@@ -87,33 +103,81 @@ def _share_beyond(samples: Array, tolerance: tuple[float, float]) -> float:
 
 
 def measure_posteriors(
-    dataset: Dataset, rig: Rig, covariances: Mapping[str, Array], *, seed: int = 0
+    dataset: Dataset,
+    rig: Rig,
+    covariances: Mapping[str, Array],
+    groups: Sequence[Sequence[str]],
+    *,
+    seed: int = 0,
 ) -> dict[str, PosePosterior]:
-    """Per camera that has a covariance, the posterior about a result.
+    """Per camera of a group, the posterior about a result.
 
     Args:
         dataset: images and clouds.
         rig: the result.
         covariances: per camera, (6, 6) of the result by its matches.
+        groups: cameras that move together, see :func:`group_tied`; they have one evidence.
         seed: of the samples.
     """
-    with core_pool() as cores, ThreadPoolExecutor(max(len(covariances), 1)) as pool:
+    with core_pool() as cores, ThreadPoolExecutor(max(len(groups), 1)) as pool:
         scorer = FrameScorer(dataset, spread_out(dataset.frames, MAX_FRAMES), cores)
 
-        def measure(name: str, covariance: Array) -> PosePosterior:
+        def likelihood_of(name: str) -> Callable[[Array], Array]:
             camera = rig.cameras[name]
-            scores = scorer.score_together(scorer.load_images(name, camera), camera, FAR)
-            likelihood, options = log_likelihood(scores), {"samples": SAMPLES, "seed": seed}
-            near, of_near = sample_posterior(likelihood, NEAR**2 * covariance, **options)
-            far, of_far = sample_posterior(likelihood, np.diag(REACH**2), **options)
-            share = float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near))
-            return PosePosterior(near, far, share)
+            return log_likelihood(
+                scorer.score_together(scorer.load_images(name, camera), camera, FAR)
+            )
 
-        found = pool.map(measure, covariances, covariances.values())
-        return dict(zip(covariances, found, strict=True))
+        def measure(group: Sequence[str]) -> dict[str, PosePosterior]:
+            to_first = rig.T_camera_lidar[group[0]]
+            adjoints = [
+                gtsam.Pose3(relative_transform(rig.T_camera_lidar[name], to_first)).AdjointMap()
+                for name in group
+            ]
+            terms = list(zip([*map(likelihood_of, group)], adjoints, strict=True))
+            found = _posterior_of(
+                lambda twists: np.mean([of(twists @ moved.T) for of, moved in terms], axis=0),
+                covariances[group[0]],
+                seed,
+            )
+            return {
+                name: found.moved(adjoint) for name, adjoint in zip(group, adjoints, strict=True)
+            }
+
+        return {name: each for of in pool.map(measure, groups) for name, each in of.items()}
 
 
-def no_posteriors(_: Mapping[str, Array]) -> dict[str, PosePosterior]:
+def _posterior_of(
+    likelihood: Callable[[Array], Array], by_matches: Array, seed: int
+) -> PosePosterior:
+    """Near the result or elsewhere, weighed by the evidence of both."""
+    near, of_near = sample_posterior(likelihood, NEAR**2 * by_matches, samples=SAMPLES, seed=seed)
+    far, of_far = sample_posterior(likelihood, np.diag(REACH**2), samples=SAMPLES, seed=seed)
+    return PosePosterior(near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near)))
+
+
+def group_tied(
+    cameras: Sequence[str], known: Iterable[tuple[str, str, Array]]
+) -> list[tuple[str, ...]]:
+    """The cameras in groups that can only be elsewhere together.
+
+    Args:
+        cameras: of the groups; others are left out.
+        known: two cameras and the (6, 6) covariance of their relative pose without the cloud. It
+            ties them if it is below ``TIED`` of ``REACH`` along every axis.
+    """
+    number, tied = {name: i for i, name in enumerate(cameras)}, np.eye(len(cameras))
+    for a, b, covariance in known:
+        if {a, b} <= set(cameras) and (np.sqrt(np.diag(covariance)) < TIED * REACH).all():
+            tied[number[a], number[b]] = 1.0
+    count, labels = connected_components(tied, directed=False)
+    return [
+        tuple(name for name, of in zip(cameras, labels, strict=True) if of == label)
+        for label in range(count)
+    ]
+
+
+def no_posteriors(*_: object) -> dict[str, PosePosterior]:
     """Of no camera: where there are no images."""
     return {}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,10 +30,14 @@ class RunEvidence:
         """The evidence of the last round's solution."""
         return Evidence(self.run.solution, self.run.guess, self._measure_posteriors)
 
-    def _measure_posteriors(self, covariances: Mapping[str, Array]) -> Mapping[str, PosePosterior]:
+    def _measure_posteriors(
+        self, covariances: Mapping[str, Array], groups: Sequence[Sequence[str]]
+    ) -> Mapping[str, PosePosterior]:
         """By the images; empty with matchers that may use what these scores do not."""
         run = self.run
         if run.out_of_time or not run.matcher.image_checks_can_fail:
             return {}
         seed = run.solution.config.seed
-        return measure_posteriors(run.dataset, run.solution.solved_rig, covariances, seed=seed)
+        return measure_posteriors(
+            run.dataset, run.solution.solved_rig, covariances, groups, seed=seed
+        )

@@ -25,7 +25,7 @@ from calibgraph.solver.augmented_fit import MIN_ROWS, fit_augmented
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-MAX_ROWS = 10_000  # per camera: more of dense matches add no information
+MAX_ROWS = 200  # per camera and frame: more of dense matches add no information
 MAX_FRAMES = 24  # evenly spread over those with a neighbour: bounds the time
 MIN_MOVING_FRAMES = 4  # that move: with fewer, a single frame decides
 MIN_MOTION_PX = 0.5  # median image motion per frame: below, the vehicle stands
@@ -65,7 +65,6 @@ def time_offsets(dataset: Dataset, rig: Rig, table: Correspondences) -> dict[str
     found = {}
     for name, camera in rig.cameras.items():
         rows = table.of_camera(name)
-        rows = rows.select(slice(None, None, -(-len(rows) // MAX_ROWS) or None))
         motion = image_motion(dataset, name, camera, rows)
         offset = time_offset(camera, rows, motion)
         if offset is not None:
@@ -100,9 +99,10 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
 
 
 def image_motion(dataset: Dataset, name: str, camera: Camera, table: Correspondences) -> Array:
-    """(n, 2) motion of each row's pixel per frame interval; NaN where it cannot be tracked.
+    """(n, 2) motion of each row's pixel per frame interval; NaN where it is not known.
 
     The mean of the motions from the previous and to the next image; one of them at either end.
+    Evenly spread frames and rows are tracked.
     """
     motion = np.full((len(table), 2), np.nan)
     with_rows = set(np.unique(table.frame).tolist())
@@ -117,6 +117,7 @@ def image_motion(dataset: Dataset, name: str, camera: Camera, table: Corresponde
             for index, other in wanted.items()
         }
         rows = np.flatnonzero(table.frame == frame.index)
+        rows = rows[:: -(-len(rows) // MAX_ROWS)]
         steps = [
             sign * _tracked(images[frame.index], images[other.index], table.pixels_px[rows])
             for other, sign in near

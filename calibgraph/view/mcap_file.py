@@ -11,10 +11,10 @@ from calibgraph.files import write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
-PROFILE = "calibgraph-view"
 LIDAR_FRAME = "lidar"
 _DISTORTIONS = {"fisheye": "kannala_brandt"}
 _RATIONAL = 8  # coefficients
@@ -91,7 +91,7 @@ class _Messages:
 
     def writer(self, file: Any) -> Any:
         """A writer into an open file."""
-        return self._Writer(file, profile=PROFILE)
+        return self._Writer(file, profile=VIEW_MARK)
 
     def of_frame(self, frame: ViewFrame, result: Calibration) -> list[tuple[str, Any]]:
         """The topics and messages of a frame, stamped."""

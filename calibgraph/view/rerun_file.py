@@ -10,13 +10,13 @@ from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
+from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
 if TYPE_CHECKING:
     import rerun
 
-APPLICATION = "calibgraph-view"
 _AXIS_M = 0.3
 _DOT_PX = 1.5
 
@@ -36,7 +36,7 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
     path = Path(path)
 
     def write(temporary: Path) -> None:
-        recording = rr.RecordingStream(APPLICATION, recording_id=path.stem)
+        recording = rr.RecordingStream(VIEW_MARK, recording_id=path.stem)
         recording.save(str(temporary))
         try:
             _log_result(rr, recording, result, progress)

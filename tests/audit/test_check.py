@@ -119,6 +119,7 @@ def test_one_frame_cannot_tell() -> None:
         assert "record" in camera.reason
 
 
+@pytest.mark.slow
 def test_images_without_structure_cannot_tell(tmp_path: Path) -> None:
     two = TRUTH.model_copy(
         update={"cameras": {n: TRUTH.cameras[n] for n in ("front_left", "left")}}

@@ -55,8 +55,7 @@ def together(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(("name", "loss"), EACH_LENS_AND_LOSS)
 def test_error_and_linearization_equal_the_separate_factors(name: str, loss: str) -> None:
     block = with_loss(world(LENSES[name], 60), loss)
     many, one = separate(block), together(block)
@@ -69,9 +68,14 @@ def test_error_and_linearization_equal_the_separate_factors(name: str, loss: str
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("weights", ["none", "numbers"])
-@pytest.mark.parametrize("name", ["pinhole", "radtan"])
+@pytest.mark.parametrize(
+    ("name", "weights", "loss"),
+    [
+        *(("pinhole", "numbers", loss) for loss in LOSSES),
+        *((name, "none", "huber") for name in ("pinhole", "radtan")),
+        ("radtan", "numbers", "huber"),
+    ],
+)
 def test_numbers_as_weights_equal_the_separate_factors(name: str, weights: str, loss: str) -> None:
     """The kernel has a way of its own for a pinhole whose weights are no matrices.
 
@@ -179,7 +183,7 @@ def solution(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Po
 @pytest.mark.parametrize(("name", "loss"), EACH_LENS_AND_LOSS)
 def test_solution_equals_that_of_the_separate_factors(name: str, loss: str) -> None:
     # Tukey gives no gradient to what is far off: start it where it can work, as documented.
-    block = with_loss(world(LENSES[name], 150, outliers=0.0 if loss == "l2" else 0.2), loss)
+    block = with_loss(world(LENSES[name], 80, outliers=0.0 if loss == "l2" else 0.2), loss)
     start = at(TRUTH.retract(np.full(6, 1e-3 if loss == "tukey" else 0.01)))
     many, one = (solution(graph, start) for graph in (separate(block), together(block)))
     np.testing.assert_allclose(one.matrix(), many.matrix(), rtol=0, atol=1e-9)

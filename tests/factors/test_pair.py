@@ -106,13 +106,13 @@ def linearized(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple
     return graph.error(values), graph.linearize(values).augmentedHessian(ordering)
 
 
-@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES)
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize(
+    ("lenses", "loss"),
+    [*(("mixed", loss) for loss in LOSSES), ("pinhole", "huber"), ("fisheye", "huber")],
+)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_block_equals_its_separate_factors(
-    kind: str, loss: str, lenses: tuple[Lens, Lens]
-) -> None:
-    features, values = Features(lenses, 60), near_truth()
+def test_a_block_equals_its_separate_factors(kind: str, loss: str, lenses: str) -> None:
+    features, values = Features(LENSES[lenses], 60), near_truth()
     one = gtsam.NonlinearFactorGraph()
     one.add(pair_block_factor(A, B, features.block(kind, loss)))
     error, hessian = linearized(one, values)

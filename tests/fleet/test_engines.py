@@ -7,7 +7,8 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -22,12 +23,12 @@ from calibgraph.fleet.task import Limits, Outcome, Task, release
 from calibgraph.simulation.fleet_tables import write_fleet
 from tests.fleet.killing import kill_at_random
 
-MANY = 100
+JOBS, MANY = 12, 100
 
 
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(write_fleet(tmp_path_factory.mktemp("fleet"), 12))
+    return str(write_fleet(tmp_path_factory.mktemp("fleet"), JOBS))
 
 
 @pytest.fixture
@@ -58,6 +59,12 @@ def test_closing_ends_jobs_and_processes(manifest: str) -> None:
     assert not children_of(os.getpid())
 
 
+def end_all(waiting: list[Future[Outcome]]) -> None:
+    for each in waiting:
+        with suppress(InvalidStateError):  # it has ended meanwhile
+            each.set_result(Outcome(error_kind="bad input", error="none"))
+
+
 def test_no_more_is_submitted_than_twice_the_slots(manifest: str, tmp_path: Path) -> None:
     class Counting:
         slots, most = 2, 0
@@ -66,12 +73,13 @@ def test_no_more_is_submitted_than_twice_the_slots(manifest: str, tmp_path: Path
             self.open: list[Future[Outcome]] = []
 
         def submit(self, task: Task) -> Future[Outcome]:
-            future: Future[Outcome] = Future()
-            self.open.append(future)
-            self.most = max(self.most, sum(not each.done() for each in self.open))
-            outcome = Outcome(error_kind="bad input", error="none")
-            threading.Timer(0.01, future.set_result, (outcome,)).start()
-            return future
+            """Jobs end once there are twice as many as slots, or no others; not at a time."""
+            self.open.append(Future())
+            waiting = [each for each in self.open if not each.done()]
+            self.most = max(self.most, len(waiting))
+            if len(waiting) >= 2 * self.slots or len(self.open) == JOBS:
+                threading.Timer(0.1, end_all, (waiting,)).start()
+            return self.open[-1]
 
         def has_workers(self) -> bool:
             return True
@@ -80,7 +88,7 @@ def test_no_more_is_submitted_than_twice_the_slots(manifest: str, tmp_path: Path
             """Nothing to release."""
 
     counting = Counting()
-    assert run_fleet(manifest, str(tmp_path), engine=counting).failures == {"bad input": 12}
+    assert run_fleet(manifest, str(tmp_path), engine=counting).failures == {"bad input": JOBS}
     assert counting.most == 4
 
 

@@ -49,7 +49,7 @@ def count_starts(folder: Path) -> Counter[str]:
 def _fewer_retries() -> Iterator[None]:
     """Each retry of a dead process starts another, which takes a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(RETRIES, "worker died", 2)
+        patch.setitem(RETRIES, "worker died", 1)
         yield
 
 

@@ -110,4 +110,3 @@ def test_the_former_key_of_an_error_probability_is_read(
     for name, verdict in load_calibration(path).camera_verdicts.items():
         assert verdict.error_probability is not None
         assert old.camera_verdicts[name].error_probability == verdict.error_probability
-        assert old.camera_verdicts[name].doubt == verdict.error_probability

@@ -173,12 +173,6 @@ def test_a_current_key_overrides_its_former_one() -> None:
     assert MatcherFindings.from_metadata(both).z_score == {"left": 2.0}
 
 
-def test_the_former_name_of_a_member_is_read() -> None:
-    matcher = Minimal()
-    matcher.fails_on_images = True  # type: ignore[attr-defined]
-    assert to_full_matcher(matcher).image_checks_can_fail  # type: ignore[arg-type]
-
-
 def test_findings_keep_their_keys_on_disk() -> None:
     assert FINDINGS.to_metadata() == METADATA
     assert MatcherFindings.from_metadata(METADATA) == FINDINGS

@@ -23,7 +23,6 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.model.pose_kernel import between_errors
 from tests.conftest import make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
@@ -143,24 +142,6 @@ def test_many_poses_move_as_gtsam_moves_each(size: float) -> None:
             to_T_lidar_camera(T[0]).localCoordinates(to_T_lidar_camera(found)),
             atol=1e-12,
         )
-
-
-def test_between_errors_are_those_of_gtsam() -> None:
-    """To the sixth power of a displacement of 0.02: far below 1e-9."""
-    rng = np.random.default_rng(5)
-    one = [gtsam.Pose3(random_transform(seed)) for seed in range(4)]
-    two = [pose.retract(rng.normal(0, 0.02, 6)) for pose in one]
-    stacked = (np.stack([pose.matrix() for pose in poses]) for poses in (one, two))
-    errors, by_one, by_two = between_errors(*stacked)
-    unit = gtsam.noiseModel.Unit.Create(6)
-    for n, (a, b) in enumerate(zip(one, two, strict=True)):
-        values = gtsam.Values()
-        values.insert(0, a)
-        values.insert(1, b)
-        factor = gtsam.BetweenFactorPose3(0, 1, gtsam.Pose3(), unit)
-        jacobian, right = factor.linearize(values).jacobian()
-        np.testing.assert_allclose(errors[n], -right, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(np.hstack([by_one[n], by_two[n]]), jacobian, atol=1e-9)
 
 
 def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:

@@ -102,7 +102,8 @@ def test_warnings_about_the_data_are_in_the_verdict(
 def test_the_title_names_the_recording_and_the_date(
     sample_result: Calibration, tmp_path: Path
 ) -> None:
-    title = title_of(write_page(replace(sample_result, date="2026-03-01"), tmp_path))
+    plain = replace(sample_result, date="2026-03-01", correspondences=None)
+    title = title_of(write_page(plain, tmp_path))
     status = sample_result.verdict.status
     assert title.startswith(f"{status} - data/sample - 2026-03-01 - calibration of front_left")
 

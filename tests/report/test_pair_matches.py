@@ -67,8 +67,9 @@ def test_without_images_the_numbers_remain(sample_result: Calibration, tmp_path:
 
 
 def test_the_page_shows_the_pairs(sample_result: Calibration, tmp_path: Path) -> None:
-    text = write_page(sample_result, tmp_path)
+    plain = replace(sample_result, correspondences=None)
+    text = write_page(plain, tmp_path)
     assert "Between cameras" in text
     assert 'alt="Features that front_left, front_right both see"' in text
-    bare = replace(sample_result, camera_matches=None)
+    bare = replace(plain, camera_matches=None)
     assert "Between cameras" not in write_page(bare, tmp_path)

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calibgraph import Rig
+from calibgraph import Calibration, Rig
 from calibgraph.report import plots
+from calibgraph.report.camera_section import camera_diagrams
+from calibgraph.report.reprojection_errors import BeforeAfter, errors_before_after
 from tests.conftest import make_camera
 from tests.report.conftest import solve_simulated, write_page
 
 NASTY = "<b>x&\"y'<b>"
+
+
+@pytest.mark.parametrize("gate_px", [1e-9, 1e3])
+@pytest.mark.parametrize("count", [0, 1])
+def test_diagrams_of_hardly_any_matches_are_drawn(
+    solved_pair: Calibration, count: int, gate_px: float
+) -> None:
+    """Inside the gate, and beyond it."""
+    after = errors_before_after(solved_pair)["left"].after
+    few = replace(after.select(np.arange(len(after.frame)) < count), gate_px=gate_px)
+    drawn = camera_diagrams(solved_pair, "left", BeforeAfter(few, few))
+    assert len({each.uri for each in drawn}) == 6
 
 
 def test_the_legend_of_the_convergence_covers_no_point(monkeypatch: pytest.MonkeyPatch) -> None:

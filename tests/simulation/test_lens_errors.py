@@ -46,12 +46,12 @@ def test_the_size_scales_them_and_none_changes_nothing() -> None:
     assert draw_lens_errors(rig, 0.0, np.random.default_rng(0)) == rig
     for size in (1.0, 2.0):
         rng = np.random.default_rng(1)
-        cameras = [c for _ in range(50) for c in draw_lens_errors(rig, size, rng).cameras.values()]
+        cameras = [c for _ in range(12) for c in draw_lens_errors(rig, size, rng).cameras.values()]
         true = rig.cameras["primary"].intrinsics_px
         focal = np.std([c.intrinsics_px.fx / true.fx for c in cameras])
         centre = np.std([c.intrinsics_px.cy for c in cameras])
-        assert focal == pytest.approx(1e-3 * size, rel=0.2)
-        assert centre == pytest.approx(5e-4 * 1920 * size, rel=0.2)
+        assert focal == pytest.approx(1e-3 * size, rel=0.4)
+        assert centre == pytest.approx(5e-4 * 1920 * size, rel=0.4)
     panorama = rig_of("panorama")
     assert draw_lens_errors(panorama, 1.0, np.random.default_rng(0)) == panorama
 

@@ -21,7 +21,7 @@ pytest.importorskip(
 )
 
 
-@pytest.mark.parametrize(("seed", "vary_layout"), [(1, False), (1, True), (2, True), (3, True)])
+@pytest.mark.parametrize(("seed", "vary_layout"), [(1, False), (2, True)])
 def test_stops_are_apart_and_the_lane_is_free(seed: int, vary_layout: bool) -> None:
     drive = build_drive(frames=6, step_m=5.0, seed=seed, vary_layout=vary_layout)
     places = np.array([T[:3, 3] for T in drive.T_world_lidar])

@@ -76,7 +76,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     )
     parts = errors.model.components.with_fixed_weights(weight)
     model = replace(errors.model, components=parts)
-    order = to_ordering([*model.camera_keys, *model.shared_keys[: -len(model.cameras)],
+    order = to_ordering([*model.reported_keys, *model.shared_keys[: -len(model.cameras)],
                          *model.place_keys])  # fmt: skip
     starts, end = {}, 0
     for number in range(order.size()):
@@ -113,12 +113,13 @@ def test_the_error_bar_of_more_frames_is_as_predicted(pair: Rig) -> None:
 
 def test_recording_is_advised_only_where_it_shrinks_the_error_bar_enough(pair: Rig) -> None:
     found = evidence(pair, table(pair, 2, OF_A_SENSOR)).error_sources["left"]
-    assert found.describe((0.5, 10.0)).startswith(f"{found.rotation_deg:.3g} deg (")
-    assert f"{found.rotation[COMMON]:.0%} {COMMON}" in found.describe((0.5, 10.0))
+    assert found.describe((0.5, 100.0)).startswith(f"{found.rotation_deg:.3g} deg (")
+    assert f"{found.rotation[COMMON]:.0%} {COMMON}" in found.describe((0.5, 100.0))
     best_deg = found.forecast[MOST_TIMES][0]
     wide = found.rotation_deg / 0.3
     assert found.action((1.01 * wide, 100.0)) == ""
-    assert found.action((0.97 * wide, 100.0)).startswith("Record 2 times as many frames")
+    twice = 1.001 * found.forecast[2][0] / 0.3
+    assert found.action((twice, 100.0)).startswith("Record 2 times as many frames")
     limited = found.action((0.9 * best_deg / 0.3, 100.0))
     assert "Record" not in limited and limited.startswith("Tolerate more")
     assert f"{best_deg:.2g} deg" in limited

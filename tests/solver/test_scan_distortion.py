@@ -84,11 +84,15 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     assert solution.errors is not None
     values, sigmas = solution.errors.scan_distortion(bent.findings.bend_sigmas)
     assert abs(values[2] - 0.1) < 3 * sigmas[2] < 0.06
+    mounts = solution.errors.fit.of_mount.T_camera_lidar
     for name, T in rig.T_camera_lidar.items():
         before, after = (
-            np.abs(twist_between(one.T_camera_lidar[name], T)).max() for one in (without, solution)
+            np.abs(twist_between(of[name], T)).max() for of in (without.T_camera_lidar, mounts)
         )
         assert after < 0.5 * before
+        # The alignment is where the displaced cloud meets the images.
+        step = twist_between(solution.T_camera_lidar[name], without.T_camera_lidar[name])
+        assert np.abs(step).max() < 0.1 * before
 
 
 def test_a_pair_follows_the_bends_by_one_motion_of_the_cloud(mixed_rig: Rig) -> None:

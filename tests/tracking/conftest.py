@@ -17,6 +17,7 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.io.rigs import load_rig
+from calibgraph.tracking import command
 from calibgraph.tracking.history import History
 from tests.conftest import Call
 from tests.tracking.drives import (
@@ -41,8 +42,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
 
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes a second, and has tests of its own."""
+    """Drawing and loading ahead take a second, and have tests of their own."""
     monkeypatch.setattr(History, "draw", lambda self, path: path.write_bytes(b""))
+    monkeypatch.setattr(command, "warm_up_tracker", lambda: None)
 
 
 @pytest.fixture

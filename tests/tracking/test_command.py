@@ -22,7 +22,7 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.io.rigs import load_rig
-from tests.conftest import KANNALA, Call, make_camera, stereo_relative_pose
+from tests.conftest import Call, make_camera, stereo_relative_pose
 from tests.tracking.drives import (
     FRAMES,
     World,
@@ -153,14 +153,13 @@ def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
     assert f"{number} is far beyond" in err
 
 
-@pytest.mark.parametrize("kind", ["one", "fisheye", "mixed", "tied"])
+@pytest.mark.parametrize("kind", ["one", "mixed", "tied"])
 def test_any_rig_continues_with_the_same_lines(
     kind: str, mixed_rig: Rig, call: Call, tmp_path: Path
 ) -> None:
     tied = pair_of()
     truth = {
         "one": Rig(cameras={"only": make_camera()}),
-        "fisheye": pair_of(model="fisheye", distortion=KANNALA),
         "mixed": mixed_rig,
         "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
     }[kind]

@@ -51,30 +51,26 @@ def degenerate(number: int, good: Correspondences, rng: np.random.Generator) -> 
 
 
 @pytest.mark.parametrize(
-    ("kind", "share"),
+    ("kind", "share", "frames"),
     [
-        ("pair", 0.4),
-        ("pair", 1.0),
-        ("one", 0.4),
-        ("one", 1.0),
-        ("fisheye", 0.4),
-        ("fisheye", 1.0),
-        ("tied", 0.4),
-        ("tied", 1.0),
+        ("one", 1.0, 34),
+        ("fisheye", 0.4, 50),
+        ("fisheye", 1.0, 34),
+        ("tied", 0.4, 50),
+        ("tied", 1.0, 34),
     ],
 )
-def test_nonsense_neither_throws_nor_harms(kind: str, share: float) -> None:
-    """Warnings are errors here: no division by zero either."""
+def test_nonsense_neither_throws_nor_harms(kind: str, share: float, frames: int) -> None:
+    """Every kind of nonsense. Warnings are errors here: no division by zero either."""
     tied = pair_of()
     rig = {
-        "pair": pair_of(),
         "one": Rig(cameras={"only": make_camera()}),
         "fisheye": pair_of(model="fisheye", distortion=KANNALA),
         "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
     }[kind]
     rng = np.random.default_rng(3)
     tracker = IncrementalCalibrator(perturb(rig, rotation_deg=1, translation_m=0.1, seed=3))
-    for frame, good in enumerate(drive(rig, 70)):
+    for frame, good in enumerate(drive(rig, frames)):
         table = degenerate(frame // 2, good, rng) if rng.random() < share else good
         line = json_line(tracker.update(table, frame=frame))
     again = IncrementalCalibrator.from_bytes(tracker.to_bytes())
@@ -82,7 +78,7 @@ def test_nonsense_neither_throws_nor_harms(kind: str, share: float) -> None:
     for name, camera in json.loads(line)["cameras"].items():
         turn = np.array(camera["T_camera_lidar"]) @ np.linalg.inv(rig.T_camera_lidar[name])
         angle = np.degrees(np.arccos(np.clip((np.trace(turn[:3, :3]) - 1) / 2, -1, 1)))
-        # 0.1 deg: ten times the sigma of forty frames of 60 matches. Nonsense alone may agree.
+        # 0.1 deg: nine times the sigma of thirty frames of 60 matches. Nonsense alone may agree.
         assert angle < 0.1 or share == 1.0
 
 

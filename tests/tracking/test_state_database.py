@@ -161,7 +161,7 @@ def test_a_power_cut_during_an_append_keeps_every_acknowledged_input(memory: Pat
     changed = np.flatnonzero(new[: len(old)] != old)
     first = changed[0] if len(changed) else len(old)
     seen = set()
-    for length in [*range(first, len(new), 61), len(new)]:
+    for length in [*range(first, len(new), 251), len(new)]:
         survivors = np.zeros(max(length, len(old)), np.uint8)
         survivors[: len(old)] = old
         survivors[first:length] = new[first:length]

@@ -60,7 +60,7 @@ def test_a_changed_byte_of_the_database_is_refused_or_changes_nothing(
     data = files[DATABASE]
     used = np.flatnonzero(np.frombuffer(data, np.uint8))
     rng = np.random.default_rng(bits)
-    places = {*range(110), *rng.choice(used, 400).tolist(), *rng.choice(len(data), 100).tolist()}
+    places = {*range(110), *rng.choice(used, 200).tolist(), *rng.choice(len(data), 50).tolist()}
     found = set()
     for at in sorted(places):
         folder = restored(memory / "copy", files | {DATABASE: flipped(data, at, bits)})
@@ -84,7 +84,7 @@ def test_a_log_that_is_damaged_or_cut_short_costs_the_inputs_from_there_on_at_mo
     files, truth = crashed(memory / "state", 8)
     log = files[LOG]
     lengths = set()
-    for at in range(0, len(log), 251):
+    for at in range(0, len(log), 1021):
         for damaged in (log[:at], flipped(log, at)):
             result = recovered(restored(memory / "copy", files | {LOG: damaged}))
             assert truth.startswith(held(result))

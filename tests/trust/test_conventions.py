@@ -27,7 +27,11 @@ def test_every_convention_error_is_recognised_by_undoing_it(words: str) -> None:
     ("words", "seed"),
     [
         ("the guess is inverted (it is T_lidar_camera)", 1),
-        ("the guess is of camera axes forward, left, up, not right, down, forward", 2),
+        pytest.param(
+            "the guess is of camera axes forward, left, up, not right, down, forward",
+            2,
+            marks=SLOW,
+        ),
         pytest.param(
             "the LiDAR's axes are turned by 180 deg about z (its x points backward)", 3, marks=SLOW
         ),

@@ -67,6 +67,7 @@ def test_a_camera_of_several_that_sees_no_point_is_a_warning() -> None:
     assert warnings == ("left: by the guess, no point of the cloud lies in the image",)
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:

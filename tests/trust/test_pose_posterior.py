@@ -6,13 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibgraph import Dataset, Rig
+from calibgraph import Dataset, Rig, load_dataset, load_rig
 from calibgraph.audit.judgement import Tolerance, judge_camera
 from calibgraph.model.error_sources import FLAT, MATCHES, ErrorSources
+from calibgraph.model.geometry import twist_between
 from calibgraph.model.perturbation import perturb
 from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
@@ -21,10 +23,11 @@ from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.pose_posterior import (
     REACH,
     PosePosterior,
+    group_tied,
     measure_posteriors,
     widen,
 )
-from tests.trust.conftest import simulated
+from tests.trust.conftest import SAMPLE, simulated
 
 Array = NDArray[np.float64]
 NAME = "front_left"
@@ -40,7 +43,7 @@ def certain(covariance: Array) -> PosePosterior:
 
 
 def posterior_of(dataset: Dataset, rig: Rig) -> PosePosterior:
-    return measure_posteriors(dataset, rig, {NAME: BY_MATCHES})[NAME]
+    return measure_posteriors(dataset, rig, {NAME: BY_MATCHES}, [(NAME,)])[NAME]
 
 
 def with_images_of(dataset: Dataset, folder: Path) -> Dataset:
@@ -96,6 +99,30 @@ def test_the_verdict_counts_the_mass_beyond_the_tolerance() -> None:
     assert both.probability_beyond(1e-9 * np.eye(6), TOLERANCE) >= 0.5
 
 
+def test_cameras_are_elsewhere_together_if_their_relative_pose_is_known() -> None:
+    known, loose = np.diag((0.05 * REACH) ** 2), np.diag((0.05 * REACH) ** 2)
+    loose[3, 3] = (0.2 * REACH[3]) ** 2
+    pairs = [("a", "c", known), ("c", "d", known), ("a", "b", loose), ("a", "held", known)]
+    assert group_tied(["a", "b", "c", "d"], pairs) == [("a", "c", "d"), ("b",)]
+
+
+def test_tied_cameras_move_by_one_motion_of_the_cloud() -> None:
+    """Displaced together, both are found where they were."""
+    truth = load_rig(SAMPLE / "reference.yaml")
+    dataset = load_dataset(SAMPLE, truth)
+    step = gtsam.Pose3.Expmap(np.array([0.0, 0.0, 0.008, 0.05, 0.0, 0.0])).matrix()
+    off = truth.moved_to({name: T @ step for name, T in truth.T_camera_lidar.items()})
+    names = list(truth.cameras)[:2]
+    covariances = dict.fromkeys(names, np.diag(REACH**2))
+    found = measure_posteriors(dataset, off, covariances, [names])
+    assert found[names[0]].share == found[names[1]].share
+    for name in names:
+        back = twist_between(truth.T_camera_lidar[name], off.T_camera_lidar[name])
+        mean = found[name].near.mean(axis=0)
+        assert np.degrees(np.linalg.norm((mean - back)[:3])) < 0.1
+        assert np.linalg.norm((mean - back)[3:]) < 0.04
+
+
 def test_a_narrower_posterior_leaves_the_covariance_as_it_is() -> None:
     joint = random_covariance(12, seed=0)
     found = widen(joint, {0: joint[:6, :6] / 2, 1: joint[6:, 6:] / 3})
@@ -122,7 +149,7 @@ def test_the_relative_pose_of_tied_cameras_stays_known_where_both_are_widened_al
 def test_flat_evidence_widens_the_error_bar_and_is_named_as_its_source(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
     plain = Evidence(solution, pair)
-    flat = Evidence(solution, pair, lambda _: {"left": certain(WIDE)})
+    flat = Evidence(solution, pair, lambda *_: {"left": certain(WIDE)})
     narrow, wide = (np.sqrt(np.diag(each.covariance_of("left"))) for each in (plain, flat))
     assert (wide > 3 * narrow).all()
     sources = flat.error_sources["left"]
@@ -137,7 +164,7 @@ def test_a_deployed_pose_is_not_wrong_where_the_images_allow_it(pair: Rig) -> No
     solution = solve_joint(pair, simulated(pair, frames=20))
     tolerance = Tolerance(0.5, 10.0)
     plain = Evidence(solution, deployed)
-    flat = Evidence(solution, deployed, lambda _: {"left": certain(WIDE)})
+    flat = Evidence(solution, deployed, lambda *_: {"left": certain(WIDE)})
     assert judge_camera(plain, "left", "", tolerance).status == "WRONG"
     assert judge_camera(flat, "left", "", tolerance).status == "CANNOT TELL"
 
@@ -148,7 +175,7 @@ def test_no_deployed_pose_is_wrong_that_the_images_alone_allow(pair: Rig) -> Non
     solution = solve_joint(pair, simulated(pair, frames=20))
     for elsewhere, status in ((WIDE, "CANNOT TELL"), (1e-3 * WIDE, "WRONG")):
         found = replace(certain(1e-3 * WIDE), elsewhere=certain(elsewhere).near)
-        evidence = Evidence(solution, deployed, lambda _, found=found: {"left": found})
+        evidence = Evidence(solution, deployed, lambda *_, found=found: {"left": found})
         audit = judge_camera(evidence, "left", "", Tolerance(0.5, 10.0))
         assert audit.status == status
         assert audit.sigma is not None and np.degrees(audit.sigma[:3].max()) < 0.1
@@ -156,7 +183,7 @@ def test_no_deployed_pose_is_wrong_that_the_images_alone_allow(pair: Rig) -> Non
 
 def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
-    evidence = Evidence(solution, pair, lambda _: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
+    evidence = Evidence(solution, pair, lambda *_: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
     found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
     assert found.error_probability is not None
     assert found.error_probability.by_error_bar > 0.9

@@ -1,7 +1,5 @@
 """Camera-camera matches of a dataset: features, epipolar geometry, surfaces of the LiDAR."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import combinations

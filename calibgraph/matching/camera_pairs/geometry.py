@@ -1,7 +1,5 @@
 """Robust epipolar geometry on rays, and whether it could have come about by chance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -11,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from calibgraph.model.rig import Camera
+from calibgraph.solver.pnp import magsac
 from factors import ray_spreads
 
 Array = NDArray[np.float64]
@@ -129,13 +128,7 @@ def _essential_matrix(
     a, b = (_FOCAL_PX * rays[narrow, :2] / rays[narrow, 2:] for rays in turned)
     ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
     focal = min(camera.lens.pixels_per_rad for camera in cameras)
-    parameters = cv2.UsacParams()
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    parameters.threshold = _THRESHOLD_PX * _FOCAL_PX / focal
-    parameters.maxIterations = _ITERATIONS
-    parameters.confidence = 0.999
-    parameters.randomGeneratorState = seed
+    parameters = magsac(_THRESHOLD_PX * _FOCAL_PX / focal, iterations=_ITERATIONS, seed=seed)
     try:
         found, _ = cv2.findEssentialMat(a, b, ideal, ideal, None, None, parameters)
     except cv2.error:  # degenerate samples

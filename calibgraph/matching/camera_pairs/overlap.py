@@ -1,7 +1,5 @@
 """Which cameras of a rig can see something in common, by their extrinsics."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

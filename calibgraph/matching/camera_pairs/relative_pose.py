@@ -1,7 +1,5 @@
 """The relative pose of two cameras from features whose depth the LiDAR gives: robust PnP."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -10,6 +8,7 @@ from numpy.typing import NDArray
 
 from calibgraph.matching.camera_pairs.geometry import MAX_ANGLE_RAD, turn_to_axis
 from calibgraph.model.geometry import transform
+from calibgraph.solver.pnp import magsac
 
 Array = NDArray[np.float64]
 
@@ -45,13 +44,7 @@ def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | Non
     if np.count_nonzero(narrow) < MIN_INLIERS:
         return None
     plane = _FOCAL_PX * turned[narrow, :2] / turned[narrow, 2:]
-    parameters = cv2.UsacParams()
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    parameters.threshold = _THRESHOLD_RAD * _FOCAL_PX
-    parameters.maxIterations = _ITERATIONS
-    parameters.confidence = 0.999
-    parameters.randomGeneratorState = seed
+    parameters = magsac(_THRESHOLD_RAD * _FOCAL_PX, iterations=_ITERATIONS, seed=seed)
     ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
     try:
         found, _, rotation, translation, inliers = cv2.solvePnPRansac(

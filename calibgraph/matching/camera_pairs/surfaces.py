@@ -5,8 +5,6 @@ range is linear in the ray, for any lens. So g comes from a linear fit to the Li
 project next to the feature.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """The learned matcher CMRNext: its network, weights, matcher and training. Needs torch."""
 
-from __future__ import annotations
-
 try:
     import torch as _torch  # noqa: F401
 except ModuleNotFoundError as error:
@@ -12,14 +10,13 @@ except ModuleNotFoundError as error:
         " (without a GPU: pip install torch --index-url https://download.pytorch.org/whl/cpu first)"
     ) from error
 
-from calibgraph.matching.cmrnext.checkpoint import CONVERTED, Checkpoint, load_checkpoint
+from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.matcher import CmrNextMatcher
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.matching.cmrnext.training.train import train
 from calibgraph.matching.cmrnext.training.validation import Validation
 
 __all__ = [
-    "CONVERTED",
     "Checkpoint",
     "CmrNextMatcher",
     "TrainSettings",

@@ -1,7 +1,5 @@
 """The architecture of a checkpoint's network: recognised from shapes, compared with its config."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal

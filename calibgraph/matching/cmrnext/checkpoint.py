@@ -1,7 +1,5 @@
 """Checkpoints: a network's weights, checked against their config, with the file's hash."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -21,9 +19,9 @@ from calibgraph.matching.cmrnext.architecture import (
 )
 from calibgraph.matching.cmrnext.network import CmrNext
 from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
+from calibgraph.outputs import WEIGHTS_MARK
 
 SAFETENSORS = ".safetensors"
-CONVERTED = "calibgraph-cmrnext/1"
 TORCH_SUFFIXES = (".tar", ".pt", ".pth")
 
 DOWNLOAD = (
@@ -85,7 +83,7 @@ class Checkpoint:
         """Write the weights and their config as a .safetensors file."""
         from safetensors.torch import save_file
 
-        metadata = {"format": CONVERTED, "config": json.dumps(self.config)}
+        metadata = {"format": WEIGHTS_MARK, "config": json.dumps(self.config)}
         # Some tensors are stored under two names; safetensors requires separate memory.
         state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
         write_atomically(path, lambda temporary: save_file(state, temporary, metadata))

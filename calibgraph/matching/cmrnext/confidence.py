@@ -5,8 +5,6 @@ of three factors in 0..1: convergence, correlation peak, and agreement with the 
 ranks matches, but is not calibrated: it is no probability.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ Both classes give the same numbers. :class:`Volume` computes all pairs once: fas
 grows with the square of the image. :class:`OnTheFly` computes only the requested windows.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

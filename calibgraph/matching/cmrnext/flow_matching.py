@@ -1,7 +1,5 @@
 """Matches of one network: images and clouds in, a table of correspondences per image out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass

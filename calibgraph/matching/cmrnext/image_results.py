@@ -1,7 +1,5 @@
 """The outcome of each image, and the matcher's findings from all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 

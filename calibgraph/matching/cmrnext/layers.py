@@ -1,7 +1,5 @@
 """Layers of the CMRNext network; parameters have the names and shapes of published checkpoints."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F

@@ -1,7 +1,5 @@
 """The matcher ``cmrnext``: a schedule of networks from coarse to fine, and its findings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby

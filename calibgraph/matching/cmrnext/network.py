@@ -5,8 +5,6 @@ uncertainty (Cattaneo and Valada, "CMRNext"; Teed and Deng, "RAFT"). Parameters 
 shaped as in the published checkpoints.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ residuals, so that no other check detects it. With a blank image the way back mu
 network that finds it has memorised the extrinsic of its training.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

@@ -7,8 +7,6 @@ about the vertical had 3 to 7 where cameras that look at façades had up to 15
 in the clouds of other streets.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Bodies: cameras whose relative poses are known, which are searched as one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import gtsam

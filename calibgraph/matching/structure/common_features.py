@@ -1,7 +1,5 @@
 """Co-visible features of a rig's cameras in the frames of a search, and the poses they imply."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import combinations

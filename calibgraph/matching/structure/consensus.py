@@ -1,7 +1,5 @@
 """Pose consensus: the pose at which the shifts of all groups agree best."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

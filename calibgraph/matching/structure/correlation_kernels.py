@@ -3,8 +3,6 @@
 The maps of all groups are far larger than any cache, so each map is read for many transforms.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

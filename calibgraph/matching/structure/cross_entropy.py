@@ -1,7 +1,5 @@
 """The cross-entropy method: maximise a function by samples that concentrate on the best."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

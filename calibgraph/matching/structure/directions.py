@@ -1,13 +1,9 @@
 """Directions: view angles of a camera, and one direction per cell of the sphere."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-
-from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -46,34 +42,17 @@ def thin(rays: Array, cell_rad: float) -> Rows:
     """
     if not len(rays):
         return np.empty(0, np.intp)
-    azimuth, elevation = np.empty((2, len(rays)))
-    _to_angles(rays, azimuth, elevation)
-    first, last = (math.floor(end / cell_rad) for end in (elevation.min(), elevation.max()))
+    x, y, z = np.asarray(rays, dtype=np.float64).T
+    up = np.arctan2(z, np.hypot(x, y)) / cell_rad
+    row = np.floor(up)
+    along = (np.arctan2(y, x) + math.pi) * np.cos((row + 0.5) * cell_rad) / cell_rad
+    column = np.floor(along)
+    off = (along - column - 0.5) ** 2 + (up - row - 0.5) ** 2
     columns = math.ceil(2 * math.pi / cell_rad) + 1
-    nearest = np.full((last - first + 1) * columns, -1, np.intp)
-    _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest)
-    return nearest[nearest >= 0]
-
-
-@compiled()
-def _to_angles(rays, azimuth, elevation):  # type: ignore[no-untyped-def]
-    """Azimuth from the negative x axis, in (0, 2 pi]; elevation over the xy plane."""
-    for i in range(len(rays)):
-        x, y, z = rays[i, 0], rays[i, 1], rays[i, 2]
-        azimuth[i] = math.atan2(y, x) + math.pi
-        elevation[i] = math.atan2(z, math.sqrt(x * x + y * y))
-
-
-@compiled()
-def _keep_nearest(azimuth, elevation, cell_rad, first, columns, nearest):  # type: ignore[no-untyped-def]
-    """The direction nearest to the centre of each cell; its squared distance is in cells."""
-    least = np.empty(len(nearest))
-    for i in range(len(azimuth)):
-        up = elevation[i] / cell_rad
-        row = math.floor(up)
-        along = azimuth[i] * math.cos((row + 0.5) * cell_rad) / cell_rad
-        column = math.floor(along)
-        off = (along - column - 0.5) ** 2 + (up - row - 0.5) ** 2
-        cell = (row - first) * columns + column
-        if nearest[cell] < 0 or off < least[cell]:
-            nearest[cell], least[cell] = i, off
+    cell = ((row - row.min()) * columns + column).astype(np.intp)
+    least = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(least, cell, off)
+    nearest = np.full(len(least), len(rays), np.intp)
+    kept = np.flatnonzero(off == least[cell])
+    np.minimum.at(nearest, cell[kept], kept)
+    return nearest[nearest < len(rays)]

@@ -1,7 +1,5 @@
 """Whether a pose stands out: its score against displaced poses, over the same windows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

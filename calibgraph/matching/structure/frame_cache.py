@@ -1,7 +1,5 @@
 """Cache of the prepared clouds and gray images of the current frames."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from functools import partial

@@ -10,8 +10,6 @@ no pose of a camera is accepted, it has not been found: the best of the rejected
 taken.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ these higher. For noise of that size the logarithm of the likelihood is z times 
 ``chance_sigma``. What windows of a frame and frames of a place share makes the noise larger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

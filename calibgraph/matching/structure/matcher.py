@@ -1,7 +1,5 @@
 """The matcher `structure`: a global search, then one table of correspondences per round."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Peaks: each group's own best shift next to the consensus, as one correspondence."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

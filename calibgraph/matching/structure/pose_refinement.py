@@ -1,7 +1,5 @@
 """Pose refinement: improve a pose of the global search, level by level."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Pose search: tries poses of the bodies of a rig, near a given one or all over the range."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

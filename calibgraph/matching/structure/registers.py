@@ -5,8 +5,6 @@ each term that a loop adds; sums in blocks stay in registers. In kernels, blocks
 added, subtracted, multiplied and divided, element by element.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

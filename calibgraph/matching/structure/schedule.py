@@ -1,7 +1,5 @@
 """The coarse-to-fine schedule: the reach and the resolution of each round, as angles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -7,8 +7,6 @@ or stored in between. The image has zero mean, which keeps single precision: its
 then not the difference of two large numbers.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shift scores: agreement of the image with each group of LiDAR windows, over a grid of shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

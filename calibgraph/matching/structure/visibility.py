@@ -1,7 +1,5 @@
 """Which points of a cloud a camera sees."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -60,12 +58,11 @@ def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
     """
     if not len(angles):
         return np.empty(0, np.bool_)
-    least, most = _range(angles)
-    rows, columns = np.floor((most - least) / cell_rad).astype(np.int64) + 1
-    nearest_m, cell = np.full(rows * columns, np.inf), np.empty(len(angles), np.int64)
-    visible = np.empty(len(angles), np.bool_)
-    _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible)
-    return visible
+    rows, columns = ((angles - angles.min(axis=0)) / cell_rad).astype(np.intp).T
+    cell = rows * (columns.max() + 1) + columns
+    nearest_m = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest_m, cell, distance_m)
+    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m[cell] + HIDDEN_M)
 
 
 def find_places(
@@ -107,27 +104,6 @@ def _least_cosine(camera: Camera) -> float:
     if not valid.all() or camera.lens.kind not in (PINHOLE, RADTAN):
         return -1.0
     return float(rays[:, 2].min()) * _COSINE_MARGIN
-
-
-@compiled()
-def _range(angles):  # type: ignore[no-untyped-def]
-    """The least and the greatest of each column; NumPy is slow with columns."""
-    least, most = angles[0].copy(), angles[0].copy()
-    for i in range(len(angles)):
-        for k in range(2):
-            least[k], most[k] = min(least[k], angles[i, k]), max(most[k], angles[i, k])
-    return least, most
-
-
-@compiled()
-def _find_visible(angles, distance_m, cell_rad, least, columns, nearest_m, cell, visible):  # type: ignore[no-untyped-def]
-    for i in range(len(angles)):
-        row = np.int64((angles[i, 0] - least[0]) / cell_rad)
-        column = np.int64((angles[i, 1] - least[1]) / cell_rad)
-        cell[i] = row * columns + column
-        nearest_m[cell[i]] = min(nearest_m[cell[i]], distance_m[i])
-    for i in range(len(angles)):
-        visible[i] = distance_m[i] < HIDDEN_RATIO * nearest_m[cell[i]] + HIDDEN_M
 
 
 @compiled()

@@ -1,7 +1,5 @@
 """The kernel that describes windows: the variation over their rays, and their silhouettes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

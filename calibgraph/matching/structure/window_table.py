@@ -1,7 +1,5 @@
 """The windows of a cloud, cut where a camera looks and kept for the next pose and camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterable
 from threading import Lock
 

@@ -2,8 +2,7 @@
 
 from pydantic import BaseModel, ConfigDict
 
-from calibgraph.model.calibration import degrees_and_centimetres
-from calibgraph.model.geometry import pose_difference
+from calibgraph.model.geometry import degrees_and_centimetres, pose_difference
 from calibgraph.service.pick.advice import Advice
 from calibgraph.service.pick.estimate import CameraEstimate, PickEstimate
 from calibgraph.service.pick.joint import JointSolve

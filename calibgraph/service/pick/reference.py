@@ -9,7 +9,7 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.rigs import REFERENCE_FILE
-from calibgraph.model.calibration import degrees_and_centimetres
+from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.result_files import WRITTEN_KEY, table_mark
 from calibgraph.model.rig import Rig
 from calibgraph.outputs import Output, marked_yaml, yaml_mark

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
-from calibgraph.solver.pnp import normalized
+from calibgraph.solver.pnp import magsac, normalized
 
 Array = NDArray[np.float64]
 Shape = Literal["line", "plane", "space"]
@@ -127,13 +127,7 @@ def _p3p_ransac(problem: _Problem) -> Poses:
 
 
 def _magsac(problem: _Problem) -> Poses:
-    parameters = cv2.UsacParams()
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    parameters.threshold = problem.threshold_px
-    parameters.maxIterations = _ITERATIONS
-    parameters.confidence = 0.999
-    parameters.randomGeneratorState = 0
+    parameters = magsac(problem.threshold_px, iterations=_ITERATIONS, seed=0)
     found, _, rotation, translation, _ = cv2.solvePnPRansac(
         problem.points_m, problem.pixels_px, problem.matrix, None, params=parameters
     )

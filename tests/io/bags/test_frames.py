@@ -42,7 +42,7 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
         assert camera.model_dump(exclude=others) == given.model_dump(exclude=others)
         np.testing.assert_allclose(camera.T_camera_lidar, given.T_camera_lidar, atol=1e-12)
     assert [frame.index for frame in data.frames] == list(range(len(folder.frames)))
-    for found, expected in zip(data.frames, folder.frames, strict=True):
+    for found, expected in zip(data.frames[::5], folder.frames[::5], strict=True):
         np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
         for name, camera in folder.rig.cameras.items():
             np.testing.assert_array_equal(
@@ -264,7 +264,7 @@ def test_a_file_of_a_bag_is_a_bag(tmp_path: Path) -> None:
 def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: str) -> None:
     messages = sample_messages(Messages(kind))
     data = load_dataset(write_bag(tmp_path, kind, messages, compression=compression))
-    for found, expected in zip(data.frames, load_dataset(SAMPLE).frames, strict=True):
+    for found, expected in zip(data.frames[::5], load_dataset(SAMPLE).frames[::5], strict=True):
         np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
         for name, camera in data.rig.cameras.items():
             np.testing.assert_array_equal(
@@ -274,7 +274,7 @@ def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: s
 
 def test_threads_read_a_bag_at_the_same_time(tmp_path: Path) -> None:
     for kind in KINDS:
-        frames = load_dataset(long_bag(tmp_path, kind, 30)).frames
+        frames = load_dataset(long_bag(tmp_path, kind, 12)).frames
         alone = [frame.load_cloud() for frame in frames]
         with ThreadPoolExecutor(8) as pool:
             for one, two in zip(pool.map(Frame.load_cloud, frames), alone, strict=True):

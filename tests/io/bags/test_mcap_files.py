@@ -96,7 +96,7 @@ def require_the_sample(path: Path) -> None:
         T = data.rig.cameras[name].T_camera_lidar
         np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
     assert len(data.frames) == len(expected.frames)
-    for found, frame in zip(data.frames, expected.frames, strict=True):
+    for found, frame in zip(data.frames[::5], expected.frames[::5], strict=True):
         np.testing.assert_array_equal(found.load_cloud(), frame.load_cloud())
         for name, camera in expected.rig.cameras.items():
             image = found.load_image(name, camera)
@@ -124,8 +124,10 @@ def test_messages_come_by_time_and_only_those_asked_for(tmp_path: Path, name: st
     file.close()
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf", "flatbuffer", ""])
-@pytest.mark.parametrize("name", ["whole", "neither"])
+@pytest.mark.parametrize(
+    ("name", "encoding"),
+    [("whole", "json"), ("whole", ""), ("neither", "protobuf"), ("neither", "flatbuffer")],
+)
 def test_channels_of_other_encodings_are_left_alone(
     tmp_path: Path, name: str, encoding: str
 ) -> None:
@@ -148,8 +150,9 @@ def test_a_channel_that_has_the_name_of_an_image_in_json_is_no_camera(tmp_path: 
         load_rig(path)
 
 
-@pytest.mark.parametrize("profile", ["", "ros2", "ros1", "px4"])
-@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+@pytest.mark.parametrize(
+    ("kind", "profile"), [("mcap", "ros1"), ("mcap", "px4"), ("ros1", ""), ("ros1", "ros2")]
+)
 def test_the_messages_encoding_counts_not_the_profile(
     tmp_path: Path, kind: str, profile: str
 ) -> None:

@@ -175,7 +175,7 @@ def test_no_damage_ends_in_another_error(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     (lens,) = write(tmp_path, lens__yaml=CAMERA_INFO.replace("front", "lens"))
     refused = 0
-    for trial in range(150):
+    for trial in range(60):
         damaged = bytearray(whole[: rng.integers(len(whole))] if trial % 2 else whole)
         for place in rng.integers(0, max(len(damaged), 1), 3 if damaged else 0):
             damaged[place] = rng.integers(256) if trial % 3 else rng.choice(list(b"0-{[}]:<>&\n"))
@@ -188,4 +188,4 @@ def test_no_damage_ends_in_another_error(name: str, tmp_path: Path) -> None:
         except CalibrationError as error:
             assert not re.search("[\n\r]", str(error))
             refused += 1
-    assert refused > 50
+    assert refused > 20

@@ -1,7 +1,5 @@
 """Batches of training samples, drawn in the background."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 

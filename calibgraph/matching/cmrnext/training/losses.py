@@ -1,7 +1,5 @@
 """The losses of training, at the points of a batch of samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import torch

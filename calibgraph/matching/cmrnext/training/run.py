@@ -1,7 +1,5 @@
 """A training run: a network, its optimizer, and the number of steps done."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

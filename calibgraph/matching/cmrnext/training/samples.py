@@ -4,8 +4,6 @@ Image and true extrinsic are also rotated together at random: the truth differs 
 that the network cannot memorise it and has to compare image and cloud.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

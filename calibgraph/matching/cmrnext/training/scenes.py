@@ -1,7 +1,5 @@
 """Scenes to learn from: images and clouds of frames whose extrinsics are trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

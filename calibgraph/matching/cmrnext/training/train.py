@@ -1,7 +1,5 @@
 """Training from frames with trusted extrinsics: perturb one, learn the flow that undoes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Validation of a network in training on held-out frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

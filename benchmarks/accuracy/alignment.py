@@ -1,0 +1,87 @@
+"""The true alignment of cameras with a LiDAR that errs: where its points best meet the images.
+
+A point that is delivered where it is not is seen by a camera at the pixel of the surface that the
+beam met. The alignment of a camera is the pose that brings the delivered points of its view nearest
+to these pixels, all of equal weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from calibgraph import Camera, Rig, load_dataset
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera, twist_between
+from calibgraph.simulation.lidar import lidar_of
+from calibgraph.simulation.scan_errors import ScanErrors
+from factors import ProjectionBlock, block_factor
+
+ALIGNMENT = "alignment.yaml"
+_MOST = 20_000  # points of a camera
+
+
+def true_points(points_m: np.ndarray, beams: int, errors: ScanErrors) -> np.ndarray:
+    """(n, 3) the surfaces that the beams met, of points as they are delivered.
+
+    Args:
+        points_m: (n, 3) in the LiDAR's frame.
+        beams: of the LiDAR.
+        errors: of its beams and its motion; those of ranges are left.
+    """
+    x, y, z = points_m.T
+    distance, azimuth = np.linalg.norm(points_m, axis=1), np.arctan2(y, x)
+    reported = np.radians(lidar_of(beams).elevations_deg)
+    elevation = np.arctan2(z, np.hypot(x, y))
+    beam = np.abs(elevation[:, None] - reported).argmin(axis=1)
+    elevation = elevation + np.radians(errors.elevations_deg)[beam]
+    level = np.cos(elevation)
+    met = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    met *= distance[:, None]
+    met[:, 0] += errors.motion_m * azimuth / (2 * np.pi)
+    return met
+
+
+def aligned_rig(truth: Rig, folder: Path, beams: int, errors: ScanErrors) -> Rig:
+    """The rig with every camera at its alignment, by all clouds of a recording.
+
+    Args:
+        truth: of the mounts.
+        folder: of the recording.
+        beams: of the LiDAR.
+        errors: of the LiDAR.
+    """
+    dataset = load_dataset(folder, truth)
+    clouds = [frame.load_cloud()[:, :3] for frame in dataset.frames]
+    points = np.concatenate(clouds).astype(np.float64)
+    met = true_points(points, beams, errors)
+    aligned = {name: _align(camera, points, met) for name, camera in truth.cameras.items()}
+    return truth.moved_to(aligned)
+
+
+def _align(camera: Camera, points: np.ndarray, met: np.ndarray) -> np.ndarray:
+    """(4, 4) T_camera_lidar."""
+    T = camera.T_camera_lidar
+    pixels, in_front = camera.lens.project(met @ T[:3, :3].T + T[:3, 3])
+    size = camera.width_px, camera.height_px
+    inside = in_front & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+    rows = np.flatnonzero(inside)
+    rows = rows[:: max(1, len(rows) // _MOST)]
+    block = ProjectionBlock(camera.lens, points[rows], pixels[rows], loss="l2")
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(block_factor(0, block))
+    values.insert(0, to_T_lidar_camera(T))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return to_T_camera_lidar(found.atPose3(0))
+
+
+def mean_poses(several: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Per camera, the mean of near (4, 4) T_camera_lidar."""
+    first = several[0]
+    steps = {
+        name: np.mean([twist_between(of[name], first[name]) for of in several], axis=0)
+        for name in first
+    }
+    return {name: gtsam.Pose3.Expmap(step).matrix() @ first[name] for name, step in steps.items()}
