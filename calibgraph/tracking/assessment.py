@@ -13,6 +13,7 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_l
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.posterior import Posterior, is_determined
@@ -159,18 +160,27 @@ def _counts(one: CameraState) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
+def second_moments(assessment: Assessment) -> Array:
+    """(6 n, 6 n) of the mounts about the estimates."""
+    mount = assessment.fit.of_mount
+    steps = zip(mount.T_lidar_camera, assessment.T_lidar_camera, strict=True)
+    away = np.concatenate([step_between(pose, estimate) for pose, estimate in steps])
+    return np.asarray(mount.covariance + np.outer(away, away))
+
+
 def to_calibration(state: State, assessment: Assessment) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
+    mounts = None if known is None else second_moments(assessment)
     rig = state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,
-        pair_covariance=pair_covariances(known, rig.T_camera_lidar),
+        pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
         camera_verdicts=assessment.verdicts,
         residuals={
             name: recent_residuals(one)

@@ -108,7 +108,7 @@ def _regate_camera(
     block = inliers.with_scale(scale)
     sums = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
-    true = convex_hessian(robust + raw.gate_hessian(to_T_camera_lidar(gate), scale), robust)
+    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
     missing = true - sum(frame.hessian[camera] for frame in frames)
     shares = sums.hessian @ np.linalg.solve(sums.hessian.sum(axis=0) + WEAK, missing)
     step = step_between(T_lidar_camera, state.references[camera])

@@ -13,6 +13,7 @@ from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
+    aligned_key,
     camera_key,
     cloud_at_key,
     matched_at_key,
@@ -75,8 +76,9 @@ class Optimum:
         values.insert(CLOUD, cloud)
         for camera, pose in enumerate(guess):
             values.insert(camera_key(camera), self.shared.get(camera_key(camera), pose))
-        for camera in model.matched:
-            key = matched_key(camera)
+        keys = {aligned_key(camera): camera for camera in model.aligned}
+        keys |= {matched_key(camera): camera for camera in model.matched}
+        for key, camera in keys.items():
             values.insert(key, self.shared.get(key, guess[camera]))
         for place, name in enumerate(names):
             values.insert(cloud_at_key(place), self.clouds.get(name, cloud))

@@ -225,19 +225,20 @@ def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalC
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     """By GTSAM's LM and Marginals: within 0.01 sigma, and a thousandth of the covariance."""
     tracker, update = tracked_at_three_places(24)
-    graph, start = tracker.graph, tracker._assess().fit.linear.values
+    linear, graph = tracker._assess().fit.linear, tracker.graph
+    start, keys = linear.values, linear.model.reported_keys
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, values)
     for camera, name in enumerate(("left", "right")):
         reported = update.covariance[name]
         assert reported is not None
-        found = marginals.marginalCovariance(camera_key(camera))
+        found = marginals.marginalCovariance(keys[camera])
         np.testing.assert_allclose(
             found,
             reported,
             atol=1e-3 * np.sqrt(np.outer(np.diag(reported), np.diag(reported))).max(),
         )
-        T = to_T_camera_lidar(values.atPose3(camera_key(camera)))
+        T = to_T_camera_lidar(values.atPose3(keys[camera]))
         apart = twist_between(update.T_camera_lidar[name], T) / np.sqrt(np.diag(reported))
         assert np.abs(apart).max() < 0.01
 
