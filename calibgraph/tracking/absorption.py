@@ -24,6 +24,7 @@ from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_shift import agrees_at_its_place
+from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
 from calibgraph.tracking.window import Window
@@ -119,6 +120,20 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
         agreements=(*camera_state.agreements, (number, False))[-_LAST_FRAMES:],
     )
     return state.with_camera(camera, camera_state.count(left_out=1, failed=1 if own is None else 0))
+
+
+def absorb(
+    state: State, blocks: Mapping[int, CameraBlock], inliers: Mapping[int, NDArray[np.bool_]]
+) -> State:
+    """The state with the inliers of its last frame, and their sums at its estimates."""
+    frame = state.epochs[-1].frames[-1]
+    for camera, rows in inliers.items():
+        pose, scale = state.T_lidar_camera[camera], state.cameras[camera].scale
+        residuals = blocks[camera].at(to_T_camera_lidar(pose))
+        sums = quadratic(residuals, rows, scale, pose, state.references[camera])
+        frame = frame.add(camera, blocks[camera], rows, sums._asdict())
+        state = count_absorbed(state, camera, residuals, int(np.count_nonzero(rows)))
+    return add_to_totals(with_open_frame(state, frame), frame)
 
 
 def count_absorbed(state: State, camera: int, residuals: BlockResiduals, used: int) -> State:

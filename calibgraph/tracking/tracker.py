@@ -13,15 +13,13 @@ from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
-    add_to_totals,
+    absorb,
     blocks_by_camera,
     count_absent,
-    count_absorbed,
     inliers_at,
     select_agreeing,
     with_estimates,
@@ -38,7 +36,7 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
+from calibgraph.tracking.posterior import closed_posterior, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.split_half import SplitHalf
@@ -61,10 +59,9 @@ _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy rais
 class IncrementalCalibrator:
     """All cameras' extrinsics, updated frame by frame.
 
-    Each frame costs the same, however many came before: live epochs are an iSAM2 problem, older
-    ones a summary of constant size. Exact: the two passes per frame, the sums over frames and their
-    covariance. Approximate: a summarized epoch is a quadratic about the estimate at the time (true
-    Hessian, so the next order is the third), with the gate of that time.
+    Each frame costs the same, however many came before: live epochs keep their matches, older ones
+    are a summary of constant size, a quadratic about the estimate at the time (true Hessian, so the
+    next order is the third), with the gate of that time. All else is as in a batch.
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
@@ -267,15 +264,7 @@ class IncrementalCalibrator:
         used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
         self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
         self._state = with_estimates(self._state, self._window)
-        open_frame = self._state.epochs[-1].frames[-1]
-        for camera, rows in inliers.items():
-            T_lidar_camera, scale = self._state.T_lidar_camera[camera], scales[camera]
-            residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
-            reference = self._state.references[camera]
-            sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, agreeing[camera], rows, sums._asdict())
-            self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
-        self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
+        self._state = absorb(self._state, agreeing, inliers)
         return used
 
     def _start_cameras(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> list[Event]:
