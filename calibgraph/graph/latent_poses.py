@@ -195,12 +195,15 @@ class LatentPoseModel:
 
     @property
     def shared_keys(self) -> list[int]:
-        """Keys of the variables that no place has of its own; the reported ones last."""
+        """Keys of the variables that no place has of its own; the reported ones last.
+
+        Mounts before the distortion: in this order no exact tie is left to a weak variable.
+        """
         distortion = [DISTORTION] if self.is_distorted else []
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
         poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
         others = [key for key in poses if key not in self.reported_keys]
-        return [CLOUD, *shown, *distortion, *others, *self.reported_keys]
+        return [CLOUD, *shown, *others, *distortion, *self.reported_keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:

@@ -71,7 +71,7 @@ def camera_section(
         no_error_bar=_why_no_error_bar(result, name),
         overlays=overlays,
         overlay_width_px=width_on_page(camera),
-        diagrams=_diagrams(result, name, errors),
+        diagrams=camera_diagrams(result, name, errors),
         worked=worked_point(camera, None if errors is None else errors.after),
     )
 
@@ -92,8 +92,8 @@ def _why_no_error_bar(result: Calibration, name: str) -> str:
     return "not by these correspondences" if result.sigmas(name) is None else ""
 
 
-def _diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
-    """The residuals, coverage, error bars and convergence of a camera."""
+def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
+    """Residuals, coverage, error bars and convergence of a camera: data URIs by name."""
     found: dict[str, str] = {}
     if errors is not None:
         camera, after = result.rig.cameras[name], errors.after
