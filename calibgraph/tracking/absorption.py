@@ -6,16 +6,28 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.rig import Rig
+from calibgraph.solver.camera_block import (
+    MIN_MATCHES,
+    BlockResiduals,
+    CameraBlock,
+    camera_blocks,
+)
+from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.cause import squared_sigmas
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_shift import agrees_at_its_place
+from calibgraph.tracking.posterior import quadratic
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
+from calibgraph.tracking.window import Window
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -27,6 +39,41 @@ def with_open_frame(state: State, frame: LiveFrame) -> State:
     last = state.epochs[-1]
     others = tuple(f for f in last.frames if f.number != frame.number)
     return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, frame))))
+
+
+def blocks_by_camera(state: State, rig: Rig, table: Correspondences) -> dict[int, CameraBlock]:
+    """The preprocessed matches of each camera that has enough.
+
+    Args:
+        state: before the frame.
+        rig: with the estimates.
+        table: of the frame.
+    """
+    if not len(table):
+        return {}
+    kept = preprocess(rig, table, state.config)
+    blocks = camera_blocks(state.rig, kept.table, state.config)
+    return {state.names.index(name): block for name, block in blocks.items()}
+
+
+def inliers_at(
+    state: State, window: Window, blocks: Mapping[int, CameraBlock]
+) -> dict[int, NDArray[np.bool_]]:
+    """Per camera which matches are within the gate at the window's estimate, if enough are."""
+    inliers = {}
+    for camera, block in blocks.items():
+        T_camera_lidar = to_T_camera_lidar(window.T_lidar_camera(camera))
+        rows = block.at(T_camera_lidar).inliers(state.cameras[camera].scale)
+        if np.count_nonzero(rows) >= MIN_MATCHES:
+            inliers[camera] = rows
+    return inliers
+
+
+def with_estimates(state: State, window: Window) -> State:
+    """The state with the window's estimates of the last epoch."""
+    estimates = tuple(window.T_lidar_camera(camera) for camera in range(len(state.names)))
+    last = replace(state.epochs[-1], T_lidar_camera=estimates)
+    return replace(state, epochs=(*state.epochs[:-1], last))
 
 
 def select_agreeing(
@@ -73,6 +120,20 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
         agreements=(*camera_state.agreements, (number, False))[-_LAST_FRAMES:],
     )
     return state.with_camera(camera, camera_state.count(left_out=1, failed=1 if own is None else 0))
+
+
+def absorb(
+    state: State, blocks: Mapping[int, CameraBlock], inliers: Mapping[int, NDArray[np.bool_]]
+) -> State:
+    """The state with the inliers of its last frame, and their sums at its estimates."""
+    frame = state.epochs[-1].frames[-1]
+    for camera, rows in inliers.items():
+        pose, scale = state.T_lidar_camera[camera], state.cameras[camera].scale
+        residuals = blocks[camera].at(to_T_camera_lidar(pose))
+        sums = quadratic(residuals, rows, scale, pose, state.references[camera])
+        frame = frame.add(camera, blocks[camera], rows, sums._asdict())
+        state = count_absorbed(state, camera, residuals, int(np.count_nonzero(rows)))
+    return add_to_totals(with_open_frame(state, frame), frame)
 
 
 def count_absorbed(state: State, camera: int, residuals: BlockResiduals, used: int) -> State:

@@ -1,7 +1,9 @@
 """The estimate of all cameras and its covariance: optimum and marginal of the error model's graph.
 
-The tracker's own estimate takes all matches for independent: by it frames are gated and moves are
-found. What is reported is the minimum under the error model, as of a batch.
+Frames are gated, and moves are found, at another estimate (``calibgraph.tracking.window``).
+
+Between the ends of epochs the places that no frame of the open epoch is of keep the weights that
+their robust loss has at the optimum of the last one: within 0.02 sigma that is the whole graph.
 """
 
 from __future__ import annotations
@@ -16,26 +18,28 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.linear_data import poses_of
-from calibgraph.graph.objective import join
-from calibgraph.graph.variables import camera_key, cloud_at_key, matched_at_key
-from calibgraph.model.error_components import error_components
+from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import (
     invert_each,
     pose_rows,
-    to_T_camera_lidar,
     to_T_lidar_camera,
 )
-from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
+from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import (
     LatentPoseFit,
     Linearization,
-    fit_latent_poses,
     start_values,
 )
-from calibgraph.solver.error_model import held_graph
 from calibgraph.solver.variance_components import estimate_variance_ratios
+from calibgraph.tracking.contradictions import (
+    Conflicts,
+    Rows,
+    fit_without_contradictions,
+    poses_by_name,
+    with_pose_graph,
+)
 from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
@@ -46,18 +50,16 @@ from calibgraph.tracking.place_model import (
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, parts_of
-from calibgraph.tracking.posterior import Posterior, is_determined, steps_of
+from calibgraph.tracking.posterior import Posterior, steps_of
 from calibgraph.tracking.state import State
 from calibgraph.tracking.window import pose_priors
 
 Array = NDArray[np.float64]
-Conflicts = dict[int, Conflict]
-Rows = tuple[int, ...]
 
 NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
-_ROUNDS = 3  # of fits and estimates of the variance ratios, as in a batch
+_ROUNDS = 2  # of fits and estimates of the variance ratios; the next epoch goes on from there
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +106,12 @@ class ClosedPlaces:
         pose_graphs, found = {NO_ROWS: pose_priors(state)}, state.optimum
         values = _start(state, model, data.names)
         if found is None or not at_optimum:
-            fit, contradicting, _ = _fit(state, sums, model, values, pose_graphs=pose_graphs)
+            fit, contradicting, _ = fit_without_contradictions(
+                state, sums, model, values, pose_graphs=pose_graphs
+            )
             found = Optimum.of(model, fit.linear.values, data.names, contradicting)
         else:
-            model = _with_pose_graph(state, model, found.contradicting, pose_graphs)
+            model = with_pose_graph(state, model, found.contradicting, pose_graphs)
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         linear = linearized(state, sums, data, fit)
         return ClosedPlaces(
@@ -148,7 +152,9 @@ class ClosedPlaces:
         model = place_model(state, every, seen, data)
         model = replace(model, pose_graph=self._summaries[kept])
         values = _start(state, model, data.names)
-        fit, _, conflicts = _fit(state, every, model, values, pose_graphs=self._pose_graphs)
+        fit, _, conflicts = fit_without_contradictions(
+            state, every, model, values, pose_graphs=self._pose_graphs
+        )
         return fit, conflicts
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
@@ -231,83 +237,10 @@ def close_places(state: State) -> tuple[State, ClosedPlaces]:
     return replace(state, optimum=closed.optimum), closed
 
 
-def _fit(
-    state: State,
-    sums: PlaceSums,
-    model: LatentPoseModel,
-    values: gtsam.Values,
-    *,
-    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-) -> tuple[LatentPoseFit, Rows, Conflicts]:
-    """The optimum with priors and relative poses, and the conflicts of these with the data.
-
-    Args:
-        state: of the tracker.
-        sums: of all frames.
-        model: with the places, and the summary of others.
-        values: near the optimum.
-        pose_graphs: the priors without contradicting relative poses, by their places in the rig.
-    """
-    conflicts = _conflicts(state, sums, model, values)
-    limit = error_components().contradiction_sigmas
-    dropped = tuple(place for place, one in conflicts.items() if one.largest > limit)
-    fit = fit_latent_poses(_with_pose_graph(state, model, dropped, pose_graphs), values)
-    if fit is None:
-        raise RuntimeError("a direction of a camera is not determined")
-    return fit, dropped, conflicts
-
-
-def _with_pose_graph(
-    state: State,
-    model: LatentPoseModel,
-    dropped: Rows,
-    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-) -> LatentPoseModel:
-    """The model with the priors, without contradicting relative poses."""
-    if dropped not in pose_graphs:
-        without = tuple(sorted({*state.dropped_pairs, *dropped}))
-        pose_graphs[dropped] = pose_priors(replace(state, dropped_pairs=without))
-    return replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
-
-
-def _conflicts(
-    state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
-) -> Conflicts:
-    """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
-    frames, hessian = sums.frames.sum(axis=0), sums.hessian.sum(axis=0)
-    known = [
-        camera
-        for camera, one in enumerate(state.cameras)
-        if one.started and frames[camera] >= ENOUGH_FRAMES and is_determined(hessian[camera])
-    ]
-    names = [state.names[camera] for camera in known]
-    measured = {
-        place: pair
-        for place, pair in enumerate(state.rig.relative_poses)
-        if place not in state.dropped_pairs and {pair.a, pair.b} <= set(names)
-    }
-    if not measured:
-        return {}
-    others = [name for name in state.names if name not in names]
-    held = held_graph(state.names, _by_name(state), others)
-    mounts = replace(model, pose_graph=join(held, model.pose_graph), of="mount")
-    linear = Linearization.at(mounts, values)
-    found, rows = linear.values.retract(linear.step), _rows(known)
-    covariance = linear.covariance[np.ix_(rows, rows)]
-    T = {
-        name: to_T_camera_lidar(found.atPose3(camera_key(camera)))
-        for name, camera in zip(names, known, strict=True)
-    }
-    return {
-        place: relative_pose_conflict(pair, tuple(T), T, covariance)
-        for place, pair in measured.items()
-    }
-
-
 def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:
     """Values near the optimum of a model, of places of these names."""
     if state.optimum is None:
-        return start_values(model, _by_name(state))
+        return start_values(model, poses_by_name(state))
     return state.optimum.values(model, names, state.references)
 
 
@@ -326,13 +259,3 @@ def _with_drifting(state: State, sums: Posterior, places: PlaceSums) -> PlaceSum
             used = state.matches_of_frame(camera)
             places = places.with_camera_at(live[-1].place, camera, own, used)
     return places
-
-
-def _rows(cameras: Sequence[int]) -> NDArray[np.intp]:
-    return np.add.outer(6 * np.asarray(cameras, dtype=np.intp), np.arange(6)).ravel()
-
-
-def _by_name(state: State) -> dict[str, Array]:
-    """Per camera its (4, 4) reference."""
-    poses = zip(state.names, state.references, strict=True)
-    return {name: to_T_camera_lidar(pose) for name, pose in poses}

@@ -150,13 +150,6 @@ class Posterior:
             return None
         return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
 
-    def covariance(self, prior_hessian: Array) -> Array:
-        """(6 n, 6 n) cluster-robust, with the (6 n, 6 n) Hessian of priors."""
-        inverse = np.linalg.inv(block_diagonal(self.hessian) + prior_hessian)
-        finite = np.repeat(np.sqrt(self.frames / np.maximum(self.frames - 1, 1)), 6)
-        covariance: Array = inverse @ self.scatter @ inverse * np.outer(finite, finite)
-        return covariance
-
 
 def posterior(state: State, before: int | None = None) -> Posterior:
     """The sums over the summaries and all live frames, or those before a frame's number."""

@@ -41,9 +41,11 @@ from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/5"
+FORMAT = "calibgraph-tracker-state/6"
 """Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies, 3 had
-no places, 4 nothing of what residuals show of the cloud's bends."""
+no places, 4 nothing of what residuals show of the cloud's bends, 5 no optimum."""
+
+_READABLE = "calibgraph-tracker-state/5", FORMAT
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
 _EARLIER_MARK = b"calibgraph-tracker/1\n"
@@ -136,7 +138,7 @@ def _decode(data: bytes) -> Any:
     with np.load(io.BytesIO(data), allow_pickle=False) as members:
         described = json.loads(members["json"].tobytes())
         flat = {dtype: members[dtype] for dtype in _DTYPES if dtype in members}
-    if described["format"] != FORMAT:
+    if described["format"] not in _READABLE:
         raise StateError(f"is of format {described['format']!r}, expected {FORMAT!r}")
     rig = Rig.model_validate(described["rig"])
     decoder = _Decoder(flat, rig)

@@ -119,10 +119,12 @@ def detect_small_step(state: State) -> DetectedStep | None:
         if not state.epochs[place].frames:
             continue
         since, after = state.epochs[place].frames[0].number, afterwards[place]
-        by_places = shift_since(state, since)
         for camera, camera_state in enumerate(state.cameras):
+            if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
+                continue  # by what places share it is less still
+            by_places = shift_since(state, since)
             excess = _shift_excess(state, camera, before, after, by_places=by_places)
-            if camera_state.started and excess > best:
+            if excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
 
@@ -158,7 +160,12 @@ def _sums_from_each_epoch(state: State) -> list[_Sums]:
 
 
 def _shift_excess(
-    state: State, camera: int, before: Posterior, after: _Sums, *, by_places: Array
+    state: State,
+    camera: int,
+    before: Posterior,
+    after: _Sums,
+    *,
+    by_places: Array | None = None,
 ) -> float:
     """Excess of the contradiction between a camera's frames before and after, over the limit.
 
@@ -178,6 +185,8 @@ def _shift_excess(
     scatter = before.scatter[rows, rows]
     covariance = (
         scatter * (after.frames[camera] / (frames - 1)) + uncertain @ scatter @ uncertain.T
-    ) * state.inflation(camera) + hessian @ by_places[rows, rows] @ hessian
+    ) * state.inflation(camera)
+    if by_places is not None:
+        covariance = covariance + hessian @ by_places[rows, rows] @ hessian
     score = after.gradient[camera] + hessian @ step
     return squared_sigmas(score, covariance) / alarm_limit(frames) - 1.0

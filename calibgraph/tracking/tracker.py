@@ -7,23 +7,22 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
-from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
-    add_to_totals,
+    absorb,
+    blocks_by_camera,
     count_absent,
-    count_absorbed,
+    inliers_at,
     select_agreeing,
+    with_estimates,
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
@@ -37,7 +36,7 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import closed_posterior, quadratic, with_open_epoch
+from calibgraph.tracking.posterior import closed_posterior, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.split_half import SplitHalf
@@ -60,10 +59,9 @@ _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy rais
 class IncrementalCalibrator:
     """All cameras' extrinsics, updated frame by frame.
 
-    Each frame costs the same, however many came before: live epochs are an iSAM2 problem, older
-    ones a summary of constant size. Exact: the two passes per frame, the sums over frames and their
-    covariance. Approximate: a summarized epoch is a quadratic about the estimate at the time (true
-    Hessian, so the next order is the third), with the gate of that time.
+    Each frame costs the same, however many came before: live epochs keep their matches, older ones
+    are a summary of constant size, a quadratic about the estimate at the time (true Hessian, so the
+    next order is the third), with the gate of that time. All else is as in a batch.
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
@@ -148,7 +146,8 @@ class IncrementalCalibrator:
         table = with_common_error(table, self._state.config)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
-        blocks = self._blocks_by_camera(new := without_repeats(self._state, table))
+        new = without_repeats(self._state, table)
+        blocks = blocks_by_camera(self._state, self._at(self._state.T_lidar_camera), new)
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
             self._begin_frame(number, stamp, table)
@@ -251,17 +250,9 @@ class IncrementalCalibrator:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
         self._closed_places = closed or ClosedPlaces.of(self._state, at_optimum=True)
         self._window = Window(self._state)
-        self._copy_estimates()
+        self._state = with_estimates(self._state, self._window)
         self._closed = closed_posterior(self._state)
         self._closed_halves = SplitHalf.of_closed_epochs(self._state)
-
-    def _blocks_by_camera(self, table: Correspondences) -> dict[int, CameraBlock]:
-        """The preprocessed matches of each camera that has enough."""
-        if not len(table):
-            return {}
-        kept = preprocess(self._at(self._state.T_lidar_camera), table, self._state.config)
-        blocks = camera_blocks(self._state.rig, kept.table, self._state.config)
-        return {self._state.names.index(name): block for name, block in blocks.items()}
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add the blocks, gate them at the new estimate, replace them."""
@@ -269,37 +260,12 @@ class IncrementalCalibrator:
             return {}
         scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
         self._window.fit({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
-        inliers = self._inliers(agreeing)
+        inliers = inliers_at(self._state, self._window, agreeing)
         used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
         self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
-        self._copy_estimates()
-        open_frame = self._state.epochs[-1].frames[-1]
-        for camera, rows in inliers.items():
-            T_lidar_camera, scale = self._state.T_lidar_camera[camera], scales[camera]
-            residuals = agreeing[camera].at(to_T_camera_lidar(T_lidar_camera))
-            reference = self._state.references[camera]
-            sums = quadratic(residuals, rows, scale, T_lidar_camera, reference)
-            open_frame = open_frame.add(camera, agreeing[camera], rows, sums._asdict())
-            self._state = count_absorbed(self._state, camera, residuals, len(used[camera].frame))
-        self._state = add_to_totals(with_open_frame(self._state, open_frame), open_frame)
+        self._state = with_estimates(self._state, self._window)
+        self._state = absorb(self._state, agreeing, inliers)
         return used
-
-    def _inliers(self, blocks: dict[int, CameraBlock]) -> dict[int, NDArray[np.bool_]]:
-        """Per camera which matches are within the gate at the new estimate, if enough are."""
-        inliers = {}
-        for camera, block in blocks.items():
-            T_camera_lidar = to_T_camera_lidar(self._window.T_lidar_camera(camera))
-            rows = block.at(T_camera_lidar).inliers(self._state.cameras[camera].scale)
-            if np.count_nonzero(rows) >= MIN_MATCHES:
-                inliers[camera] = rows
-        return inliers
-
-    def _copy_estimates(self) -> None:
-        """Copy the estimates of the last epoch from iSAM2 to the state."""
-        epochs = self._state.epochs
-        estimates = tuple(self._window.T_lidar_camera(c) for c in range(len(self._state.names)))
-        last = replace(epochs[-1], T_lidar_camera=estimates)
-        self._state = replace(self._state, epochs=(*epochs[:-1], last))
 
     def _start_cameras(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> list[Event]:
         """Try to estimate the cameras that have no estimate yet."""

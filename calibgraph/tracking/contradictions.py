@@ -1,0 +1,117 @@
+"""Relative poses of the rig that contradict the correspondences of both their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.objective import join
+from calibgraph.graph.variables import camera_key
+from calibgraph.model.error_components import error_components
+from calibgraph.model.geometry import (
+    to_T_camera_lidar,
+)
+from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
+from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.elimination import (
+    LatentPoseFit,
+    Linearization,
+    fit_latent_poses,
+)
+from calibgraph.solver.error_model import held_graph
+from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.posterior import is_determined
+from calibgraph.tracking.state import State
+from calibgraph.tracking.window import pose_priors
+
+Array = NDArray[np.float64]
+Conflicts = dict[int, Conflict]
+Rows = tuple[int, ...]
+
+
+def fit_without_contradictions(
+    state: State,
+    sums: PlaceSums,
+    model: LatentPoseModel,
+    values: gtsam.Values,
+    *,
+    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
+) -> tuple[LatentPoseFit, Rows, Conflicts]:
+    """The optimum with priors and relative poses, and the conflicts of these with the data.
+
+    Args:
+        state: of the tracker.
+        sums: of all frames.
+        model: with the places, and the summary of others.
+        values: near the optimum.
+        pose_graphs: the priors without contradicting relative poses, by their places in the rig.
+    """
+    conflicts = _conflicts(state, sums, model, values)
+    limit = error_components().contradiction_sigmas
+    dropped = tuple(place for place, one in conflicts.items() if one.largest > limit)
+    fit = fit_latent_poses(with_pose_graph(state, model, dropped, pose_graphs), values)
+    if fit is None:
+        raise RuntimeError("a direction of a camera is not determined")
+    return fit, dropped, conflicts
+
+
+def with_pose_graph(
+    state: State,
+    model: LatentPoseModel,
+    dropped: Rows,
+    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
+) -> LatentPoseModel:
+    """The model with the priors, without contradicting relative poses."""
+    if dropped not in pose_graphs:
+        without = tuple(sorted({*state.dropped_pairs, *dropped}))
+        pose_graphs[dropped] = pose_priors(replace(state, dropped_pairs=without))
+    return replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
+
+
+def _conflicts(
+    state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
+) -> Conflicts:
+    """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
+    frames, hessian = sums.frames.sum(axis=0), sums.hessian.sum(axis=0)
+    known = [
+        camera
+        for camera, one in enumerate(state.cameras)
+        if one.started and frames[camera] >= ENOUGH_FRAMES and is_determined(hessian[camera])
+    ]
+    names = [state.names[camera] for camera in known]
+    measured = {
+        place: pair
+        for place, pair in enumerate(state.rig.relative_poses)
+        if place not in state.dropped_pairs and {pair.a, pair.b} <= set(names)
+    }
+    if not measured:
+        return {}
+    others = [name for name in state.names if name not in names]
+    held = held_graph(state.names, poses_by_name(state), others)
+    mounts = replace(model, pose_graph=join(held, model.pose_graph), of="mount")
+    linear = Linearization.at(mounts, values)
+    found, rows = linear.values.retract(linear.step), _rows(known)
+    covariance = linear.covariance[np.ix_(rows, rows)]
+    T = {
+        name: to_T_camera_lidar(found.atPose3(camera_key(camera)))
+        for name, camera in zip(names, known, strict=True)
+    }
+    return {
+        place: relative_pose_conflict(pair, tuple(T), T, covariance)
+        for place, pair in measured.items()
+    }
+
+
+def _rows(cameras: Sequence[int]) -> NDArray[np.intp]:
+    return np.add.outer(6 * np.asarray(cameras, dtype=np.intp), np.arange(6)).ravel()
+
+
+def poses_by_name(state: State) -> dict[str, Array]:
+    """Per camera its (4, 4) reference."""
+    poses = zip(state.names, state.references, strict=True)
+    return {name: to_T_camera_lidar(pose) for name, pose in poses}
