@@ -20,7 +20,7 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -33,6 +33,7 @@ from calibgraph.graph.by_place import (
     QuadraticByPlace,
     SummarizedByPlace,
 )
+from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
@@ -48,63 +49,6 @@ from calibgraph.model.config import Reported
 from factors import biased_between_factor, placed_pair_factor, robust_noise
 
 Array = NDArray[np.float64]
-
-EXACT = 1e-5
-"""Standard deviation [rad and m] of what holds exactly; less is lost in rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class VarianceComponents:
-    """Covariances of the latent displacements, positive definite, each in the tangent of its pose.
-
-    Attributes:
-        cloud: (6, 6) of the cloud at every place, in the LiDAR frame.
-        cloud_at_place: (6, 6) of the cloud at one place, about ``cloud``.
-        camera: (6, 6) of all matches of a camera, in its axes.
-        pairs: (6, 6) of all pairs of a camera, in its axes.
-        at_place: (P, N, 6, 6) of a camera's matches at one place, about ``camera``.
-        scatter_at_place: (P, N, 6, 6) the part of ``at_place`` that the scatter of frames shows.
-        distortion_jacobian: (N, 6, B) displacement of a camera's matches by one prior standard
-            deviation of each scan distortion; B = 0 without any.
-        pair_distortion_jacobian: (N, 6, B) displacement of a camera's pairs by the same.
-        distortion_information: (P, N, B, B) of a camera's residuals at a place about the
-            distortion.
-        distortion_vector: (P, N, B) the information times the distortion that these show.
-        distortion_weight: (P, N) weight of these.
-        distortion_size: prior variance of the distortion, over the stated one.
-        robust_scale: tuning constant [sigmas] of the loss of a place (Geman and McClure);
-            infinite: none.
-    """
-
-    cloud: Array
-    cloud_at_place: Array
-    camera: Array
-    pairs: Array
-    at_place: Array
-    scatter_at_place: Array
-    distortion_jacobian: Array
-    pair_distortion_jacobian: Array
-    distortion_information: Array
-    distortion_vector: Array
-    distortion_weight: Array
-    distortion_size: float | Array = 1.0
-    robust_scale: float = np.inf
-
-    def with_fixed_weights(self, weight: Array) -> VarianceComponents:
-        """Quadratic losses of the same curvature as the robust ones.
-
-        Args:
-            weight: (P, 1 + N) of the cloud and of each camera at each place.
-        """
-        clouds = self.cloud_at_place / weight[:, 0, None, None]
-        cameras = weight[:, 1:, None, None]
-        return replace(
-            self,
-            cloud_at_place=clouds,
-            at_place=self.at_place / cameras,
-            scatter_at_place=self.scatter_at_place / cameras,
-            robust_scale=np.inf,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,27 +222,12 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
     noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
-    information, vector, constant = _shown_distortion(parts)
+    information, vector, constant = shown_distortion(parts)
     zero = gtsam.Values()
     zero.insert(DISTORTION, np.zeros(size))
     shown = gtsam.HessianFactor(DISTORTION, information, vector, constant)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
-
-
-def least_cost_of_distortion(parts: VarianceComponents) -> float:
-    """Twice the error of both factors of the distortion by itself, at its minimum."""
-    information, vector, constant = _shown_distortion(parts)
-    prior = np.diag(1.0 / np.broadcast_to(parts.distortion_size, len(vector)))
-    return constant - float(vector @ np.linalg.solve(prior + information, vector))
-
-
-def _shown_distortion(parts: VarianceComponents) -> tuple[Array, Array, float]:
-    """(B, B) information, (B,) vector and constant by the residuals of all places."""
-    weight = parts.distortion_weight
-    information = np.einsum("pn,pnij->ij", weight, parts.distortion_information)
-    vector = np.einsum("pn,pni->i", weight, parts.distortion_vector)
-    return information, vector, float(vector @ np.linalg.pinv(information) @ vector)
 
 
 def _place_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.latent_poses import EXACT, VarianceComponents
+from calibgraph.graph.components import EXACT, VarianceComponents
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.pair_refinement import pair_sigmas

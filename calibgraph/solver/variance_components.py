@@ -18,11 +18,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.graph.latent_poses import (
-    VarianceComponents,
-    least_cost_of_distortion,
-    to_ordering,
-)
+from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
+from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, join_linear
 

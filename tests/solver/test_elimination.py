@@ -17,7 +17,8 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
-from calibgraph.graph.latent_poses import LatentPoseModel, VarianceComponents, latent_pose_graph
+from calibgraph.graph.components import VarianceComponents
+from calibgraph.graph.latent_poses import LatentPoseModel, latent_pose_graph
 from calibgraph.graph.variables import (
     DISTORTION,
     aligned_key,
