@@ -44,11 +44,12 @@ def true_points(points_m: np.ndarray, beams: int, errors: ScanErrors) -> np.ndar
     return met
 
 
-def aligned_rig(truth: Rig, folder: Path, beams: int, errors: ScanErrors) -> Rig:
+def aligned_rig(truth: Rig, stated: Rig, folder: Path, beams: int, errors: ScanErrors) -> Rig:
     """The rig with every camera at its alignment, by all clouds of a recording.
 
     Args:
-        truth: of the mounts.
+        truth: mounts and lenses as they are.
+        stated: lenses as their owner knows them, mounts as these fit best.
         folder: of the recording.
         beams: of the LiDAR.
         errors: of the LiDAR.
@@ -57,11 +58,14 @@ def aligned_rig(truth: Rig, folder: Path, beams: int, errors: ScanErrors) -> Rig
     clouds = [frame.load_cloud()[:, :3] for frame in dataset.frames]
     points = np.concatenate(clouds).astype(np.float64)
     met = true_points(points, beams, errors)
-    aligned = {name: _align(camera, points, met) for name, camera in truth.cameras.items()}
-    return truth.moved_to(aligned)
+    aligned = {
+        name: _align(camera, stated.cameras[name], points, met)
+        for name, camera in truth.cameras.items()
+    }
+    return stated.moved_to(aligned)
 
 
-def _align(camera: Camera, points: np.ndarray, met: np.ndarray) -> np.ndarray:
+def _align(camera: Camera, stated: Camera, points: np.ndarray, met: np.ndarray) -> np.ndarray:
     """(4, 4) T_camera_lidar."""
     T = camera.T_camera_lidar
     pixels, in_front = camera.lens.project(met @ T[:3, :3].T + T[:3, 3])
@@ -69,10 +73,10 @@ def _align(camera: Camera, points: np.ndarray, met: np.ndarray) -> np.ndarray:
     inside = in_front & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
     rows = np.flatnonzero(inside)
     rows = rows[:: max(1, len(rows) // _MOST)]
-    block = ProjectionBlock(camera.lens, points[rows], pixels[rows], loss="l2")
+    block = ProjectionBlock(stated.lens, points[rows], pixels[rows], loss="l2")
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(block_factor(0, block))
-    values.insert(0, to_T_lidar_camera(T))
+    values.insert(0, to_T_lidar_camera(stated.T_camera_lidar))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return to_T_camera_lidar(found.atPose3(0))
 

@@ -151,10 +151,11 @@ def run_case(case: Key, scenes: Path) -> Record:
             folder, truth, beams=beams, frames=FRAMES, step_m=STEP_M, seed=case.seed,
             sensor_errors=errors, vary_layout=True,
         )  # fmt: skip
-    aligned = aligned_rig(truth, folder, beams, errors).T_camera_lidar
-    truth = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
+    stated = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
+    aligned = aligned_rig(truth, stated, folder, beams, errors)
+    aligned.save(folder / ALIGNMENT)
+    truth = stated
     truth.save(folder / "reference.yaml")
-    truth.moved_to(aligned).save(folder / ALIGNMENT)
     guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
     guess.save(folder / "rig.yaml")
     result = calibrate(load_dataset(folder), guess)
@@ -164,7 +165,7 @@ def run_case(case: Key, scenes: Path) -> Record:
         result.camera_matches.save(folder / "camera_matches.parquet")
     result.rig.save(folder / "result.yaml")
     spreads = {name: r.sigma_px for name, r in result.residuals.items()}
-    return {**ledger.to_record(result, truth.moved_to(aligned)), "spread_px": spreads,
+    return {**ledger.to_record(result, aligned), "spread_px": spreads,
             "z_score": dict(result.correspondences.findings.z_score),
             "probability": {n: v.error_probability and v.error_probability.probability
                             for n, v in result.camera_verdicts.items()}}  # fmt: skip
