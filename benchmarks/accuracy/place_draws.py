@@ -75,7 +75,7 @@ def rows_of(case: str, draws: int, matches: int) -> Iterator[tuple[str, ...]]:
         drawn = draw_places(places, matches, rng)
         for change in changes:
             drawn = change(drawn, rng)
-        solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False))
+        solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, of="mount"))
         joint = Evidence(solved, guess=drawn.rig).joint_covariance
         for of, nees in nees_of(solved, drawn.rig, joint):
             found.setdefault(of, []).append(nees)

@@ -68,7 +68,7 @@ def rows_of(case: str, draws: int, matches: int) -> Iterator[tuple[str, ...]]:
 
 def tracked(drawn: Drawn) -> tuple[Calibration, int]:
     """The last estimate, and how many moves and drifts were reported."""
-    tracker, events = IncrementalCalibrator(drawn.rig, Config()), 0
+    tracker, events = IncrementalCalibrator(drawn.rig, Config(of="mount")), 0
     for frame in np.unique(drawn.table.frame):
         update = tracker.update(drawn.table.select(drawn.table.frame == frame))
         events += sum(event.kind in ("moved", "drifts") for event in update.events)

@@ -1,11 +1,13 @@
 """Tables of several places that state the errors which were drawn, with the truth beside them."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import pose_key
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
@@ -14,8 +16,9 @@ from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.matcher_errors import MatcherErrors
+from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.scan_distortion import distortions_at
-from factors import ProjectionBlock
+from factors import ProjectionBlock, block_factor
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -33,10 +36,13 @@ class Drawn:
     Attributes:
         rig: the true extrinsics; relative poses, if any, as they were measured.
         table: the correspondences.
+        aligned: per camera, (4, 4) T_camera_lidar that brings the distorted points nearest to the
+            true pixels of all places.
     """
 
     rig: Rig
     table: Correspondences
+    aligned: Mapping[str, Array] = field(default_factory=dict)
 
 
 def draw_places(
@@ -60,6 +66,7 @@ def draw_places(
     cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
     everywhere = displaced(truth, cloud, cameras)
     tables, names = [], [list[int]() for _ in range(places)]
+    true_points = []
     for visit in range(places * rounds):
         place = visit % places
         if visit < places:
@@ -74,10 +81,25 @@ def draw_places(
         )
         points = table.points_lidar_m
         bent = points + np.tensordot(bends, distortions_at(points), axes=1)
+        true_points.append(points)
         tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
         names[place] += range(frames * visit, frames * (visit + 1))
     joined = concatenate(tables).with_findings(findings)
-    return Drawn(truth, joined.with_places(Places(places=as_groups(names))))
+    aligned = align(truth, joined, np.concatenate(true_points))
+    return Drawn(truth, joined.with_places(Places(places=as_groups(names))), aligned)
+
+
+def align(truth: Rig, table: Correspondences, true_points_m: Array) -> dict[str, Array]:
+    """Per camera, the pose that brings the table's points nearest to the true ones' pixels."""
+    found: dict[str, Array] = {}
+    for number, (name, camera) in enumerate(truth.cameras.items()):
+        rows, T = table.camera_index == number, camera.T_camera_lidar
+        pixels, _ = camera.lens.project(true_points_m[rows] @ T[:3, :3].T + T[:3, 3])
+        block = ProjectionBlock(camera.lens, table.points_lidar_m[rows], pixels, loss="l2")
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(block_factor(pose_key((name,), name), block))
+        found |= optimize(graph, (name,), {name: T}).T_camera_lidar
+    return found
 
 
 def draw_cameras(truth: Rig, matches: int, rng: Rng) -> Array:

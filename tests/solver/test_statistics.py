@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import gtsam
 import numpy as np
 import pytest
@@ -60,7 +62,10 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
 
 
 @pytest.mark.parametrize("places", [1, 5])
-def test_the_reported_covariance_covers_draws_of_data(places: int) -> None:
+@pytest.mark.parametrize("of", ["alignment", "mount"])
+def test_the_reported_covariance_covers_draws_of_data(
+    places: int, of: Literal["alignment", "mount"]
+) -> None:
     """Of the default preset and tables that state the errors which were drawn, all of them.
 
     It is wider than the scatter, since the sizes of what is shared are estimated and never taken
@@ -70,11 +75,12 @@ def test_the_reported_covariance_covers_draws_of_data(places: int) -> None:
     found: dict[str, list[float]] = {}
     for seed in range(DRAWS):
         drawn = draw_places(places, 100, np.random.default_rng([29, seed]))
-        result = calibgraph.solve(drawn.rig, drawn.table, Config(learnt_weights=False))
-        for name, camera in drawn.rig.cameras.items():
+        result = calibgraph.solve(drawn.rig, drawn.table, Config(learnt_weights=False, of=of))
+        truth = drawn.aligned if of == "alignment" else drawn.rig.T_camera_lidar
+        for name, T in truth.items():
             covariance = result.covariance[name]
             assert covariance is not None
-            xi = error(result.T_camera_lidar[name], camera.T_camera_lidar)
+            xi = error(result.T_camera_lidar[name], T)
             found.setdefault(name, []).append(float(xi @ np.linalg.solve(covariance, xi)))
     for name, values in found.items():
         assert 0.5 < np.mean(values) / 6 < 1.0, name
