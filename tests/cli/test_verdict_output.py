@@ -25,7 +25,7 @@ def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, trut
     nonsense.save(tmp_path / "table.parquet")
     out = tmp_path / "out"
     code, _, text = call("calibrate", SAMPLE, "--matcher", tmp_path / "table.parquet", "--out", out)
-    assert code == 1 and text.startswith("FAIL")
+    assert code == 1 and "\nFAIL: off by" in "\n" + text  # on a slow machine, progress before
     assert yaml.safe_load((out / "calibration.yaml").read_text())["verdict"]["status"] == "FAIL"
     metadata = pq.read_schema(out / "correspondences.parquet").metadata
     assert any(b'"FAIL"' in value for value in metadata.values())
