@@ -29,7 +29,7 @@ def true_points(points_m: np.ndarray, beams: int, errors: ScanErrors) -> np.ndar
     Args:
         points_m: (n, 3) in the LiDAR's frame.
         beams: of the LiDAR.
-        errors: of its beams and its motion; those of ranges are left.
+        errors: elevations and motion; errors of ranges stay in the points.
     """
     x, y, z = points_m.T
     distance, azimuth = np.linalg.norm(points_m, axis=1), np.arctan2(y, x)

@@ -13,16 +13,10 @@ from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import (
-    to_T_camera_lidar,
-)
+from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.solver.elimination import (
-    LatentPoseFit,
-    Linearization,
-    fit_latent_poses,
-)
+from calibgraph.solver.elimination import LatentPoseFit, Linearization, fit_latent_poses
 from calibgraph.solver.error_model import held_graph
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.posterior import is_determined
