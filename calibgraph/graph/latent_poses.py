@@ -82,7 +82,7 @@ class LatentPoseModel:
         """Keys of ``x_c``."""
         return [camera_key(number) for number in range(len(self.cameras))]
 
-    @property
+    @cached_property
     def aligned(self) -> dict[int, Array]:
         """Per camera whose alignment differs from its mount, the (6, B) displacement by ``d``."""
         parts = self.components
@@ -91,7 +91,7 @@ class LatentPoseModel:
         pairs = {number: parts.pair_distortion_jacobian[number] for number in self.paired}
         return pairs | {number: parts.distortion_jacobian[number] for number in self.matched}
 
-    @property
+    @cached_property
     def reported_keys(self) -> list[int]:
         """Keys of the poses that are reported, in the order of the cameras."""
         aligned = self.aligned if self.of == "alignment" else {}
