@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import io
 import os
 import pickle
@@ -28,6 +29,8 @@ from calibgraph.trust import assess, image_checks, inputs
 
 Call = Callable[..., tuple[int, str, str]]
 
+gc.disable()  # while the tests are collected: their hundred thousands of objects stay
+
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample"
 
@@ -37,6 +40,12 @@ FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 RADTAN5 = (-0.11, 0.05, 0.001, -0.002, 0.004)
 RADTAN8 = (0.3, -0.1, 0.0005, 0.001, 0.02, 0.35, -0.05, 0.01)
 KANNALA = (0.02, -0.004, 0.001, -0.0002)
+
+
+def pytest_collection_finish() -> None:
+    """Let no later collection of garbage look at what has been imported and collected."""
+    gc.freeze()
+    gc.enable()
 
 
 def make_camera(
