@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, SAMPLE
 
 
 def test_every_file_of_the_packages_is_installed() -> None:
@@ -39,7 +39,7 @@ SLOW = pytest.mark.slow
 def test_modules_in_the_working_folder_are_not_imported(name: str, tmp_path: Path) -> None:
     (tmp_path / f"{name}.py").write_text("raise SystemExit('imported')")
     done = subprocess.run(
-        [sys.executable, "-m", "calibgraph", "doctor", str(ROOT / "data" / "sample")],
+        [sys.executable, "-m", "calibgraph", "evaluate", *2 * [str(SAMPLE / "reference.yaml")]],
         cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip

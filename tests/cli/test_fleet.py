@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from calibgraph.fleet.child import Child
 from calibgraph.fleet.rows import read_rows
+from calibgraph.fleet.task import Outcome
 from calibgraph.simulation.fleet_tables import write_fleet
 from tests.cli.conftest import error_line
 from tests.conftest import Call
@@ -23,7 +25,8 @@ def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(call: Call, tmp_
     assert "2 jobs, 2 finished before; cameras: 4 PASS, 0 WARN, 0 FAIL" in err
 
 
-def test_failed_jobs_exit_1(call: Call, tmp_path: Path) -> None:
+def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Child, "run", lambda *_: Outcome(error_kind="bad input", error="empty"))
     (tmp_path / "drive").mkdir()
     (tmp_path / "fleet.csv").write_text("vehicle,recording\na,drive\n")
     code, _, err = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "out"))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import calibgraph
-from calibgraph import Calibration, perturb
+from calibgraph import perturb
 from tests.conftest import CommandRun
 from tests.report.browsing import browser, render
 from tests.report.conftest import write_page
@@ -50,7 +50,7 @@ def test_real_recordings_are_reported(realdata: Path, name: str, tmp_path: Path)
 
 
 def test_the_knob_of_the_slider_is_above_the_line(
-    sample_result: Calibration, tmp_path: Path
+    calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
     """The way of a knob 16 px wide is the width of the picture."""
     script = """<script>addEventListener("load", () => {
@@ -60,7 +60,8 @@ def test_the_knob_of_the_slider_is_above_the_line(
       document.title = [way.left + 8 - picture.left, way.right - 8 - picture.right].join(" ");
     });</script>"""
     page = tmp_path / "page.html"
-    page.write_text(write_page(sample_result, tmp_path).replace("</body>", f"{script}</body>"))
+    text = (calibrated_sample.folder / "report.html").read_text("utf-8")
+    page.write_text(text.replace("</body>", f"{script}</body>"))
     command = [browser(), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1280,2000",
                f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]  # fmt: skip
     dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout

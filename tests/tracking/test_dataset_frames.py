@@ -71,7 +71,7 @@ def recorded(world: World, tmp_path: Path) -> Dataset:
     return load_dataset(folder)
 
 
-@pytest.mark.parametrize("at", [0, 3, 8])
+@pytest.mark.parametrize("at", [pytest.param(0, marks=pytest.mark.slow), 3, 8])
 def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
     at: int,
     world: World,

@@ -54,7 +54,7 @@ def degenerate(number: int, good: Correspondences, rng: np.random.Generator) -> 
     ("kind", "share", "frames"),
     [
         ("one", 1.0, 34),
-        ("fisheye", 0.4, 50),
+        pytest.param("fisheye", 0.4, 50, marks=pytest.mark.slow),
         ("fisheye", 1.0, 34),
         ("tied", 0.4, 50),
         ("tied", 1.0, 34),

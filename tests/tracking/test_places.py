@@ -81,7 +81,7 @@ def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
     return tied(drawn, rng, deg=0.02, cm=0.3) if tie else drawn
 
 
-@pytest.mark.parametrize("tie", [False, True])
+@pytest.mark.parametrize("tie", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize(
     ("places", "frames", "rounds"), [(1, 20, 1), (2, 10, 1), (6, 5, 1), (3, 5, 2)]
 )
@@ -374,14 +374,18 @@ def test_a_new_place_is_no_move() -> None:
         for table in drive(away, 60, matches=300, seed=2)
     ]
 
-    def events(places: list[str]) -> list[str]:
-        tracker, found = IncrementalCalibrator(rig), []
-        for table, place in zip(tables, places, strict=True):
-            found += [event.kind for event in tracker.update(table, place=place).events]
+    def events(
+        tracker: IncrementalCalibrator, tables: list[Correspondences], place: str
+    ) -> list[str]:
+        updates = [tracker.update(table, place=place) for table in tables]
+        found = [event.kind for update in updates for event in update.events]
         return [kind for kind in found if kind != "started"]
 
-    assert events(["here"] * 140) == ["moved"]
-    assert not events(["here"] * 80 + ["there"] * 60)
+    tracker = IncrementalCalibrator(rig)
+    assert not events(tracker, tables[:80], "here")
+    other = IncrementalCalibrator.from_bytes(tracker.to_bytes())
+    assert events(tracker, tables[80:], "here") == ["moved"]
+    assert not events(other, tables[80:], "there")
 
 
 def test_a_frame_of_another_place_disagrees_by_what_places_differ_by() -> None:

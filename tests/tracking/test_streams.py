@@ -203,7 +203,10 @@ def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
     assert outcomes(frames) == []
 
 
-@pytest.mark.parametrize("begin", [line(1), arrow_stream(to_arrow(table([1])))[:-8]])
+@pytest.mark.parametrize(
+    "begin",
+    [line(1), pytest.param(arrow_stream(to_arrow(table([1])))[:-8], marks=pytest.mark.slow)],
+)
 def test_a_signal_ends_the_waiting_for_standard_input(begin: bytes) -> None:
     program = """
         import signal, sys
