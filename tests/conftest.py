@@ -6,6 +6,7 @@ import gc
 import io
 import os
 import pickle
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,11 @@ from calibgraph.trust import assess, image_checks, inputs
 Call = Callable[..., tuple[int, str, str]]
 
 gc.disable()  # while the tests are collected: their hundred thousands of objects stay
+
+MEMORY = Path("/dev/shm")
+if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4e9:  # a run writes 0.8 GB
+    # Results and states are synced to disk, thousands of times in all: that costs nothing there.
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample"
@@ -115,7 +121,15 @@ class CommandRun:
     folder: Path
 
 
-def run_command(*arguments: object, folder: Path) -> CommandRun:
+def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
+    for name in (
+        "convergence", "coverage", "distances", "error_bars", "residual_by_distance",
+        "residual_map", "residual_scatter",
+    ):  # fmt: skip
+        patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
+
+
+def run_command(*arguments: object, folder: Path, diagrams: bool = False) -> CommandRun:
     """Run the command line in this process, outside of a test's fixtures."""
     out, err = io.StringIO(), io.StringIO()
     with (
@@ -124,6 +138,8 @@ def run_command(*arguments: object, folder: Path) -> CommandRun:
         contextlib.redirect_stderr(err),
         pytest.raises(SystemExit) as exit_,
     ):
+        if not diagrams:
+            leave_out_diagrams(patch)
         patch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])
         cli.main()
         raise SystemExit(0)
@@ -154,21 +170,15 @@ def calibrate_sample(folder: Path) -> CommandRun:
     table.save(folder / "table.parquet")
     result = folder / "result"
     return run_command(
-        "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result
-    )
+        "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result,
+        diagrams=True,
+    )  # fmt: skip
 
 
 @pytest.fixture
 def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not draw the diagrams of reports, for tests of all else.
-
-    Session fixtures such as ``calibrated_sample`` are made before, with drawn ones.
-    """
-    for name in (
-        "convergence", "coverage", "distances", "error_bars", "residual_by_distance",
-        "residual_map", "residual_scatter",
-    ):  # fmt: skip
-        monkeypatch.setattr(plots, name, lambda *_: "data:image/png;base64,")
+    """Do not draw the diagrams of reports, for tests of all else."""
+    leave_out_diagrams(monkeypatch)
 
 
 @pytest.fixture

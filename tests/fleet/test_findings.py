@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from calibgraph.fleet.findings import find_changes, moved_lidars
+from calibgraph.fleet.findings import Finding, find_changes, moved_lidars
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import retract_all
@@ -14,19 +14,25 @@ from calibgraph.simulation.fleet_rows import CAMERAS, simulate_fleet
 from tests.fleet.conftest import Fitted
 
 
-def test_a_changed_batch_a_date_and_a_drift_are_found(fitted: Fitted) -> None:
-    found = find_changes(fitted.model)
-    names = {(f.kind, f.model, f.camera, f.batch) for f in found}
+@pytest.fixture(scope="module")
+def changes(fitted: Fitted) -> list[Finding]:
+    return find_changes(fitted.model)
+
+
+def test_a_changed_batch_a_date_and_a_drift_are_found(
+    fitted: Fitted, changes: list[Finding]
+) -> None:
+    names = {(f.kind, f.model, f.camera, f.batch) for f in changes}
     assert {("batch", *fitted.truth.changed[::2], fitted.truth.changed[1])} <= names
     assert {("date", "van", "right", "B00"), ("drift", "compact", "rear", ""),
             ("drift", "van", "rear", "")} <= names  # fmt: skip
 
 
-def test_size_and_date_of_a_change_are_measured(fitted: Fitted) -> None:
-    (step,) = [f for f in find_changes(fitted.model) if f.kind == "date"]
+def test_size_and_date_of_a_change_are_measured(changes: list[Finding]) -> None:
+    (step,) = [f for f in changes if f.kind == "date"]
     assert abs(step.change[1] - np.radians(0.5)) < 3.5 * step.sigma[1]
     assert "2026-06-20" < step.at < "2026-08-31"
-    for drift in [f for f in find_changes(fitted.model) if f.at == "mileage_km"]:
+    for drift in [f for f in changes if f.at == "mileage_km"]:
         assert abs(drift.change[0] - np.radians(0.15) / 1e5) < 3.5 * drift.sigma[0]
 
 

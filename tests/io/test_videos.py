@@ -36,14 +36,20 @@ def marked(number: int) -> np.ndarray:
     return np.full((64, 96, 3), 3 * number, np.uint8)
 
 
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images of the sample's left camera."""
+    data, path = load_dataset(SAMPLE), tmp_path_factory.mktemp("video") / f"{LEFT}.mp4"
+    write_video(path, [f.load_image(LEFT, data.rig.cameras[LEFT]) for f in data.frames])
+    return path
+
+
 @pytest.fixture
-def dataset(tmp_path: Path) -> Path:
+def dataset(video: Path, tmp_path: Path) -> Path:
     """The sample, whose left camera has a video; its clouds are named by stamps."""
     folder = Path(shutil.copytree(SAMPLE, tmp_path / "recording"))
-    data = load_dataset(SAMPLE)
-    images = [f.load_image(LEFT, data.rig.cameras[LEFT]) for f in data.frames]
     shutil.rmtree(folder / "cameras" / LEFT)
-    write_video(folder / "cameras" / f"{LEFT}.mp4", images)
+    shutil.copy(video, folder / "cameras")
     return folder
 
 

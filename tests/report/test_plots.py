@@ -19,8 +19,7 @@ from tests.report.conftest import solve_simulated, write_page
 NASTY = "<b>x&\"y'<b>"
 
 
-@pytest.mark.parametrize("gate_px", [1e-9, 1e3])
-@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize(("count", "gate_px"), [(0, 1e3), (1, 1e-9), (1, 1e3)])
 def test_diagrams_of_hardly_any_matches_are_drawn(
     solved_pair: Calibration, count: int, gate_px: float
 ) -> None:
