@@ -178,10 +178,3 @@ def test_only_the_command_that_is_called_has_its_options_read(call: Call) -> Non
     code, out, _ = call("solve", "--help")
     assert code == 0 and "--print-graph" in out
     assert app._command_of.cache_info().currsize == 1
-
-
-def test_it_runs_as_a_module_too() -> None:
-    command = [sys.executable, "-m", "calibgraph", "evaluate", "nothing.yaml", "nothing.yaml"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("calibgraph: nothing.yaml") and done.stderr.count("\n") == 1

@@ -2,18 +2,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
 from calibgraph.fleet.child import Child
+from calibgraph.fleet.execute import execute
 from calibgraph.fleet.rows import read_rows
-from calibgraph.fleet.task import Outcome
+from calibgraph.fleet.task import Outcome, Task
 from calibgraph.simulation.fleet_tables import write_fleet
 from tests.cli.conftest import error_line
 from tests.conftest import Call
 
 
-def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(call: Call, tmp_path: Path) -> None:
+def run_here(_: Child, task: Task) -> Outcome:
+    with TemporaryDirectory() as folder:
+        return execute(task, Path(folder))
+
+
+def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process: tests/fleet has the processes."""
+    monkeypatch.setattr(Child, "run", run_here)
     manifest, out = str(write_fleet(tmp_path / "in", 2)), str(tmp_path / "out")
     code, printed, _ = call("fleet", manifest, "--out", out, "--jobs", 1, "--json")
     assert code == 0

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -384,8 +382,3 @@ def test_updates_of_another_rig_are_refused_and_change_nothing():
 def test_a_history_of_fewer_than_two_entries_is_refused():
     with pytest.raises(ValueError, match="at least 2"):
         History(1)
-
-
-def test_matplotlib_is_not_imported_before_something_is_drawn():
-    code = "import sys, calibgraph.tracking.history; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

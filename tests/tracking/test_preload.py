@@ -11,7 +11,7 @@ from numba.core.dispatcher import Dispatcher
 from calibgraph import IncrementalCalibrator, perturb
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.tracking import warm_up_tracker
+from calibgraph.tracking import history, warm_up_tracker
 
 def loaded():
     modules = [m for n, m in sys.modules.items() if n.startswith(("calibgraph.", "factors."))]
@@ -26,14 +26,15 @@ tracker = IncrementalCalibrator(perturb(rig, rotation_deg=1.0, translation_m=0.1
 table = simulate_correspondences(rig, frames=30, matches=200)
 for frame in range(30):
     tracker.update(table.select(table.frame == frame))
-print(warm - before, loaded() - warm)
+print(warm - before, loaded() - warm, "matplotlib" in sys.modules)
 """
 
 
-def test_after_the_warm_up_updates_load_no_code() -> None:
+def test_after_the_warm_up_updates_load_no_code_nor_what_draws() -> None:
     found = subprocess.run(
         [sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True
     )
-    by_warm_up, by_updates = map(int, found.stdout.split())
-    assert by_warm_up > 0
-    assert by_updates == 0
+    by_warm_up, by_updates, drawing = found.stdout.split()
+    assert int(by_warm_up) > 0
+    assert int(by_updates) == 0
+    assert drawing == "False"

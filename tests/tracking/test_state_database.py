@@ -239,7 +239,7 @@ for round in range(int(sys.argv[2])):
 
 
 def test_every_input_acknowledged_before_a_sigkill_is_there(tmp_path: Path) -> None:
-    kills = int(os.environ.get("CALIBGRAPH_TEST_KILLS", "10"))
+    kills = int(os.environ.get("CALIBGRAPH_TEST_KILLS", "5"))
     run = subprocess.run(
         [sys.executable, "-c", ACKNOWLEDGING, str(tmp_path), str(kills)],
         capture_output=True,
