@@ -19,7 +19,7 @@ from benchmarks.speed.streets import link_dataset, street_rig
 from calibgraph import load_rig, perturb, preset, simulate_correspondences, solve
 from calibgraph.simulation.rigs import rig_of
 
-BUSY_S = 0.4  # of 5 ms between samples: 80 of them
+BUSY_S = 0.2  # of 5 ms between samples: 40 of them
 
 
 def in_file(path: str, called: Callable[[], None]) -> Callable[[], None]:
