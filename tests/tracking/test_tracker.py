@@ -300,7 +300,9 @@ def test_an_update_that_fails_leaves_nothing_behind(
         np.testing.assert_array_equal(found.T_camera_lidar["left"], expected.T_camera_lidar["left"])
 
 
-@pytest.mark.parametrize(("live_epochs", "frames"), [(1, 30), (8, 100)])
+@pytest.mark.parametrize(
+    ("live_epochs", "frames"), [(1, 30), (3, 50), pytest.param(8, 100, marks=pytest.mark.slow)]
+)
 def test_a_change_at_any_live_epoch_can_be_followed(
     pair: Rig, live_epochs: int, frames: int
 ) -> None:

@@ -68,7 +68,9 @@ def check_true_poses(result: Calibration, table: Correspondences, dataset: Datas
     assert table.metadata["schedule"][0]["sha256"]
 
 
-@pytest.mark.parametrize(("estimate", "rounds"), [("frame", 1), ("joint", 2)])
+@pytest.mark.parametrize(
+    ("estimate", "rounds"), [pytest.param("frame", 1, marks=pytest.mark.slow), ("joint", 2)]
+)
 def test_true_flow_gives_the_true_poses(
     sample: Dataset,
     far_weights: Path,
