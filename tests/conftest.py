@@ -48,6 +48,13 @@ RADTAN8 = (0.3, -0.1, 0.0005, 0.001, 0.02, 0.35, -0.05, 0.01)
 KANNALA = (0.02, -0.004, 0.001, -0.0002)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first: at the end one process would wait for the other."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 def pytest_collection_finish() -> None:
     """Let no later collection of garbage look at what has been imported and collected."""
     gc.freeze()
