@@ -86,7 +86,7 @@ def fill_features(cloud, members, counts, front, basis, out):  # type: ignore[no
         flat, whole = math.sqrt(x0 * x0 + y0 * y0), math.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
         ax, ay = (-y0 / flat, x0 / flat) if flat > 0 else (1.0, 0.0)
         sine, cosine = z0 / whole, flat / whole
-        ux, uy, uz = sine * ay, -sine * ax, cosine  # up, across the ray
+        ux, uy, uz = -sine * ay, sine * ax, cosine  # up, across the ray
         depth, intensity, behind = 0.0, 0.0, 0.0
         for i in range(n):
             row = members[w, i]
