@@ -34,7 +34,8 @@ from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
 from calibgraph.matching.structure.visibility import find_places
-from calibgraph.matching.structure.window_weights import FEATURES, fill_features, window_network
+from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
+from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.simulation.surroundings import SURROUNDINGS

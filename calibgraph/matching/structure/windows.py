@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
 from calibgraph.matching.structure.window_kernel import describe_windows
-from calibgraph.matching.structure.window_weights import FEATURES, fill_features, window_network
+from calibgraph.matching.structure.window_weights import window_network
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
