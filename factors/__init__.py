@@ -12,6 +12,12 @@ from factors.conditioning import (
     unit_diagonal,
 )
 from factors.epipolar import EpipolarBlock, epipolar_residual
+from factors.free_lens import (
+    FreeLens,
+    FreeLensBlock,
+    free_lens_factor,
+    placed_free_lens_factor,
+)
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pair import (
@@ -40,6 +46,8 @@ __all__ = [
     "LOSSES",
     "BlockSums",
     "EpipolarBlock",
+    "FreeLens",
+    "FreeLensBlock",
     "Lens",
     "LensModel",
     "LossName",
@@ -50,11 +58,13 @@ __all__ = [
     "camera_prior_factor",
     "epipolar_factor",
     "epipolar_residual",
+    "free_lens_factor",
     "pair_block_factor",
     "pair_chain",
     "pair_projection_factor",
     "pair_run_sums",
     "pair_sums",
+    "placed_free_lens_factor",
     "placed_pair_factor",
     "pose_sigmas",
     "projection_factor",
