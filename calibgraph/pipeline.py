@@ -115,7 +115,7 @@ def solve(
         ValueError: if ``terms`` is unknown.
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
-    evidence, watch = Evidence(solution, guess=solution.rig), Stopwatch()
+    evidence, watch = Evidence(solution, guess=rig), Stopwatch()
     with watch("checks"):
         checks = assess(evidence)
     result = to_calibration(evidence, checks)

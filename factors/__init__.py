@@ -16,6 +16,7 @@ from factors.free_lens import (
     FreeLens,
     FreeLensBlock,
     free_lens_factor,
+    linear_factor,
     placed_free_lens_factor,
 )
 from factors.lens import Lens, LensModel
@@ -59,6 +60,7 @@ __all__ = [
     "epipolar_factor",
     "epipolar_residual",
     "free_lens_factor",
+    "linear_factor",
     "pair_block_factor",
     "pair_chain",
     "pair_projection_factor",

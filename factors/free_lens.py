@@ -8,7 +8,7 @@ derivatives are products of known numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -80,6 +80,10 @@ class FreeLens:
         make, size = _MAKERS[self.lens.kind]
         named = dict(zip(("fx", "fy", "cx", "cy"), packed.tolist(), strict=False))
         return make(**named, distortion=packed[4 : 4 + size].tolist())
+
+    def coefficient(self, name: str, values: Array) -> float:
+        """A distortion coefficient of the lens of (k,) values."""
+        return float(self.at(values).packed[4 + COEFFICIENT_NUMBERS[self.lens.kind][name]])
 
     def fill_columns(self, lens: Lens, points_camera_m: Array, columns: Array) -> None:
         """Derivatives of the pixels of some points by the values.
@@ -231,3 +235,20 @@ def _factor(keys: list[int], block: FreeLensBlock) -> gtsam.CustomFactor:
         return found
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), keys, error)
+
+
+def linear_factor(
+    keys: Sequence[int], matrices: Sequence[Array], noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """A factor on vectors, whose error is the sum of matrices times them."""
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        if jacobians is not None:
+            for number, matrix in enumerate(matrices):
+                jacobians[number] = np.asfortranarray(matrix)
+        vectors = (values.atVector(key) for key in keys)
+        return np.asarray(sum(m @ v for m, v in zip(matrices, vectors, strict=True)))
+
+    return gtsam.CustomFactor(noise, list(keys), error)

@@ -23,9 +23,11 @@ from calibgraph.graph.variables import (
     aligned_key,
     camera_key,
     cloud_at_key,
+    lens_key,
     matched_at_key,
     matched_key,
     paired_key,
+    seen_lens_key,
 )
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.solver.optimizer import MAX_ITERATIONS
@@ -245,7 +247,7 @@ def fit_latent_poses(
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
-    """All poses of a camera at its (4, 4) extrinsic, the cloud where it is, no distortion."""
+    """All poses of a camera at its (4, 4) extrinsic, the cloud and lenses where they are."""
     values, no_motion = gtsam.Values(), gtsam.Pose3()
     poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in model.cameras]
     for number, pose in enumerate(poses):
@@ -258,6 +260,9 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
         values.insert(paired_key(number), poses[number])
     for place, number in model.matched_places():
         values.insert(matched_at_key(place, number), poses[number])
+    for number, term in model.lenses.items():
+        values.insert(lens_key(number), term.variable.values)
+        values.insert(seen_lens_key(number), term.variable.values)
     for key in [CLOUD, *map(cloud_at_key, range(model.places))]:
         values.insert(key, no_motion)
     if model.is_distorted:

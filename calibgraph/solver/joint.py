@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.graph.lens import LensVariable, lens_variables
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -16,6 +17,7 @@ from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
+from calibgraph.solver.lens import solve_in_rounds
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
@@ -33,6 +35,7 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
     camera_matches: CameraMatches | None = None,
+    lenses: Mapping[str, LensVariable] | None = None,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -46,6 +49,8 @@ def solve_joint(
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
         camera_matches: what cameras see in common, with surfaces; from the correspondences' frames.
+        lenses: whose values the rig's lenses have; None: those that ``config.estimate`` names, at
+            the rig's lenses, and then in rounds.
 
     Raises:
         FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
@@ -54,6 +59,8 @@ def solve_joint(
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
     require_known(rig, config.excluded_cameras)
+    if lenses is None and config.estimate:
+        return _solve_with_lenses(rig, table, config, terms, camera_matches=camera_matches)
 
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
@@ -71,7 +78,8 @@ def solve_joint(
     with watch("weights"):                                                 # ours: frame weights
         frames = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
 
-    objective = Objective(rig, frames.blocks, T_hat(pairwise), config, terms)  # Eq. 5
+    objective = Objective(                                                 # Eq. 5
+        rig, frames.blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
 
     with watch("pass1"):                                                   # Two-Pass Solver
         rough, scales = objective.minimize_with_scale(frames.T_camera_lidar)   # 1. fit
@@ -95,6 +103,29 @@ def solve_joint(
     )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def _solve_with_lenses(
+    rig: Rig,
+    table: Correspondences | Path | str,
+    config: Config,
+    terms: Terms,
+    *,
+    camera_matches: CameraMatches | None,
+) -> Solution:
+    """The joint solve with the lenses that are to be estimated, in rounds."""
+    if config.preset != "auto" or terms not in USING_CORRESPONDENCES:
+        raise ValueError(
+            "lenses are estimated with the preset auto and the terms full or reprojection; found "
+            f"preset {config.preset}, terms {terms}"
+        )
+
+    def solve(moved: Rig, lenses: Mapping[str, LensVariable]) -> Solution:
+        return solve_joint(
+            moved, table, config, terms, camera_matches=camera_matches, lenses=lenses
+        )
+
+    return solve_in_rounds(solve, rig, lens_variables(rig, config.estimate))
 
 
 def solve_without_failing(

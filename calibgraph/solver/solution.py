@@ -16,6 +16,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.lens import lens_values, put_into
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
@@ -84,8 +85,10 @@ class Solution:
 
     @cached_property
     def solved_rig(self) -> Rig:
-        """The rig with the estimated extrinsics."""
-        return self.rig.moved_to(self.T_camera_lidar)
+        """The rig with the estimated extrinsics, and lenses if these are estimated."""
+        found = {} if self.errors is None else lens_values(self.errors.fit)
+        lenses = {n: self.inliers.lenses[n].moved_to(v) for n, (v, _) in found.items()}
+        return put_into(self.rig.moved_to(self.T_camera_lidar), lenses)
 
     @cached_property
     def marginals(self) -> Marginals:
