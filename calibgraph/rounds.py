@@ -116,7 +116,7 @@ def assign_places(run: MatchingRun) -> MatchingRun:
     places = replace(run.correspondences.places, places=as_groups(groups))
     table = run.correspondences.with_places(places)
     solution = solve_joint(
-        run.solution.rig,
+        run.solution.rig.with_lenses_of(run.guess),
         table,
         config,
         run.solution.terms,
@@ -168,6 +168,7 @@ def _solve(
     A camera with too few correspondences is placed by what it sees in common with another; if that
     does not place it either, it is excluded, and the others are calibrated.
     """
+    matched = (matched[0].with_lenses_of(guess), matched[1])  # the mean of their priors
     try:
         return solve_joint(*matched, config, terms)
     except CorrespondenceError as error:
@@ -256,7 +257,7 @@ def _from_displaced_start(
             progress=lambda what, done, total: progress("matching again", done, total),
         )
         table = table.with_places(places)
-        solution = solve_joint(estimate, table, config, terms)
+        solution = solve_joint(estimate.with_lenses_of(run.guess), table, config, terms)
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return last
@@ -285,7 +286,8 @@ def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> M
     mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
     mixed = mixed.with_findings(replace(findings, z_score=z_score))
     second = again.solution.rig.T_camera_lidar
-    start = run.solution.rig.moved_to({name: second[name] for name in better})
+    at_prior = run.solution.rig.with_lenses_of(run.guess)
+    start = at_prior.moved_to({name: second[name] for name in better})
     settings = run.solution.config, run.solution.terms
     last = {**run.rounds[-1], **{name: again.summary[name] for name in better}}
     return replace(

@@ -116,10 +116,15 @@ def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
 
 
 def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariable]:
-    """Per camera, its lens; none without parts."""
-    if not parts:
-        return {}
-    return {name: LensVariable.of(camera, parts) for name, camera in rig.cameras.items()}
+    """Per camera but panoramas, whose format determines the lens, its variable.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    lenses = {name: c for name, c in rig.cameras.items() if c.model != "equirectangular"}
+    if not lenses:
+        raise ValueError("equirectangular cameras have no lens to estimate")
+    return {name: LensVariable.of(camera, parts) for name, camera in lenses.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +156,15 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
         noise = gtsam.noiseModel.Gaussian.Covariance(term.excess + _EXACT**2 * unit)
         graph.add(linear_factor(keys, matrices, noise))
     return graph
+
+
+def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
+    """Both variables of each lens, where correspondences have been weighed and gated."""
+    values = gtsam.Values()
+    for number, term in lenses.items():
+        values.insert(lens_key(number), term.variable.values)
+        values.insert(seen_lens_key(number), term.variable.values)
+    return values
 
 
 @dataclass(frozen=True, eq=False)

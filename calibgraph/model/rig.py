@@ -285,6 +285,15 @@ class Rig(_Model):
         }
         return self.model_copy(update={"cameras": cameras})
 
+    def with_lenses_of(self, other: Rig) -> Rig:
+        """The same extrinsics with the lenses of a rig of the same cameras."""
+        lenses = {
+            name: {key: getattr(camera, key) for key in ("intrinsics_px", "distortion")}
+            for name, camera in other.cameras.items()
+        }
+        cameras = {n: camera.model_copy(update=lenses[n]) for n, camera in self.cameras.items()}
+        return self if cameras == self.cameras else self.model_copy(update={"cameras": cameras})
+
     def save(self, path: Path | str, *, first_line: str = "") -> None:
         """Write the rig file; the first line is a comment."""
         write_yaml(Path(path), self.model_dump(), first_line=first_line)

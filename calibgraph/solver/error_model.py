@@ -22,13 +22,13 @@ from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.fitted import FittedObjective
-from calibgraph.solver.lens import lens_term
+from calibgraph.solver.lens import lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.prior_components import common_error, variance_components
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
-from calibgraph.solver.within_place import WEAK, within_place
+from calibgraph.solver.within_place import within_place
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -218,14 +218,16 @@ def error_model(
         by_place = block_by_place(block, at.scales[name], places)
         within = within_place(at, name, by_place)
         placed, evidence = by_place.with_variance(within.least), None
-        blocks[name], number = placed, cameras.index(name)
-        if (lens := inliers.lenses.get(name)) is not None:
-            lenses[number] = lens_term(lens, within, at.of_camera(name), findings)
-            blocks[name] = FreeLensByPlace(placed, lens.free, seen_lens_key(number))
+        lens, number = inliers.lenses.get(name), cameras.index(name)
         if any(findings.bend_sigmas):
+            weak, pose = weak_information(lens), at.pose(name)
             evidence = distortion_evidence(
-                block, at.scales[name], at.pose(name), WEAK, places=places
+                block, at.scales[name], pose, weak, places=places, lens=lens
             )
+        blocks[name] = placed
+        if lens is not None:
+            lenses[number] = lens_term(lens, within, at.of_camera(name), (findings, evidence))
+            blocks[name] = FreeLensByPlace(placed, lens.free, seen_lens_key(number))
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
     components = variance_components(findings, cameras, shown, places=len(places))

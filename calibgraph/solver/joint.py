@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.graph.lens import LensVariable, lens_variables
+from calibgraph.graph.lens import lens_variables
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -17,13 +17,16 @@ from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
-from calibgraph.solver.lens import solve_in_rounds
+from calibgraph.solver.lens import Lenses, moved_lenses, put_into
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined, require_known
+
+_MOST_ROUNDS = 8  # of solves, each from the lenses of the last
+_SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds
 
 
 # fmt: off
@@ -35,7 +38,7 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
     camera_matches: CameraMatches | None = None,
-    lenses: Mapping[str, LensVariable] | None = None,
+    lenses: Lenses | None = None,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -113,19 +116,30 @@ def _solve_with_lenses(
     *,
     camera_matches: CameraMatches | None,
 ) -> Solution:
-    """The joint solve with the lenses that are to be estimated, in rounds."""
+    """The joint solve with the lenses that are to be estimated, in rounds until they stand.
+
+    The lens decides which matches are inliers, and their weights; its prior stays where it is.
+    """
     if config.preset != "auto" or terms not in USING_CORRESPONDENCES:
         raise ValueError(
             "lenses are estimated with the preset auto and the terms full or reprojection; found "
             f"preset {config.preset}, terms {terms}"
         )
-
-    def solve(moved: Rig, lenses: Mapping[str, LensVariable]) -> Solution:
-        return solve_joint(
-            moved, table, config, terms, camera_matches=camera_matches, lenses=lenses
+    lenses: Lenses = lens_variables(rig, config.estimate)
+    for _ in range(_MOST_ROUNDS):
+        solution = solve_joint(
+            put_into(rig, lenses),
+            table,
+            config,
+            terms,
+            camera_matches=camera_matches,
+            lenses=lenses,
         )
-
-    return solve_in_rounds(solve, rig, lens_variables(rig, config.estimate))
+        fit = None if solution.errors is None else solution.errors.fit
+        lenses, change = moved_lenses(lenses, fit)
+        if change < _SETTLED:
+            return solution
+    return replace(solution, optimum=replace(solution.optimum, converged=False))
 
 
 def solve_without_failing(

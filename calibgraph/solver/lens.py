@@ -8,9 +8,7 @@ matches, S that by the scatter of frames, and k the variance that matches are le
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +24,10 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.elimination import LatentPoseFit, marginal_information
 from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 from factors.free_lens import ASPECT, FOCAL
-
-if TYPE_CHECKING:
-    from calibgraph.solver.solution import Solution
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, LensVariable]
@@ -43,27 +39,6 @@ lens."""
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
-_MOST_ROUNDS, _SETTLED = 8, 0.1  # of solves; the largest change of a value in its sigmas
-
-
-def solve_in_rounds(solve: Callable[[Rig, Lenses], Solution], rig: Rig, lenses: Lenses) -> Solution:
-    """Solve, put the lenses found into the rig, and solve again until they stand.
-
-    The lens decides which matches are inliers, and their weights. The prior stays where it is.
-
-    Args:
-        solve: the joint solve of a rig whose lenses are at the values of variables.
-        rig: with the lenses of the prior.
-        lenses: of its cameras.
-    """
-    for _ in range(_MOST_ROUNDS):
-        solution = solve(put_into(rig, lenses), lenses)
-        moved = {} if solution.errors is None else lens_values(solution.errors.fit)
-        changes = [np.abs(v - lenses[name].values) / s for name, (v, s) in moved.items()]
-        if all((change < _SETTLED).all() for change in changes):
-            return solution
-        lenses = {**lenses, **{name: lenses[name].moved_to(v) for name, (v, _) in moved.items()}}
-    return replace(solution, optimum=replace(solution.optimum, converged=False))
 
 
 def put_into(rig: Rig, lenses: Lenses) -> Rig:
@@ -75,7 +50,10 @@ def put_into(rig: Rig, lenses: Lenses) -> Rig:
 
 
 def lens_term(
-    lens: LensVariable, within: WithinPlace, at: FittedObjective, findings: MatcherFindings
+    lens: LensVariable,
+    within: WithinPlace,
+    at: FittedObjective,
+    matcher: tuple[MatcherFindings, DistortionEvidence | None],
 ) -> LensTerm:
     """The lens of a camera in the error model.
 
@@ -83,11 +61,12 @@ def lens_term(
         lens: of the camera.
         within: what its matches of one place share.
         at: the minimum for independent matches, of this camera alone.
-        findings: the matcher's error.
+        matcher: its error; the quadratics of this camera's matches in the scan distortion.
     """
+    findings, evidence = matcher
     ((name, block),) = at.objective.blocks.items()
     free = FreeLensBlock(at.projections[name], lens.free)
-    columns, hessian = _at_minimum(free, at.T_camera_lidar[name], lens.values)
+    columns, hessian = _at_minimum(free, at.T_camera_lidar[name], lens)
     pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
     gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
     covariance = np.linalg.inv(hessian)
@@ -99,13 +78,21 @@ def lens_term(
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     own = covariance[6:, 6:]
     excess = _positive(by_frames - within.least * own) + shared * own
-    return LensTerm(lens, excess, np.zeros((len(own), len(findings.bend_sigmas))))
+    sigmas = np.asarray(findings.bend_sigmas)
+    bent = np.zeros((len(own), len(sigmas))) if evidence is None else evidence.lens_jacobian
+    return LensTerm(lens, excess, bent * sigmas)
 
 
-def _at_minimum(free: FreeLensBlock, T_camera_lidar: Array, values: Array) -> tuple[Array, Array]:
+def weak_information(lens: LensVariable | None) -> Array:
+    """(6 + k, 6 + k) of a pose within sight and a lens, so that few matches have an inverse."""
+    return WEAK if lens is None else block_diag(WEAK, _WEAK_PRIOR * np.eye(len(lens.free)))
+
+
+def _at_minimum(
+    free: FreeLensBlock, T_camera_lidar: Array, lens: LensVariable
+) -> tuple[Array, Array]:
     """Columns and Hessian of independent matches, where pose and lens fit them best."""
-    pose, size = to_T_lidar_camera(T_camera_lidar), len(values)
-    weak = block_diag(WEAK, _WEAK_PRIOR * np.eye(size))
+    pose, values, weak = to_T_lidar_camera(T_camera_lidar), lens.values, weak_information(lens)
     for _ in range(_MOST_STEPS):
         sums = free.sums(to_T_camera_lidar(pose), values)
         pull = sums.gradient + weak @ np.concatenate([np.zeros(6), values])
@@ -121,6 +108,14 @@ def _positive(matrix: Array) -> Array:
     """The positive part of a symmetric matrix."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
+    """Lenses where a fit has them, and the largest change of a value in standard deviations."""
+    found = {} if fit is None else lens_values(fit)
+    moved = {name: lenses[name].moved_to(values) for name, (values, _) in found.items()}
+    changes = [abs(v - lenses[n].values) / s for n, (v, s) in found.items()]
+    return {**lenses, **moved}, float(np.concatenate([*changes, [0.0]]).max())
 
 
 def lens_values(fit: LatentPoseFit) -> dict[str, tuple[Array, Array]]:
