@@ -35,6 +35,7 @@ from factors.pair import (
 from factors.pose import (
     biased_between_factor,
     camera_prior_factor,
+    displaced_between_factor,
     pose_sigmas,
     relative_pose_factor,
     relative_prior_factor,
@@ -57,6 +58,7 @@ __all__ = [
     "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
+    "displaced_between_factor",
     "epipolar_factor",
     "epipolar_residual",
     "free_lens_factor",

@@ -50,7 +50,12 @@ from calibgraph.graph.variables import (
     seen_lens_key,
 )
 from calibgraph.model.config import Reported
-from factors import biased_between_factor, placed_pair_factor, robust_noise
+from factors import (
+    biased_between_factor,
+    displaced_between_factor,
+    placed_pair_factor,
+    robust_noise,
+)
 
 Array = NDArray[np.float64]
 
@@ -212,8 +217,12 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
         graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
     seen = aligned_key if model.is_distorted else camera_key
     for number in model.matched:
-        edge = seen(number), matched_key(number)
-        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(parts.camera)))
+        edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
+        if (term := model.lenses.get(number)) is None:
+            graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise))
+        else:
+            shifts = term.shifts(number, is_distorted=model.is_distorted)
+            graph.add(displaced_between_factor(*edge, shifts, noise))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)
         graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))

@@ -1,7 +1,8 @@
 """The lens of a camera as a variable of the graph, shared by all its places.
 
     prior    l_c at the lens of the rig, each parameter with a Cauchy loss
-    matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion
+    matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
+             their errors; these displace m_c, the pose as they show it, too
     data     correspondences of camera c at place p, on o_p, a_cp and s_c
 
 A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
@@ -135,11 +136,20 @@ class LensTerm:
         variable: the lens.
         excess: (k, k) covariance of s_c about l_c, in the units of the values.
         by_distortion: (k, B) displacement of s_c by a unit of each scan distortion.
+        compensating: (6, k) displacement of m_c by a unit of the difference of s_c and l_c that is
+            no scan distortion: of the pose that fits best where the lens is wrong by as much.
     """
 
     variable: LensVariable
     excess: Array
     by_distortion: Array
+    compensating: Array
+
+    def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
+        """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
+        B = self.compensating
+        lens = {lens_key(number): -B, seen_lens_key(number): B}
+        return lens | ({DISTORTION: -B @ self.by_distortion} if is_distorted else {})
 
 
 def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.NonlinearFactorGraph:

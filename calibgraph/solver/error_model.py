@@ -226,7 +226,11 @@ def error_model(
             )
         blocks[name] = placed
         if lens is not None:
-            lenses[number] = lens_term(lens, within, at.of_camera(name), (findings, evidence))
+            term = lens_term(lens, by_place, within, at.T_camera_lidar[name], findings=findings)
+            if evidence is not None:
+                bent = evidence.lens_jacobian * np.asarray(findings.bend_sigmas)
+                term = replace(term, by_distortion=bent)
+            lenses[number] = term
             blocks[name] = FreeLensByPlace(placed, lens.free, seen_lens_key(number))
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -46,12 +46,6 @@ class FittedObjective:
     def projections(self) -> Mapping[str, ProjectionBlock]:
         """Per camera with correspondences, these with their scale."""
         return {n: b.with_scale(self.scales[n]) for n, b in self.objective.blocks.items()}
-
-    def of_camera(self, name: str) -> FittedObjective:
-        """The correspondences of one camera alone."""
-        return replace(
-            self, objective=replace(self.objective, blocks={name: self.objective.blocks[name]})
-        )
 
     def data_only(self) -> FittedObjective:
         """The correspondences alone, at their minimum near here."""

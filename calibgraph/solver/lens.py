@@ -14,17 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from calibgraph.graph.lens import LensTerm, LensVariable
+from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.lens import FreeLensByPlace, LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.elimination import LatentPoseFit, marginal_information
-from calibgraph.solver.fitted import FittedObjective
-from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 from factors.free_lens import ASPECT, FOCAL
@@ -51,36 +49,49 @@ def put_into(rig: Rig, lenses: Lenses) -> Rig:
 
 def lens_term(
     lens: LensVariable,
+    placed: BlockByPlace,
     within: WithinPlace,
-    at: FittedObjective,
-    matcher: tuple[MatcherFindings, DistortionEvidence | None],
+    T_camera_lidar: Array,
+    *,
+    findings: MatcherFindings,
 ) -> LensTerm:
-    """The lens of a camera in the error model.
+    """The lens of a camera in the error model, without scan distortion.
 
     Args:
         lens: of the camera.
+        placed: its matches.
         within: what its matches of one place share.
-        at: the minimum for independent matches, of this camera alone.
-        matcher: its error; the quadratics of this camera's matches in the scan distortion.
+        T_camera_lidar: (4, 4) the minimum for independent matches.
+        findings: the matcher's error.
     """
-    findings, evidence = matcher
-    ((name, block),) = at.objective.blocks.items()
-    free = FreeLensBlock(at.projections[name], lens.free)
-    columns, hessian = _at_minimum(free, at.T_camera_lidar[name], lens)
-    pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
-    gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
+    by_place = FreeLensByPlace(placed, lens.free, 0)
+    T, values = _minimum(by_place, T_camera_lidar, lens)
+    hessians = np.array([one.hessian for one in by_place.sums(T, values)])
+    hessian = hessians.sum(axis=0) + weak_information(lens)
     covariance = np.linalg.inv(hessian)
-    frames = np.full(len(hessian), float(block.frames))
-    usual = 1 + error_components().frame_correlation * (len(block) / block.frames - 1)
-    scatter = with_pseudo_frames(gradients.T @ gradients, hessian, frames, usual * hessian)
-    by_frames = within.efficiency**2 * (covariance @ scatter @ covariance)[6:, 6:]
-    of_matches = MATCH_SHARE * len(block) if any(findings.systematic_sigmas) else 0.0
+    scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, (T, values), hessian)
+    matches = len(placed.block)
+    of_matches = MATCH_SHARE * matches if any(findings.systematic_sigmas) else 0.0
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
-    own = covariance[6:, 6:]
-    excess = _positive(by_frames - within.least * own) + shared * own
-    sigmas = np.asarray(findings.bend_sigmas)
-    bent = np.zeros((len(own), len(sigmas))) if evidence is None else evidence.lens_jacobian
-    return LensTerm(lens, excess, bent * sigmas)
+    whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
+    of_poses = within.at_place(findings.place_variance)[placed.places]
+    excess = _positive((whole - _in_graph(hessians, of_poses, within.least, lens))[6:, 6:])
+    compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
+    return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
+
+
+def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:
+    """(6 + k, 6 + k) covariance of m_c and s_c by the matches and the poses of places.
+
+    Args:
+        hessians: (p, 6 + k, 6 + k) of independent matches at each place.
+        of_poses: (p, 6, 6) covariance of a_cp about m_c.
+        least: variance of the matches.
+        lens: of the camera.
+    """
+    own = np.linalg.inv(hessians / least + weak_information(lens))
+    own[:, :6, :6] += of_poses
+    return np.asarray(np.linalg.inv(np.linalg.inv(own).sum(axis=0)))
 
 
 def weak_information(lens: LensVariable | None) -> Array:
@@ -88,20 +99,35 @@ def weak_information(lens: LensVariable | None) -> Array:
     return WEAK if lens is None else block_diag(WEAK, _WEAK_PRIOR * np.eye(len(lens.free)))
 
 
-def _at_minimum(
-    free: FreeLensBlock, T_camera_lidar: Array, lens: LensVariable
+def _minimum(
+    by_place: FreeLensByPlace, T_camera_lidar: Array, lens: LensVariable
 ) -> tuple[Array, Array]:
-    """Columns and Hessian of independent matches, where pose and lens fit them best."""
+    """(p, 4, 4) pose, the same at each place, and (k,) values where all matches fit best."""
     pose, values, weak = to_T_lidar_camera(T_camera_lidar), lens.values, weak_information(lens)
+    each = len(by_place.places), 1, 1
     for _ in range(_MOST_STEPS):
-        sums = free.sums(to_T_camera_lidar(pose), values)
-        pull = sums.gradient + weak @ np.concatenate([np.zeros(6), values])
-        step = -np.linalg.solve(sums.hessian + weak, pull)
+        sums = by_place.sums(np.tile(to_T_camera_lidar(pose), each), values)
+        pull = sum(one.gradient for one in sums) + weak @ np.concatenate([np.zeros(6), values])
+        step = -np.linalg.solve(sum(one.hessian for one in sums) + weak, pull)
         pose, values = pose.retract(step[:6]), values + step[6:]
         if -step @ pull < _MINIMAL:
             break
-    T = to_T_camera_lidar(pose)
-    return free.columns(T, values), free.sums(T, values).hessian + weak
+    return np.tile(to_T_camera_lidar(pose), each), values
+
+
+def _frame_scatter(
+    free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array], hessian: Array
+) -> Array:
+    """(6 + k, 6 + k) sum of the outer products of the gradients of frames; few have usual ones."""
+    counts = placed.count_of_frame[np.argsort(placed.place_of_frame, kind="stable")]
+    columns = free.columns(at[0][0], at[1])
+    pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
+    gradients = np.add.reduceat(pulls, np.cumsum(counts) - counts, axis=1).T
+    known, frames = error_components(), len(counts)
+    prior = known.prior_frames / known.pseudo_frames
+    usual = 1 + known.frame_correlation * (counts.mean() - 1)
+    own = gradients.T @ gradients + prior * usual * hessian / frames
+    return np.asarray(own * frames / (prior + frames - 1))
 
 
 def _positive(matrix: Array) -> Array:
