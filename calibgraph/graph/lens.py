@@ -35,10 +35,10 @@ from factors.lens_kernels import PINHOLE, RADTAN
 
 Array = NDArray[np.float64]
 
-FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.002, 0.0005, 2.0
+FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.02, 0.002, 5.0
 """Of the prior, where the rig states none: what good calibrations with a target leave."""
 
-RADIAL_SIGMA, TANGENTIAL_SHARE = 0.01, 0.1
+RADIAL_SIGMA, TANGENTIAL_SHARE = 0.05, 0.1
 """The same of a radial coefficient; and a tangential one's in parts of it."""
 
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
