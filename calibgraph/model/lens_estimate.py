@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 _PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have said nothing
@@ -43,3 +45,15 @@ class LensEstimate:
         """Whether the data determine it, and what it cannot be told from."""
         pair = f"with {self.direction} {self.correlation:.2f}"
         return pair if self.is_determined else f"not determined by these data; {pair}"
+
+
+def change_of_lens(
+    before: Mapping[str, tuple[LensEstimate, ...]], after: Mapping[str, tuple[LensEstimate, ...]]
+) -> float:
+    """Largest change of a parameter in its standard deviations; infinite where none was known."""
+    changes = [
+        abs(new.value - old.value) / new.sigma if name in before else math.inf
+        for name, parameters in after.items()
+        for new, old in zip(parameters, before.get(name, parameters), strict=True)
+    ]
+    return max(changes, default=0.0)
