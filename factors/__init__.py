@@ -17,7 +17,6 @@ from factors.free_lens import (
     FreeLensBlock,
     free_lens_factor,
     linear_factor,
-    placed_free_lens_factor,
 )
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
@@ -68,7 +67,6 @@ __all__ = [
     "pair_projection_factor",
     "pair_run_sums",
     "pair_sums",
-    "placed_free_lens_factor",
     "placed_pair_factor",
     "pose_sigmas",
     "projection_factor",

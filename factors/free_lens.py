@@ -198,26 +198,14 @@ def _losses(loss, scale, squares):  # type: ignore[no-untyped-def]
     return found, weights
 
 
-def free_lens_factor(key: int, key_lens: int, block: FreeLensBlock) -> gtsam.CustomFactor:
+def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomFactor:
     """The block as one factor on ``T_lidar_camera`` and the lens, equal to its separate factors.
 
     Args:
-        key: the pose.
-        key_lens: the lens, a vector of k numbers.
+        keys: of the pose and of the lens, a vector of k numbers; a pose ``T_lidar_cloud`` before
+            these displaces the points.
         block: of the camera.
     """
-    return _factor([key, key_lens], block)
-
-
-def placed_free_lens_factor(
-    key_cloud: int, key: int, key_lens: int, block: FreeLensBlock
-) -> gtsam.CustomFactor:
-    """As :func:`free_lens_factor`, with the cloud displaced by ``T_lidar_cloud``."""
-    return _factor([key_cloud, key, key_lens], block)
-
-
-def _factor(keys: list[int], block: FreeLensBlock) -> gtsam.CustomFactor:
-    """On the poses of these keys, the last that of the camera, and the lens."""
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
@@ -234,7 +222,7 @@ def _factor(keys: list[int], block: FreeLensBlock) -> gtsam.CustomFactor:
                 jacobians[number] = np.asfortranarray(part)
         return found
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), keys, error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), list(keys), error)
 
 
 def linear_factor(

@@ -26,8 +26,8 @@ from factors import (
     BlockSums,
     FreeLens,
     FreeLensBlock,
+    free_lens_factor,
     linear_factor,
-    placed_free_lens_factor,
     robust_noise,
 )
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL
@@ -211,7 +211,7 @@ class FreeLensByPlace:
         block = self._at(place)
         if not len(block.block):
             return []
-        return [placed_free_lens_factor(cloud, matched, self.key, block)]
+        return [free_lens_factor([cloud, matched, self.key], block)]
 
     def _at(self, place: int) -> FreeLensBlock:
         rows = np.arange(self.placed.edges[place], self.placed.edges[place + 1])

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FreeLens, FreeLensBlock, Lens, free_lens_factor, placed_free_lens_factor
+from factors import FreeLens, FreeLensBlock, Lens, free_lens_factor
 from factors.free_lens import COEFFICIENT_NUMBERS
 from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, poses, world
 from tests.factors.test_block import together
@@ -60,7 +60,7 @@ def test_derivatives_are_those_of_differences(name: str) -> None:
 def test_with_the_lens_held_it_is_the_block_factor(name: str) -> None:
     block, lens = world(LENSES[name], 60), free(name)
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(free_lens_factor(KEY, KEY_LENS, FreeLensBlock(block, lens)))
+    graph.add(free_lens_factor([KEY, KEY_LENS], FreeLensBlock(block, lens)))
     for pose in poses()[:3]:
         values = with_lens(pose, np.zeros(len(lens)))
         np.testing.assert_allclose(graph.error(values), together(block).error(at(pose)), rtol=1e-9)
@@ -89,7 +89,7 @@ def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> 
     free_lens = FreeLens(lens, names, (1.0,) * len(names))
     block = replace(world(lens, 20), sqrt_information=None, loss="l2")
     ours, theirs = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    ours.add(free_lens_factor(KEY, KEY_LENS, FreeLensBlock(block, free_lens)))
+    ours.add(free_lens_factor([KEY, KEY_LENS], FreeLensBlock(block, free_lens)))
     values = at(TRUTH.retract(np.full(6, 0.01)))
     values.insert(KEY_LENS, calibration(K["fx"], K["fy"], 0.0, K["cx"], K["cy"], *distortion))
     for number, (point, pixel) in enumerate(
@@ -120,8 +120,8 @@ def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> 
 
 def test_a_displaced_cloud_is_a_displaced_camera() -> None:
     lens = free("radtan")
-    factor = placed_free_lens_factor(
-        KEY_CLOUD, KEY, KEY_LENS, FreeLensBlock(world(LENSES["radtan"], 40), lens)
+    factor = free_lens_factor(
+        [KEY_CLOUD, KEY, KEY_LENS], FreeLensBlock(world(LENSES["radtan"], 40), lens)
     )
     values = with_lens(TRUTH, np.full(len(lens), 0.3))
     values.insert(KEY_CLOUD, gtsam.Pose3().retract(np.linspace(-0.02, 0.03, 6)))
