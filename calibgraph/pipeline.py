@@ -115,7 +115,7 @@ def solve(
         ValueError: if ``terms`` is unknown.
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
-    evidence, watch = Evidence(solution, guess=solution.rig), Stopwatch()
+    evidence, watch = Evidence(solution, guess=rig), Stopwatch()
     with watch("checks"):
         checks = assess(evidence)
     result = to_calibration(evidence, checks)
@@ -158,6 +158,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         weaknesses={n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras},
         prior_share=evidence.prior_shares,
         error_sources=evidence.error_sources,
+        lens=solution.lens,
         bootstrap=evidence.bootstrap,
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,

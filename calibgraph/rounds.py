@@ -22,11 +22,17 @@ from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
-from calibgraph.matching.run import MatchingRun, Rematch, RoundSummary
+from calibgraph.matching.run import (
+    MatchingRun,
+    Rematch,
+    RoundSummary,
+    round_in_words,
+    summarize_round,
+)
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.geometry import angle_deg, relative_transform
+from calibgraph.model.lens_estimate import LensEstimate, change_of_lens
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
@@ -46,6 +52,11 @@ _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
 8 to 12 cm off had 8 to 16 % lower z-scores than those at 3 cm; equally good ends differ by a few
 percent."""
+
+
+_STANDS, _MORE_ROUNDS = 0.5, 4
+"""Change of a lens, in its standard deviations, from which the last round is repeated; how often.
+"""
 
 
 def match_in_rounds(
@@ -74,15 +85,19 @@ def match_in_rounds(
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
     estimate = start.rig
-    for index in range(start.first_round, full.rounds):
+    indices, lens = [*range(start.first_round, full.rounds)], dict[str, tuple[LensEstimate, ...]]()
+    for index in indices:
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=progress)
             table = table.with_findings(start.findings).with_places(places)
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms=terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
-        _log.info("round %d: %s", index, _in_words(rounds[-1]))
+        _log.info("round %d: %s", index, round_in_words(rounds[-1]))
+        moved, lens = change_of_lens(lens, solution.lens), solution.lens
         estimate = solution.solved_rig
+        if indices[-1] == index and moved > _STANDS and len(indices) < full.rounds + _MORE_ROUNDS:
+            indices.append(index)  # with the new lens
         if out_of_time():
             break
     missed = full.rounds - 1 - index
@@ -116,7 +131,7 @@ def assign_places(run: MatchingRun) -> MatchingRun:
     places = replace(run.correspondences.places, places=as_groups(groups))
     table = run.correspondences.with_places(places)
     solution = solve_joint(
-        run.solution.rig,
+        run.solution.rig.with_lenses_of(run.guess),
         table,
         config,
         run.solution.terms,
@@ -168,6 +183,7 @@ def _solve(
     A camera with too few correspondences is placed by what it sees in common with another; if that
     does not place it either, it is excluded, and the others are calibrated.
     """
+    matched = (matched[0].with_lenses_of(guess), matched[1])  # the mean of their priors
     try:
         return solve_joint(*matched, config, terms)
     except CorrespondenceError as error:
@@ -182,28 +198,6 @@ def _solve(
             raise
         hint = f"{error}; {intended}"
         raise CorrespondenceError(hint, camera=error.camera) from error
-
-
-def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:
-    """How many matches a round found, and how far it moved each camera."""
-    counts = table.counts()
-    cameras = {}
-    for name, old in before.T_camera_lidar.items():
-        delta = relative_transform(after.T_camera_lidar[name], old)
-        cameras[name] = {
-            "matches": counts.get(name, 0),
-            "moved_deg": angle_deg(delta[:3, :3]),
-            "moved_cm": 100.0 * float(np.linalg.norm(delta[:3, 3])),
-        }
-    return cameras
-
-
-def _in_words(summary: RoundSummary) -> str:
-    return "; ".join(
-        f"{name} {each['matches']:.0f} matches, moved {each['moved_deg']:.2f} deg, "
-        f"{each['moved_cm']:.1f} cm"
-        for name, each in summary.items()
-    )
 
 
 def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool]) -> MatchingRun:
@@ -256,7 +250,7 @@ def _from_displaced_start(
             progress=lambda what, done, total: progress("matching again", done, total),
         )
         table = table.with_places(places)
-        solution = solve_joint(estimate, table, config, terms)
+        solution = solve_joint(estimate.with_lenses_of(run.guess), table, config, terms)
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return last
@@ -285,7 +279,8 @@ def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> M
     mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
     mixed = mixed.with_findings(replace(findings, z_score=z_score))
     second = again.solution.rig.T_camera_lidar
-    start = run.solution.rig.moved_to({name: second[name] for name in better})
+    at_prior = run.solution.rig.with_lenses_of(run.guess)
+    start = at_prior.moved_to({name: second[name] for name in better})
     settings = run.solution.config, run.solution.terms
     last = {**run.rounds[-1], **{name: again.summary[name] for name in better}}
     return replace(

@@ -12,6 +12,12 @@ from factors.conditioning import (
     unit_diagonal,
 )
 from factors.epipolar import EpipolarBlock, epipolar_residual
+from factors.free_lens import (
+    FreeLens,
+    FreeLensBlock,
+    free_lens_factor,
+    linear_factor,
+)
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pair import (
@@ -28,6 +34,7 @@ from factors.pair import (
 from factors.pose import (
     biased_between_factor,
     camera_prior_factor,
+    displaced_between_factor,
     pose_sigmas,
     relative_pose_factor,
     relative_prior_factor,
@@ -40,6 +47,8 @@ __all__ = [
     "LOSSES",
     "BlockSums",
     "EpipolarBlock",
+    "FreeLens",
+    "FreeLensBlock",
     "Lens",
     "LensModel",
     "LossName",
@@ -48,8 +57,11 @@ __all__ = [
     "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
+    "displaced_between_factor",
     "epipolar_factor",
     "epipolar_residual",
+    "free_lens_factor",
+    "linear_factor",
     "pair_block_factor",
     "pair_chain",
     "pair_projection_factor",

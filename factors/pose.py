@@ -4,6 +4,8 @@ All act on variables ``X = T_lidar_camera``. GTSAM's cost is half the squared wh
 paper weight lambda is a sigma of 1 / sqrt(lambda).
 """
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,7 +90,20 @@ def biased_between_factor(
         shifts: (6, B) twist of X_2 in X_1's frame by each of the numbers.
         noise: of the six rows.
     """
-    shifts = np.asarray(shifts, dtype=np.float64)
+    return displaced_between_factor(key_1, key_2, {key_bend: np.asarray(shifts)}, noise)
+
+
+def displaced_between_factor(
+    key_1: int, key_2: int, shifts: Mapping[int, Array], noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """The same with several vectors: error ``log(X_1^-1 X_2) - sum shifts b``.
+
+    Args:
+        key_1: variable X_1.
+        key_2: variable X_2.
+        shifts: by the key of each vector b, (6, B) twist of X_2 in X_1's frame by its numbers.
+        noise: of the six rows.
+    """
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
@@ -97,9 +112,9 @@ def biased_between_factor(
         twist = gtsam.Pose3.Logmap(step)
         if jacobians is not None:
             by_step = gtsam.Pose3.LogmapDerivative(twist)
-            jacobians[0] = np.asfortranarray(-by_step @ step.inverse().AdjointMap())
-            jacobians[1] = np.asfortranarray(-shifts)
-            jacobians[2] = np.asfortranarray(by_step)
-        return np.asarray(twist - shifts @ values.atVector(key_bend))
+            by_first = -by_step @ step.inverse().AdjointMap()
+            for number, jacobian in enumerate([by_first, *(-s for s in shifts.values()), by_step]):
+                jacobians[number] = np.asfortranarray(jacobian)
+        return np.asarray(twist - sum(s @ values.atVector(key) for key, s in shifts.items()))
 
-    return gtsam.CustomFactor(noise, [key_1, key_bend, key_2], error)
+    return gtsam.CustomFactor(noise, [key_1, *shifts, key_2], error)

@@ -7,14 +7,14 @@ from functools import cached_property
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
-from calibgraph.matching.run import MatchingRun, RoundSummary
+from calibgraph.matching.run import MatchingRun, RoundSummary, summarize_round
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.progress import Progress, Stopwatch
-from calibgraph.rounds import find_stationary, summarize_round
+from calibgraph.rounds import find_stationary
 from calibgraph.solver.joint import solve_without_failing
 from calibgraph.trust.thresholds import threshold
 

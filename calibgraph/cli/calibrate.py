@@ -39,10 +39,15 @@ def calibrate(
     from calibgraph.report.result_files import write_result
 
     with checked_arguments():
-        given = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "of": of}
+        given = {
+            "tolerance_deg": tolerance_deg,
+            "tolerance_cm": tolerance_cm,
+            "of": of,
+            "estimate": matching.lens_parts,
+        }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
-        chosen = matching.find_matcher(seed=settings.seed)
+        chosen = matching.find_matcher(seed=settings.seed, lens_too=True)
     data = matching.load_dataset(dataset)
     if remote.SERVER.get() is not None:
         result, written = remote.calibrate(data, matching, settings, checked_terms, out)
@@ -109,6 +114,7 @@ def solve(
     common_deg: options.CommonDegOption = None,
     common_cm: options.CommonCmOption = None,
     of: options.OfOption = None,
+    estimate: options.EstimateOption = None,
     print_graph: options.PrintGraphOption = False,
     graph: options.GraphOption = None,
     as_json: options.JsonOption = False,
@@ -129,6 +135,7 @@ def solve(
             "common_deg": common_deg,
             "common_cm": common_cm,
             "of": of,
+            "estimate": estimate,
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)

@@ -66,13 +66,14 @@ WeightsOption = Annotated[
         rich_help_panel=_CMRNEXT,
     ),
 ]
-EstimateOption = Annotated[
+NetworkEstimateOption = Annotated[
     str | None,
     typer.Option(
-        metavar="frame|joint",
-        help="Where a network starts: at each frame's own pose from the previous network "
-        "(default), or at the joint solve over all frames and cameras.",
-        rich_help_panel=_CMRNEXT,
+        "--estimate",
+        metavar="PART,...|frame|joint",
+        help="Parts of each camera's lens that calibrate estimates too: focal, aspect, centre, "
+        "distortion, or lens for all but aspect; or where a network of cmrnext starts: at each "
+        "frame's own pose from the previous one (default), or at the joint solve.",
     ),
 ]
 DeviceOption = Annotated[
@@ -183,6 +184,14 @@ OfOption = Annotated[
         metavar="alignment|mount",
         help="Poses to report: where the LiDAR's points meet the images, or where the sensors are "
         "mounted, less certain. (default: alignment)",
+    ),
+]
+EstimateOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PART,...",
+        help="Estimate each camera's lens too: focal, aspect, centre, distortion, or lens for all "
+        "but aspect. The rig may state how well it is known.",
     ),
 ]
 TermsOption = Annotated[

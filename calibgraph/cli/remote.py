@@ -120,8 +120,9 @@ def _search_of(matching: MatchingOptions) -> dict[str, Any]:
     from calibgraph.errors import CalibrationError
 
     known = ("rig", "matcher", "frames", "time_limit_s", "search_deg", "search_m")
+    with_config = ("estimate",) if matching.lens_parts else ()
     for name, value in vars(matching).items():
-        if name not in known and value != getattr(MatchingOptions(), name):
+        if name not in (*known, *with_config) and value != getattr(MatchingOptions(), name):
             raise CalibrationError(f"--{name.replace('_', '-')}: not with --server")
     if matching.matcher == "cmrnext":
         raise CalibrationError("--matcher cmrnext: not with --server")

@@ -43,6 +43,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         f"the matcher reports as common to its frames; {result.not_included}; A->B: of the "
         "transform from A to B, in B's axes"
     )
+    if result.lens:
+        console.print(lens_table(result))
     time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
     console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
     for path in written:
@@ -127,6 +129,19 @@ def error_bar_table(result: Calibration) -> Table:
         if result.error_bar_holds(name):
             sigmas = degrees_and_centimetres(covariance)
             table.add_row(escape(f"{name} (bootstrap)"), *_sigma_cells(*sigmas))
+    return table
+
+
+def lens_table(result: Calibration) -> Table:
+    """One row per parameter of each lens that was estimated."""
+    table = empty_table("Lens", "camera", "parameter")
+    add_number_columns(table, "estimate", "sigma", "prior", "prior\nsigma")
+    table.add_column("with the pose")
+    for name, parameters in result.lens.items():
+        for one in parameters:
+            numbers = (f"{v:.5g}" for v in (one.value, one.sigma, one.prior, one.prior_sigma))
+            label = f"{one.name} {one.unit}".strip()
+            table.add_row(escape(name), label, *numbers, one.describe())
     return table
 
 

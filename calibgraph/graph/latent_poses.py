@@ -8,6 +8,7 @@
     data          correspondences of camera c at place p, on o_p and a_cp;
                   camera-to-camera matches at place p, on o_p, n_a and n_b
     pose graph    priors and measured relative poses, on x_c
+    lens          l_c, s_c where lenses are estimated: ``calibgraph.graph.lens``
 
 What is reported is y_c, the alignment: the pose that puts the points, as this sensor delivers them,
 on this camera's image. The mount x_c is where the sensor is; what is unknown of its beams is added.
@@ -20,7 +21,7 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -34,6 +35,7 @@ from calibgraph.graph.by_place import (
     SummarizedByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
+from calibgraph.graph.lens import FreeLensByPlace, LensTerm, lens_graph
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
@@ -41,12 +43,19 @@ from calibgraph.graph.variables import (
     aligned_key,
     camera_key,
     cloud_at_key,
+    lens_key,
     matched_at_key,
     matched_key,
     paired_key,
+    seen_lens_key,
 )
 from calibgraph.model.config import Reported
-from factors import biased_between_factor, placed_pair_factor, robust_noise
+from factors import (
+    biased_between_factor,
+    displaced_between_factor,
+    placed_pair_factor,
+    robust_noise,
+)
 
 Array = NDArray[np.float64]
 
@@ -63,14 +72,16 @@ class LatentPoseModel:
             not in the graph, on ``o`` and ``m_c``.
         components: of the errors.
         of: the poses that are reported.
+        lenses: those that are estimated, by the numbers of their cameras.
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, BlockByPlace | QuadraticByPlace | SummarizedByPlace]
+    blocks: Mapping[str, BlockByPlace | QuadraticByPlace | SummarizedByPlace | FreeLensByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
     of: Reported = "alignment"
+    lenses: Mapping[int, LensTerm] = field(default_factory=dict)
 
     @property
     def places(self) -> int:
@@ -123,8 +134,14 @@ class LatentPoseModel:
 
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
-        """The factors of what all places share: priors, distortion, camera, pose graph."""
-        return join(_shared_graph(self), self.pose_graph)
+        """The factors of what all places share: of errors, pose graph, lenses."""
+        lenses = lens_graph(self.lenses, is_distorted=self.is_distorted)
+        return join(self.error_graph, self.pose_graph, lenses)
+
+    @cached_property
+    def error_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Those of errors alone: priors, distortion, camera."""
+        return _shared_graph(self)
 
     @cached_property
     def place_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -144,10 +161,11 @@ class LatentPoseModel:
         Mounts before the distortion: in this order no exact tie is left to a weak variable.
         """
         distortion = [DISTORTION] if self.is_distorted else []
+        lenses = [key(number) for key in (seen_lens_key, lens_key) for number in self.lenses]
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
         poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
         others = [key for key in poses if key not in self.reported_keys]
-        return [CLOUD, *shown, *others, *distortion, *self.reported_keys]
+        return [CLOUD, *shown, *others, *lenses, *distortion, *self.reported_keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -199,8 +217,12 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
         graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
     seen = aligned_key if model.is_distorted else camera_key
     for number in model.matched:
-        edge = seen(number), matched_key(number)
-        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(parts.camera)))
+        edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
+        if (term := model.lenses.get(number)) is None:
+            graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise))
+        else:
+            shifts = term.shifts(number, is_distorted=model.is_distorted)
+            graph.add(displaced_between_factor(*edge, shifts, noise))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)
         graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import PairByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
 from factors import pair_run_sums
@@ -57,6 +58,9 @@ class LinearData:
         places, T_camera_cloud = block.places, np.tile(np.eye(4), (len(clouds), 1, 1))
         keys = [matched_at_key(int(place), number) for place in places]
         T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
+        if isinstance(block, FreeLensByPlace):
+            self._add_free_lens(block, keys, values, T_camera_cloud[places])
+            return
         sums = block.sums(T_camera_cloud)
         by_cloud = -adjoints(T_camera_cloud)[places]
         hessian, gradient, cost = sums.hessian[places], sums.gradient[places], sums.cost[places]
@@ -68,6 +72,29 @@ class LinearData:
                 gtsam.HessianFactor(
                     cloud_at_key(int(place)), key,
                     cloud[row], across[row], pull[row], hessian[row], -gradient[row], cost[row],
+                )
+            )  # fmt: skip
+
+    def _add_free_lens(
+        self, block: FreeLensByPlace, keys: list[int], values: gtsam.Values, T_camera_cloud: Array
+    ) -> None:
+        """The same with a free lens, on o_p^-1 a_cp and s_c."""
+        sums = block.sums(T_camera_cloud, values.atVector(block.key))
+        by_cloud = -adjoints(T_camera_cloud)
+        for number, (place, key) in enumerate(zip(block.places, keys, strict=True)):
+            one, size = sums[number], len(sums[number].gradient)
+            chain = np.hstack(
+                [np.vstack([by_cloud[number], np.zeros((size - 6, 6))]), np.eye(size)]
+            )
+            hessian, pull = chain.T @ one.hessian @ chain, -chain.T @ one.gradient
+            cloud, pose, lens = slice(6), slice(6, 12), slice(12, None)
+            self.cost += float(one.cost)
+            self.graph.push_back(
+                gtsam.HessianFactor(
+                    cloud_at_key(int(place)), key, block.key,
+                    hessian[cloud, cloud], hessian[cloud, pose], hessian[cloud, lens], pull[cloud],
+                    hessian[pose, pose], hessian[pose, lens], pull[pose],
+                    hessian[lens, lens], pull[lens], float(one.cost),
                 )
             )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Keys of the variables. All are ``Pose3`` in the LiDAR frame but the scan distortion, a vector.
+"""Keys of the variables: ``Pose3`` in the LiDAR frame; scan distortion and lenses are vectors.
 
 x_c   the mount of camera c: ``T_lidar_camera`` of the two sensors as bodies
 d     the scan distortion, in standard deviations of its prior
@@ -8,6 +8,8 @@ n_c   camera c as its pairs with other cameras show it
 o     the cloud as it is displaced at every place
 o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
+l_c   the lens of camera c, if it is estimated, in standard deviations of its prior
+s_c   that lens as its matches show it
 """
 
 import gtsam
@@ -41,6 +43,16 @@ def matched_key(camera: int) -> int:
 def paired_key(camera: int) -> int:
     """Key of ``n_c``."""
     return int(gtsam.symbol("n", camera))
+
+
+def lens_key(camera: int) -> int:
+    """Key of ``l_c``."""
+    return int(gtsam.symbol("l", camera))
+
+
+def seen_lens_key(camera: int) -> int:
+    """Key of ``s_c``."""
+    return int(gtsam.symbol("s", camera))
 
 
 def cloud_at_key(place: int) -> int:

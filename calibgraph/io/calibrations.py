@@ -16,6 +16,7 @@ from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
@@ -149,6 +150,7 @@ class _Parts(BaseModel):
     terms: Terms
     prior_share: dict[str, float]
     error_sources: dict[str, ErrorSources] = {}
+    lens: dict[str, tuple[LensEstimate, ...]] = {}
     inputs: dict[str, str]
     versions: dict[str, str]
     date: str = ""
@@ -188,11 +190,12 @@ _OF_SOME_CAMERAS = (
     "prior_share",
     "bootstrap",
     "error_sources",
+    "lens",
 )
 _PLAIN = (
     "covariance", "joint_covariance", "pair_covariance", "stage1_T_camera_lidar", "residuals",
     "weaknesses", "rounds", "counts", "timings_s", "terms", "prior_share", "error_sources",
-    "inputs", "versions", "date", "warnings",
+    "inputs", "versions", "date", "warnings", "lens",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

@@ -3,9 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.solution import Solution
@@ -60,3 +63,26 @@ class MatchingRun:
     out_of_time: bool = False
     warnings: tuple[str, ...] = ()
     rematch: Rematch | None = None
+
+
+def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:
+    """How many matches a round found, and how far it moved each camera."""
+    counts = table.counts()
+    cameras = {}
+    for name, old in before.T_camera_lidar.items():
+        delta = relative_transform(after.T_camera_lidar[name], old)
+        cameras[name] = {
+            "matches": counts.get(name, 0),
+            "moved_deg": angle_deg(delta[:3, :3]),
+            "moved_cm": 100.0 * float(np.linalg.norm(delta[:3, 3])),
+        }
+    return cameras
+
+
+def round_in_words(summary: RoundSummary) -> str:
+    """The summary of a round as one line."""
+    return "; ".join(
+        f"{name} {each['matches']:.0f} matches, moved {each['moved_deg']:.2f} deg, "
+        f"{each['moved_cm']:.1f} cm"
+        for name, each in summary.items()
+    )

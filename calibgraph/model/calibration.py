@@ -19,6 +19,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
@@ -80,6 +81,7 @@ class Calibration:
         weaknesses: per camera, the least determined directions, in words, the worst first.
         prior_share: per camera, the share of its result that comes from priors, not data (0-1).
         error_sources: per camera with an error bar, the shares of its sources.
+        lens: per camera whose lens was estimated, its parameters; the lens itself is the rig's.
         bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
             frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
@@ -111,6 +113,7 @@ class Calibration:
     weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
     prior_share: dict[str, float] = field(default_factory=dict)
     error_sources: dict[str, ErrorSources] = field(default_factory=dict)
+    lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
@@ -182,7 +185,8 @@ class Calibration:
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
-        return f"errors of the intrinsics{scale} are not included"
+        fixed = "" if self.lens else " of the intrinsics"
+        return f"errors{fixed}{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.
@@ -262,6 +266,7 @@ class Calibration:
             "joint_covariance": self.joint_covariance,
             "pair_covariance_of": PAIR_TANGENT_SENTENCE,
             "pair_covariance": self.pair_covariance,
+            "lens": {name: [vars(one) for one in of] for name, of in self.lens.items()},
             "bootstrap_covariance": self.bootstrap,
             "residuals": {name: vars(value) for name, value in self.residuals.items()},
             "counts": self.counts,

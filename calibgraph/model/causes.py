@@ -24,6 +24,13 @@ _FRAMES = "Look at the frames that disagree: leave out those in which a sensor m
 _SPREAD = "Give more matches, spread over the image and over distances."
 _LEARNED = "Use the matcher structure, or train the network on recordings of this kind."
 
+_ESTIMATED_AS = {
+    "focal_length": "focal",
+    "distortion": "distortion",
+    "principal_point": "centre",
+    "aspect_ratio": "aspect",
+}
+
 # fmt: off
 CAUSES: dict[str, Cause] = {
     "guess": Cause(
@@ -54,10 +61,10 @@ CAUSES: dict[str, Cause] = {
         {
             "lens": "",
             "values of the rig": "Correct the named value in the rig.",
-            **{f"lens_{name}": "" for name in (
-                "focal_length", "distortion", "principal_point", "aspect_ratio", "skew")},
-            **{name: "" for name in (
-                "focal_length", "distortion", "principal_point", "aspect_ratio", "skew")},
+            **{f"{by}{name}": "Check that intrinsics and image size belong to these images, or "
+               f"estimate the lens: --estimate {part}."
+               for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
+            "lens_skew": "", "skew": "",
             "focal_sensitivity": "Verify the focal length: here the position depends on it.",
         },
     ),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
 
 from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
@@ -17,6 +17,7 @@ TERMS: tuple[Terms, ...] = get_args(Terms)
 Stage1Source = Literal["pnp", "rig"]
 PresetName = Literal["kitti", "walkley", "auto"]
 Reported = Literal["alignment", "mount"]
+LensPart = Literal["focal", "aspect", "centre", "distortion"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
@@ -57,6 +58,15 @@ def _not_one(draws: int) -> int:
     return draws
 
 
+def _lens_parts(value: Any) -> Any:
+    """The names of parts, also with commas between them; ``lens`` stands for three."""
+    names = value.split(",") if isinstance(value, str) else value
+    if not isinstance(names, list | tuple):
+        return names
+    whole = {"lens": ("focal", "centre", "distortion")}
+    return tuple(dict.fromkeys(part for name in names for part in whole.get(name, (name,))))
+
+
 class Config(StrictNumbers):
     """Settings, with the paper's symbols. The defaults are the preset ``auto``.
 
@@ -89,6 +99,9 @@ class Config(StrictNumbers):
             of the covariance; 0 for none.
         of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
+        estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
+            ``solve``: ``focal``, ``aspect`` (fx over fy), ``centre``, ``distortion``; ``lens`` is
+            focal, centre and distortion.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """
@@ -118,6 +131,7 @@ class Config(StrictNumbers):
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
     bootstrap: Annotated[int, Field(ge=0, le=100_000), AfterValidator(_not_one)] = 0
     of: Reported = "alignment"
+    estimate: Annotated[tuple[LensPart, ...], BeforeValidator(_lens_parts)] = ()
     seed: Seed = 0
     tracking: Tracking = Tracking()
 

@@ -137,6 +137,9 @@ class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
+_LEFT_OUT = "covariance", "frame_id", "intrinsics_sigma_px", "distortion_sigma"  # where None
+
+
 class Intrinsics(_Model):
     """Focal lengths and principal point [px]; pixel (0, 0) is the centre of the top-left pixel."""
 
@@ -146,12 +149,21 @@ class Intrinsics(_Model):
     cy: Bounded
 
 
+class IntrinsicsSigma(_Model):
+    """Standard deviations [px] of the focal lengths and of each coordinate of the centre."""
+
+    focal: Positive | None = None
+    centre: Positive | None = None
+
+
 class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
 
-    ``frame_id`` is that of its optical frame in ROS, as its bag names it. ``covariance`` is that of
-    a reference with error bars: (6, 6) of xi = (rotation [rad], translation [m]) in T_camera_lidar
-    = exp(xi) T, in the camera's axes.
+    ``intrinsics_sigma_px`` and ``distortion_sigma`` (of radial coefficients) are how well the lens
+    is known where it is estimated; ``calibgraph.graph.lens`` has defaults. ``frame_id`` is that of
+    its optical frame in ROS, as its bag names it. ``covariance`` is that of a reference with error
+    bars: (6, 6) of xi = (rotation [rad], translation [m]) in T_camera_lidar = exp(xi) T, in the
+    camera's axes.
     """
 
     model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
@@ -159,6 +171,8 @@ class Camera(_Model):
     height_px: Size
     intrinsics_px: Intrinsics
     distortion: tuple[Bounded, ...] = ()
+    intrinsics_sigma_px: IntrinsicsSigma | None = None
+    distortion_sigma: Positive | None = None
     frame_id: FrameId | None = None
     T_camera_lidar: Transform
     covariance: PoseCovariance | None = None
@@ -169,7 +183,7 @@ class Camera(_Model):
         return {
             name: value
             for name, value in fields.items()
-            if value is not None or name not in ("covariance", "frame_id")
+            if value is not None or name not in _LEFT_OUT
         }
 
     @model_validator(mode="after")
@@ -270,6 +284,15 @@ class Rig(_Model):
             for name, camera in self.cameras.items()
         }
         return self.model_copy(update={"cameras": cameras})
+
+    def with_lenses_of(self, other: Rig) -> Rig:
+        """The same extrinsics with the lenses of a rig of the same cameras."""
+        lenses = {
+            name: {key: getattr(camera, key) for key in ("intrinsics_px", "distortion")}
+            for name, camera in other.cameras.items()
+        }
+        cameras = {n: camera.model_copy(update=lenses[n]) for n, camera in self.cameras.items()}
+        return self if cameras == self.cameras else self.model_copy(update={"cameras": cameras})
 
     def save(self, path: Path | str, *, first_line: str = "") -> None:
         """Write the rig file; the first line is a comment."""

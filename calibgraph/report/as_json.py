@@ -31,6 +31,10 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
             "prior_share": result.prior_share.get(name),
             "error_sources": _sources(result, name),
             "counts": result.counts[name],
+            "lens": [
+                {**vars(one), "is_determined": one.is_determined}
+                for one in result.lens.get(name, ())
+            ],
         }
     return {
         "verdict": result.verdict.status,

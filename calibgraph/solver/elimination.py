@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.linear_data import LinearData
 from calibgraph.graph.variables import (
     CLOUD,
@@ -37,9 +38,7 @@ TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
-
 _ROUNDING = 2e-15  # smallest part of a sum that a difference may leave
-
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
 
@@ -245,7 +244,7 @@ def fit_latent_poses(
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
-    """All poses of a camera at its (4, 4) extrinsic, the cloud where it is, no distortion."""
+    """All poses of a camera at its (4, 4) extrinsic, the cloud and lenses where they are."""
     values, no_motion = gtsam.Values(), gtsam.Pose3()
     poses = [to_T_lidar_camera(T_camera_lidar[name]) for name in model.cameras]
     for number, pose in enumerate(poses):
@@ -258,6 +257,7 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
         values.insert(paired_key(number), poses[number])
     for place, number in model.matched_places():
         values.insert(matched_at_key(place, number), poses[number])
+    values.insert(start_lenses(model.lenses))
     for key in [CLOUD, *map(cloud_at_key, range(model.places))]:
         values.insert(key, no_motion)
     if model.is_distorted:

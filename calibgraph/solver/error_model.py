@@ -9,8 +9,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.objective import join, pose_key
+from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
@@ -19,12 +22,13 @@ from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.lens import lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.prior_components import common_error, variance_components
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
-from calibgraph.solver.within_place import WEAK, within_place
+from calibgraph.solver.within_place import within_place
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -112,7 +116,8 @@ def refine_with_error_model(
     inliers = at.objective
     several = inliers.blocks and len(split_frames(inliers, places)) > 1
     distorted = any(findings.bend_sigmas)
-    if not (several or distorted or inliers.pairs or inliers.rig.relative_poses):
+    known = inliers.rig.relative_poses, inliers.lenses
+    if not (several or distorted or inliers.pairs or any(known)):
         return None, optimum
     free = fit_without_priors(at, findings, places) if inliers.rig.relative_poses else None
     if free is not None:
@@ -207,15 +212,26 @@ def error_model(
         places: the frame numbers of each place.
     """
     inliers, cameras = at.objective, at.cameras
-    blocks, shown = {}, {}
+    blocks: dict[str, BlockByPlace | FreeLensByPlace] = {}
+    shown, lenses = {}, {}
     for name, block in inliers.blocks.items():
         by_place = block_by_place(block, at.scales[name], places)
         within = within_place(at, name, by_place)
-        blocks[name], evidence = by_place.with_variance(within.least), None
+        placed, evidence = by_place.with_variance(within.least), None
+        lens, number = inliers.lenses.get(name), cameras.index(name)
         if any(findings.bend_sigmas):
+            weak, pose = weak_information(lens), at.pose(name)
             evidence = distortion_evidence(
-                block, at.scales[name], at.pose(name), WEAK, places=places
+                block, at.scales[name], pose, weak, places=places, lens=lens
             )
+        blocks[name] = placed
+        if lens is not None:
+            term = lens_term(lens, by_place, within, at.T_camera_lidar[name], findings=findings)
+            if evidence is not None:
+                bent = evidence.lens_jacobian * np.asarray(findings.bend_sigmas)
+                term = replace(term, by_distortion=bent)
+            lenses[number] = term
+            blocks[name] = FreeLensByPlace(placed, lens.free, seen_lens_key(number))
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
     components = variance_components(findings, cameras, shown, places=len(places))
@@ -234,7 +250,8 @@ def error_model(
     )
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
     features = pairs_by_place(pairs, places)
-    return LatentPoseModel(cameras, blocks, features, graph, components, inliers.config.of)
+    of = inliers.config.of
+    return LatentPoseModel(cameras, blocks, features, graph, components, of, lenses)
 
 
 def held_graph(

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import to_ordering
-from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
+    LENSES,
     MATCHES,
     MOTION,
     PAIRS,
@@ -107,11 +107,12 @@ def _of_shared(linear: Linearization) -> Variances:
     model = linear.model
     summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
     keys = model.reported_keys + model.shared_keys[: -len(model.cameras)]
-    sizes = [len(_DISTORTIONS) if key == DISTORTION else 6 for key in keys]
+    dims = linear.values.dims()
+    sizes = [dims[key] for key in keys]
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))
     hessian = join_linear(linear.shared, summary).hessian(to_ordering(keys))[0]
     covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
-    found = dict.fromkeys((COMMON, PAIRS, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
+    found = dict.fromkeys((COMMON, PAIRS, LENSES, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
     for number in range(linear.shared.size()):
         factor = linear.shared.at(number)
         if isinstance(factor, gtsam.HessianFactor):
@@ -125,6 +126,7 @@ def _of_shared(linear: Linearization) -> Variances:
                 found[name] = found[name] + part
             continue
         source = PAIRS if "n" in letters else COMMON if letters & {"m", "o", "y"} else PRIORS
+        source = LENSES if "l" in letters else source
         found[source] = found[source] + (moved**2).sum(axis=1)
     return found
 

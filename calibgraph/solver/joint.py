@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.graph.lens import lens_variables
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -16,12 +17,16 @@ from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
 from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
+from calibgraph.solver.lens import Lenses, moved_lenses, put_into
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined, require_known
+
+_MOST_ROUNDS = 8  # of solves, each from the lenses of the last
+_SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds
 
 
 # fmt: off
@@ -33,6 +38,7 @@ def solve_joint(
     *,
     pairwise: Stage1 | None = None,
     camera_matches: CameraMatches | None = None,
+    lenses: Lenses | None = None,
 ) -> Solution:
     """The paper's method, from correspondences to the optimum.
 
@@ -46,6 +52,8 @@ def solve_joint(
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
         camera_matches: what cameras see in common, with surfaces; from the correspondences' frames.
+        lenses: whose values the rig's lenses have; None: those that ``config.estimate`` names, at
+            the rig's lenses, and then in rounds.
 
     Raises:
         FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
@@ -54,6 +62,8 @@ def solve_joint(
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
     require_known(rig, config.excluded_cameras)
+    if lenses is None and config.estimate:
+        return _solve_with_lenses(rig, table, config, terms, camera_matches=camera_matches)
 
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
@@ -71,7 +81,8 @@ def solve_joint(
     with watch("weights"):                                                 # ours: frame weights
         frames = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
 
-    objective = Objective(rig, frames.blocks, T_hat(pairwise), config, terms)  # Eq. 5
+    objective = Objective(                                                 # Eq. 5
+        rig, frames.blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
 
     with watch("pass1"):                                                   # Two-Pass Solver
         rough, scales = objective.minimize_with_scale(frames.T_camera_lidar)   # 1. fit
@@ -95,6 +106,40 @@ def solve_joint(
     )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def _solve_with_lenses(
+    rig: Rig,
+    table: Correspondences | Path | str,
+    config: Config,
+    terms: Terms,
+    *,
+    camera_matches: CameraMatches | None,
+) -> Solution:
+    """The joint solve with the lenses that are to be estimated, in rounds until they stand.
+
+    The lens decides which matches are inliers, and their weights; its prior stays where it is.
+    """
+    if config.preset != "auto" or terms not in USING_CORRESPONDENCES:
+        raise ValueError(
+            "lenses are estimated with the preset auto and the terms full or reprojection; found "
+            f"preset {config.preset}, terms {terms}"
+        )
+    lenses: Lenses = lens_variables(rig, config.estimate)
+    for _ in range(_MOST_ROUNDS):
+        solution = solve_joint(
+            put_into(rig, lenses),
+            table,
+            config,
+            terms,
+            camera_matches=camera_matches,
+            lenses=lenses,
+        )
+        fit = None if solution.errors is None else solution.errors.fit
+        lenses, change = moved_lenses(lenses, fit)
+        if change < _SETTLED:
+            return solution
+    return replace(solution, optimum=replace(solution.optimum, converged=False))
 
 
 def solve_without_failing(

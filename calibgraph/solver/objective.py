@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.objective import join, objective_graph, pose_key, projection_graph
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
@@ -47,6 +48,7 @@ class Objective:
             scale that it was drawn at; before it, empty.
         relative_tolerance: of Levenberg-Marquardt.
         pairs: what cameras see in common, each term with its sigma.
+        lenses: those that the error model estimates; here they are where the rig has them.
     """
 
     rig: Rig
@@ -57,6 +59,7 @@ class Objective:
     gated: Mapping[str, tuple[CameraBlock, Array, ResidualScale]] = field(default_factory=dict)
     relative_tolerance: float = RELATIVE_TOLERANCE
     pairs: tuple[PairTerm, ...] = ()
+    lenses: Mapping[str, LensVariable] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -9,17 +9,18 @@ residuals and measures the distortion: informative for a panoramic camera, weak 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import place_of
+from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
-from factors import ProjectionBlock
+from factors import FreeLensBlock, ProjectionBlock
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -59,12 +60,14 @@ class DistortionEvidence:
             mean over several sets of matches.
         information: (P, 3, 3) of the residuals at each place, if all matches were independent.
         vector: (P, 3) the information times the distortions that the residuals show.
+        lens_jacobian: (k, 3) displacement of a free lens, likewise; of a fixed one, (0, 3).
     """
 
     jacobian: Array
     hessian: Array
     information: Array
     vector: Array
+    lens_jacobian: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def distortion_evidence(
@@ -74,6 +77,7 @@ def distortion_evidence(
     weak: Array,
     *,
     places: Sequence[Numbers],
+    lens: LensVariable | None = None,
 ) -> DistortionEvidence:
     """The quadratics of a camera's matches, in the tangent of ``T_lidar_camera``.
 
@@ -85,27 +89,31 @@ def distortion_evidence(
         block: inliers of one camera.
         scale: of their residuals.
         T_lidar_camera: their minimum.
-        weak: (6, 6) information that is added to J^T J, so that few matches have an inverse.
+        weak: (6 + k, 6 + k) information that is added to J^T J, so that few matches have an
+            inverse.
         places: the numbers of the frames of each place.
+        lens: of the camera, if it is free; it follows as the pose does.
     """
     some = block.select_evenly(_SAMPLE)
     share = len(some) / len(block)
     place = place_of(some.frame, places)
     order = np.argsort(place, kind="stable")
-    by_pose, by_distortion, residuals = _jacobians(some.block.select(order), scale, T_lidar_camera)
+    rows = some.block.select(order)
+    by_pose, by_distortion, residuals = _jacobians(rows, scale, T_lidar_camera)
+    if lens is not None:
+        by_pose = np.hstack([by_pose, _by_lens(rows, scale, T_lidar_camera, lens)])
     weak = share * weak
     size = by_distortion.shape[1]
     information, vector = np.zeros((len(places), size, size)), np.zeros((len(places), size))
     edges = 2 * np.searchsorted(place[order], np.arange(len(places) + 1))
     for number in np.flatnonzero(np.diff(edges)):
-        rows = slice(edges[number], edges[number + 1])
-        left = by_distortion[rows] + by_pose[rows] @ _follow(
-            by_pose[rows], by_distortion[rows], weak
-        )
+        own = slice(edges[number], edges[number + 1])
+        left = by_distortion[own] + by_pose[own] @ _follow(by_pose[own], by_distortion[own], weak)
         information[number] = left.T @ left / share
-        vector[number] = left.T @ residuals[rows] / share
-    hessian = (by_pose.T @ by_pose + weak) / share
-    return DistortionEvidence(_follow(by_pose, by_distortion, weak), hessian, information, vector)
+        vector[number] = left.T @ residuals[own] / share
+    hessian = (by_pose.T @ by_pose + weak)[:6, :6] / share
+    follow = _follow(by_pose, by_distortion, weak)
+    return DistortionEvidence(follow[:6], hessian, information, vector, follow[6:])
 
 
 def pair_jacobians(
@@ -139,8 +147,17 @@ def pair_jacobians(
 
 
 def _follow(by_pose: Array, by_distortion: Array, weak: Array) -> Array:
-    """(6, 3) displacement of the pose by a unit of each distortion."""
+    """(6 + k, 3) displacement of pose and lens by a unit of each distortion."""
     return -np.asarray(np.linalg.solve(by_pose.T @ by_pose + weak, by_pose.T @ by_distortion))
+
+
+def _by_lens(
+    block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, lens: LensVariable
+) -> Array:
+    """(2 n, k) Jacobian of the whitened residuals by the lens."""
+    free = FreeLensBlock(block.rescale(scale=scale.loss_scale, sigma=scale.sigma), lens.free)
+    columns = free.columns(to_T_camera_lidar(T_lidar_camera), lens.values)[6:-1]
+    return np.asarray(columns.transpose(2, 1, 0).reshape(-1, len(columns)))
 
 
 def _jacobians(

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
@@ -84,8 +86,15 @@ class Solution:
 
     @cached_property
     def solved_rig(self) -> Rig:
-        """The rig with the estimated extrinsics."""
-        return self.rig.moved_to(self.T_camera_lidar)
+        """The rig with the estimated extrinsics, and lenses if these are estimated."""
+        fit = None if self.errors is None else self.errors.fit
+        lenses, _ = moved_lenses(self.inliers.lenses, fit)
+        return put_into(self.rig.moved_to(self.T_camera_lidar), lenses)
+
+    @property
+    def lens(self) -> dict[str, tuple[LensEstimate, ...]]:
+        """Per camera whose lens is estimated, its parameters."""
+        return {} if self.errors is None else lens_estimates(self.errors.fit)
 
     @cached_property
     def marginals(self) -> Marginals:

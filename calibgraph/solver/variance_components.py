@@ -117,13 +117,12 @@ def squared_displacements(fit: LatentPoseFit) -> dict[Component, Evidence]:
     present = np.zeros(squared.shape, dtype=np.bool_)
     for place, number in model.matched_places():
         present[place, 1 + number] = True
-    shared = replace(model, pose_graph=gtsam.NonlinearFactorGraph()).shared_graph
     variables, distortions, known = 1 + len(model.matched) + len(model.paired), 0, 0.0
     if model.is_distorted:  # its residuals count as a part of its prior
         distortions, known = parts.distortion_jacobian.shape[2], least_cost_of_distortion(parts)
     return {
         "shared": Evidence(
-            2.0 * shared.error(linear.values) - known, 6.0 * variables + distortions
+            2.0 * model.error_graph.error(linear.values) - known, 6.0 * variables + distortions
         ),
         "cloud": Evidence(squared[:, 0].sum(), 6.0 * weight[:, 0].sum()),
         "cameras": Evidence(squared[:, 1:].sum(), 6.0 * weight[present].sum()),

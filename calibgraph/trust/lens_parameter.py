@@ -19,6 +19,14 @@ NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew"
 SHAPES = NAMES[3:]
 """Those that no lens has wrong by much."""
 
+ESTIMATED_AS = {
+    "focal length": "focal",
+    "distortion": "distortion",
+    "principal point": "centre",
+    "aspect ratio": "aspect",
+}
+"""Parts of the lens that ``--estimate`` names; it has no skew."""
+
 RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
@@ -154,6 +162,8 @@ def check_parameter(found: LensParameter, by: str, better: str) -> Check:
     )
     if status != "PASS":
         text += f"; {row.advice}"
+        if found.name in ESTIMATED_AS:
+            text += f"; or run with --estimate {ESTIMATED_AS[found.name]}"
     name = f"{found.name} by the {by}: {row.name}"
     check = row.describe(probability, status, text, name=name)
     return replace(check, kind=KINDS[by][found.name])

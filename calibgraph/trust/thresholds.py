@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.lens import MATCH_SHARE
 
 _COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
@@ -224,8 +225,8 @@ LIMITS: tuple[Limit, ...] = (
           "looked at: relative, or in focal lengths."),
     Limit("lens_wrong", 0.04, "", "The error of one that is wrong."),
     Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
-    Limit("lens_match_share", 0.01, "share", "So much of a match's variance is taken to be shared "
-          "by all: less cannot be told from a wrong lens."),
+    Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
+          "shared by all: less cannot be told from a wrong lens."),
     Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
           "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
           "the sample: wrong lenses left 3.2 and more."),

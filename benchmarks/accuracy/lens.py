@@ -1,0 +1,197 @@
+"""Lenses that are wrong, before and after they are estimated with the extrinsics.
+
+    python -m benchmarks.accuracy.lens [--draws 30] [--data FOLDER ...]
+
+Simulated tables of two cameras like KITTI's, 30 frames of 100 matches, with errors that the matches
+of a frame share. NEES is the squared error of a camera's pose in the metric of its covariance; its
+mean over 6 should be 1. ``z^2`` is the mean square of the lens' errors in their sigmas. With
+``--data``, recordings in folders whose rig is the reference: their lenses are spoilt, they are
+calibrated from starts 1 degree and 10 cm off with and without the estimate, and the errors are
+against the reference.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.tables import Table, add_record_option, publish
+from calibgraph import (
+    Calibration,
+    Config,
+    Correspondences,
+    MatcherErrors,
+    Rig,
+    calibrate,
+    evaluate,
+    load_dataset,
+    perturb,
+    simulate_correspondences,
+)
+from calibgraph.graph.lens import LensVariable
+from calibgraph.model.geometry import twist_between
+from calibgraph.simulation.lens_errors import put_lens_error
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.solution import Solution
+
+Array = NDArray[np.float64]
+
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+CASES = (
+    ("focal", 0.0), ("focal", 0.003), ("focal", 0.017), ("focal", 0.05),
+    ("centre", 3.0), ("centre", 10.0), ("centre", 30.0),
+    ("distortion", 0.01), ("distortion", 0.03), ("distortion", 0.1),
+    ("lens", 0.0),
+)  # fmt: skip
+"""Part that is estimated; its error: of the focal length (share), of cx [px], of k1."""
+
+SPOILT = (("focal", 0.017), ("centre", 10.0), ("distortion", 0.03), ("focal", 0.0))
+COLUMNS = (
+    "part", "error", "before [deg]", "[cm]", "after [deg]", "[cm]", "NEES / 6", "lens off",
+    "sigma", "z^2",
+)  # fmt: skip
+RECORDED = (
+    "recording", "part", "error", "estimated", "verdict", "error [deg]", "[cm]", "lens off", "sigma"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One solve with a wrong lens.
+
+    Attributes:
+        before: per camera (6,) error of the pose with the wrong lens.
+        after: the same with the estimated lens.
+        nees: per camera, of ``after``.
+        off: per camera and parameter that was spoilt, error of the estimate.
+        sigmas: of these.
+    """
+
+    before: list[Array]
+    after: list[Array]
+    nees: list[float]
+    off: list[float]
+    sigmas: list[float]
+
+
+@cache
+def simulated(seed: int, frames: int = 30, matches: int = 100) -> tuple[Rig, Correspondences]:
+    """The true rig, and its matches."""
+    rig = rig_of("kitti")
+    return rig, simulate_correspondences(
+        rig, frames=frames, matches=matches, errors=ERRORS, seed=seed
+    )
+
+
+def draw(part: str, error: float, seed: int) -> Drawn:
+    """Solve a table with a wrong lens; of ``lens``, all of it is drawn from its prior."""
+    truth, table = simulated(seed)
+    config = Config(estimate=part)
+    wrong = put_lens_error(truth, part, error)
+    if part == "lens":
+        rng = np.random.default_rng(seed)
+        free = {n: LensVariable.of(c, config.estimate) for n, c in truth.cameras.items()}
+        cameras = {
+            name: lens.put_into(lens.camera, rng.standard_normal(len(lens.free)))
+            for name, lens in free.items()
+        }
+        wrong = truth.model_copy(update={"cameras": cameras})
+    before, after = (solve_joint(wrong, table, one) for one in (Config(), config))
+    errors = _errors(after, truth)
+    off, sigmas = zip(*_lens_errors(after, truth, part), strict=True)
+    return Drawn(_errors(before, truth), errors, _nees(after, errors), [*off], [*sigmas])
+
+
+def _errors(found: Solution, truth: Rig) -> list[Array]:
+    reference = truth.T_camera_lidar
+    return [twist_between(T, reference[name]) for name, T in found.T_camera_lidar.items()]
+
+
+def _nees(found: Solution, errors: list[Array]) -> list[float]:
+    assert found.covariance is not None
+    blocks = (found.covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(len(errors)))
+    return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
+
+
+def _lens_errors(
+    found: Solution | Calibration, truth: Rig, part: str
+) -> Iterator[tuple[float, float]]:
+    """Error and sigma of the parameter that was spoilt, of all with ``lens``."""
+    for name, parameters in found.lens.items():
+        camera = truth.cameras[name]
+        k, distortion = camera.intrinsics_px, [*camera.distortion, *[0.0] * 4]
+        right = {"focal": float(np.sqrt(k.fx * k.fy)), "centre_x": k.cx, "centre_y": k.cy}
+        right |= dict(zip(("k1", "k2", "p1", "p2"), distortion, strict=False))
+        for one in parameters[: None if part == "lens" else 1]:
+            yield one.value - right[one.name], one.sigma
+
+
+def main() -> None:
+    """Draw, solve, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=30)
+    parser.add_argument("--data", nargs="*", type=Path, default=[], help="recordings")
+    add_record_option(parser)
+    options = parser.parse_args()
+    tables = []
+    if options.draws:
+        rows = tuple(row_of(part, error, options.draws) for part, error in CASES)
+        tables.append(Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows))
+    if options.data:
+        recorded = tuple(row for folder in options.data for row in rows_of(folder))
+        tables.append(Table("Recordings, the worst camera", RECORDED, recorded))
+    publish("accuracy.lens", tables, record=options.record)
+
+
+def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
+    """One case over all draws."""
+    found = [draw(part, error, seed) for seed in range(draws)]
+    cells = [cell for when in ("before", "after") for cell in _sizes(found, when)]
+    nees = np.mean([value for one in found for value in one.nees]) / 6
+    off, sigmas = (
+        np.concatenate([getattr(one, key) for one in found]) for key in ("off", "sigmas")
+    )
+    lens = (np.median(np.abs(off)), np.median(sigmas), np.mean((off / sigmas) ** 2))
+    return (part, f"{error:g}", *cells, f"{nees:.2f}", *(f"{value:.2g}" for value in lens))
+
+
+def _sizes(found: list[Drawn], when: str) -> tuple[str, str]:
+    errors = np.array([error for one in found for error in getattr(one, when)])
+    turned, moved = (
+        np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors, 2, axis=1)
+    )
+    return f"{np.degrees(turned):.3f}", f"{100 * moved:.2f}"
+
+
+def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:
+    """A recording with every spoilt lens, fixed and estimated."""
+    data = load_dataset(folder)
+    for part, error in SPOILT:
+        wrong = put_lens_error(data.rig, part, error)
+        guess = perturb(wrong, rotation_deg=1.0, translation_m=0.1, seed=1)
+        for estimate in ((), (part,)):
+            result = calibrate(data, guess, config=Config(estimate=estimate))
+            errors = evaluate(result, data.rig).cameras.values()
+            worst = max(
+                _lens_errors(result, data.rig, part), key=lambda pair: abs(pair[0]), default=None
+            )
+            yield (
+                folder.name, part, f"{error:g}", "yes" if estimate else "no",
+                result.verdict.status,
+                f"{max(one.rotation_error_deg for one in errors):.3f}",
+                f"{max(one.translation_error_cm for one in errors):.1f}",
+                *(("-", "-") if worst is None else (f"{value:.3g}" for value in worst)),
+            )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

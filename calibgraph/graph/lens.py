@@ -1,0 +1,218 @@
+"""The lens of a camera as a variable of the graph, shared by all its places.
+
+    prior    l_c at the lens of the rig, each parameter with a Cauchy loss
+    matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
+             their errors; these displace m_c, the pose as they show it, too
+    data     correspondences of camera c at place p, on o_p, a_cp and s_c
+
+A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
+sure of a wrong lens leave it, and data that are not stay with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
+from calibgraph.model.config import LensPart
+from calibgraph.model.rig import Camera, Rig
+from factors import (
+    BlockSums,
+    FreeLens,
+    FreeLensBlock,
+    free_lens_factor,
+    linear_factor,
+    robust_noise,
+)
+from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL
+from factors.lens_kernels import PINHOLE, RADTAN
+
+Array = NDArray[np.float64]
+
+FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.02, 0.002, 5.0
+"""Of the prior, where the rig states none: what good calibrations with a target leave."""
+
+RADIAL_SIGMA, TANGENTIAL_SHARE = 0.05, 0.1
+"""The same of a radial coefficient; and a tangential one's in parts of it."""
+
+_TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
+_PLAIN = 2  # radial coefficients that are set free in a rig without distortion
+_EXACT = 1e-3  # prior standard deviations: less would lose digits
+
+
+@dataclass(frozen=True, eq=False)
+class LensVariable:
+    """One camera's lens.
+
+    Attributes:
+        camera: with the lens at the prior's mean.
+        free: its free parameters.
+        values: (k,) at which the correspondences have been weighed and gated.
+    """
+
+    camera: Camera
+    free: FreeLens
+    values: Array
+
+    @staticmethod
+    def of(camera: Camera, parts: Iterable[LensPart]) -> LensVariable:
+        """The lens of a camera, at its prior.
+
+        Args:
+            camera: of the rig, with the sigmas that it states.
+            parts: which are free.
+
+        Raises:
+            ValueError: if its model has no such part.
+        """
+        sigmas = _prior_sigmas(camera)
+        chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
+        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()))
+        return LensVariable(camera, free, np.zeros(len(chosen)))
+
+    def moved_to(self, values: Array) -> LensVariable:
+        """The same variable, where correspondences are weighed and gated at other values."""
+        return replace(self, values=values)
+
+    def put_into(self, camera: Camera, values: Array) -> Camera:
+        """A camera with the lens of (k,) values."""
+        packed = self.free.at(values).packed
+        intrinsics = dict(zip(("fx", "fy", "cx", "cy"), packed[:4].tolist(), strict=True))
+        numbers = COEFFICIENT_NUMBERS[self.free.lens.kind]
+        free = any(name in numbers for name in self.free.parameters)
+        size = max(len(self.camera.distortion), 4 if free else 0)
+        return camera.model_copy(
+            update={
+                "intrinsics_px": camera.intrinsics_px.model_copy(update=intrinsics),
+                "distortion": tuple(packed[4 : 4 + size].tolist()),
+            }
+        )
+
+
+def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
+    """Per part of a lens, the prior standard deviation of each parameter."""
+    stated, kind = camera.intrinsics_sigma_px, camera.lens.kind
+    focal = FOCAL_SIGMA
+    if stated is not None and stated.focal is not None:
+        focal = stated.focal / camera.intrinsics_px.fx
+    centre = CENTRE_SIGMA_PX if stated is None or stated.centre is None else stated.centre
+    radial = camera.distortion_sigma or RADIAL_SIGMA
+    size = len(camera.distortion) or _PLAIN
+    return {
+        "focal": {FOCAL: focal},
+        "aspect": {ASPECT: ASPECT_SIGMA},
+        "centre": {CENTRE_X: centre, CENTRE_Y: centre},
+        "distortion": {
+            name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial
+            for name, number in COEFFICIENT_NUMBERS[kind].items()
+            if kind not in (PINHOLE, RADTAN) or number < size
+        },
+    }
+
+
+def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariable]:
+    """Per camera but panoramas, whose format determines the lens, its variable.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    lenses = {name: c for name, c in rig.cameras.items() if c.model != "equirectangular"}
+    if not lenses:
+        raise ValueError("equirectangular cameras have no lens to estimate")
+    return {name: LensVariable.of(camera, parts) for name, camera in lenses.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class LensTerm:
+    """A lens in the error model.
+
+    Attributes:
+        variable: the lens.
+        excess: (k, k) covariance of s_c about l_c, in the units of the values.
+        by_distortion: (k, B) displacement of s_c by a unit of each scan distortion.
+        compensating: (6, k) displacement of m_c by a unit of the difference of s_c and l_c that is
+            no scan distortion: of the pose that fits best where the lens is wrong by as much.
+    """
+
+    variable: LensVariable
+    excess: Array
+    by_distortion: Array
+    compensating: Array
+
+    def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
+        """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
+        B = self.compensating
+        lens = {lens_key(number): -B, seen_lens_key(number): B}
+        return lens | ({DISTORTION: -B @ self.by_distortion} if is_distorted else {})
+
+
+def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.NonlinearFactorGraph:
+    """Priors of the lenses, and from each to where its matches show it."""
+    graph = gtsam.NonlinearFactorGraph()
+    tail = robust_noise(gtsam.noiseModel.Unit.Create(1), loss="cauchy", scale=_TAIL_SIGMAS)
+    for number, term in lenses.items():
+        unit = np.eye(len(term.variable.free))
+        for row in unit:
+            graph.add(linear_factor([lens_key(number)], [row[None]], tail))
+        keys, matrices = [lens_key(number), seen_lens_key(number)], [-unit, unit]
+        if is_distorted:
+            keys, matrices = [*keys, DISTORTION], [*matrices, -term.by_distortion]
+        noise = gtsam.noiseModel.Gaussian.Covariance(term.excess + _EXACT**2 * unit)
+        graph.add(linear_factor(keys, matrices, noise))
+    return graph
+
+
+def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
+    """Both variables of each lens, where correspondences have been weighed and gated."""
+    values = gtsam.Values()
+    for number, term in lenses.items():
+        values.insert(lens_key(number), term.variable.values)
+        values.insert(seen_lens_key(number), term.variable.values)
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class FreeLensByPlace:
+    """One camera's correspondences, sorted by place, with a free lens.
+
+    Attributes:
+        placed: the correspondences.
+        lens: of the camera.
+        key: of its variable.
+    """
+
+    placed: BlockByPlace
+    lens: FreeLens
+    key: int
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """(p,) the places that have correspondences, in rising order."""
+        return self.placed.places
+
+    def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
+        """H, b and c of every place with correspondences, by pose and lens.
+
+        Args:
+            T_camera_cloud: (p, 4, 4) of these places.
+            values: (k,) of the lens.
+        """
+        pairs = zip(self.places, T_camera_cloud, strict=True)
+        return [self._at(int(place)).sums(T, values) for place, T in pairs]
+
+    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
+        """The correspondences of one place, lossless, on the variables of these keys."""
+        block = self._at(place)
+        if not len(block.block):
+            return []
+        return [free_lens_factor([cloud, matched, self.key], block)]
+
+    def _at(self, place: int) -> FreeLensBlock:
+        rows = np.arange(self.placed.edges[place], self.placed.edges[place + 1])
+        return FreeLensBlock(self.placed.block.select(rows), self.lens)

@@ -1,0 +1,59 @@
+"""Parameters of a lens that were estimated together with the extrinsics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+_PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have said nothing
+_LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
+
+
+@dataclass(frozen=True)
+class LensEstimate:
+    """One parameter of a camera's lens.
+
+    Attributes:
+        name: ``focal`` (the root of fx fy), ``aspect`` (fx / fy), ``centre_x``, ``centre_y`` or a
+            distortion coefficient.
+        unit: ``px`` or empty.
+        value: the estimate.
+        sigma: its standard deviation: the marginal of the graph.
+        prior: what the rig states.
+        prior_sigma: its standard deviation.
+        direction: of the camera's pose that has the largest correlation with it.
+        correlation: its size, 0 to 1.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    prior: float
+    prior_sigma: float
+    direction: str
+    correlation: float
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the data have narrowed or left the prior."""
+        left = abs(self.value - self.prior) > _LEFT_SIGMAS * self.sigma
+        return left or self.sigma < _PRIOR_SHARE * self.prior_sigma
+
+    def describe(self) -> str:
+        """Whether the data determine it, and what it cannot be told from."""
+        pair = f"with {self.direction} {self.correlation:.2f}"
+        return pair if self.is_determined else f"not determined by these data; {pair}"
+
+
+def change_of_lens(
+    before: Mapping[str, tuple[LensEstimate, ...]], after: Mapping[str, tuple[LensEstimate, ...]]
+) -> float:
+    """Largest change of a parameter in its standard deviations; infinite where none was known."""
+    changes = [
+        abs(new.value - old.value) / new.sigma if name in before else math.inf
+        for name, parameters in after.items()
+        for new, old in zip(parameters, before.get(name, parameters), strict=True)
+    ]
+    return max(changes, default=0.0)

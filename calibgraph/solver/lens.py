@@ -1,0 +1,214 @@
+"""Lenses that are estimated together with the extrinsics: their part of the error model.
+
+What matches of one frame share, or of all frames, also looks like another lens. It belongs between
+the lens l_c and s_c, as the matches show it: with C the covariance of pose and lens by independent
+matches, S that by the scatter of frames, and k the variance that matches are left with in the graph
+(``solver.within_place``), its covariance is S - k C, and what places and all matches share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.lens import FreeLensByPlace, LensTerm, LensVariable
+from calibgraph.graph.variables import lens_key
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.rig import Rig
+from calibgraph.solver.elimination import LatentPoseFit, marginal_information
+from calibgraph.solver.within_place import WEAK, WithinPlace
+from factors import FreeLensBlock
+from factors.free_lens import ASPECT, FOCAL
+
+Array = NDArray[np.float64]
+Lenses = Mapping[str, LensVariable]
+
+MATCH_SHARE = 0.01
+"""So much of a match's variance is taken to be shared by all: less cannot be told from a wrong
+lens."""
+
+_DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
+_WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
+_MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
+
+
+def put_into(rig: Rig, lenses: Lenses) -> Rig:
+    """The rig with lenses at the values of their variables."""
+    if not lenses:
+        return rig
+    moved = {name: of.put_into(rig.cameras[name], of.values) for name, of in lenses.items()}
+    return rig.model_copy(update={"cameras": {**rig.cameras, **moved}})
+
+
+def lens_term(
+    lens: LensVariable,
+    placed: BlockByPlace,
+    within: WithinPlace,
+    T_camera_lidar: Array,
+    *,
+    findings: MatcherFindings,
+) -> LensTerm:
+    """The lens of a camera in the error model, without scan distortion.
+
+    Args:
+        lens: of the camera.
+        placed: its matches.
+        within: what its matches of one place share.
+        T_camera_lidar: (4, 4) the minimum for independent matches.
+        findings: the matcher's error.
+    """
+    by_place = FreeLensByPlace(placed, lens.free, 0)
+    T, values = _minimum(by_place, T_camera_lidar, lens)
+    hessians = np.array([one.hessian for one in by_place.sums(T, values)])
+    hessian = hessians.sum(axis=0) + weak_information(lens)
+    covariance = np.linalg.inv(hessian)
+    scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, (T, values), hessian)
+    matches = len(placed.block)
+    of_matches = MATCH_SHARE * matches if any(findings.systematic_sigmas) else 0.0
+    shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
+    whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
+    of_poses = within.at_place(findings.place_variance)[placed.places]
+    excess = _positive((whole - _in_graph(hessians, of_poses, within.least, lens))[6:, 6:])
+    compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
+    return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
+
+
+def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:
+    """(6 + k, 6 + k) covariance of m_c and s_c by the matches and the poses of places.
+
+    Args:
+        hessians: (p, 6 + k, 6 + k) of independent matches at each place.
+        of_poses: (p, 6, 6) covariance of a_cp about m_c.
+        least: variance of the matches.
+        lens: of the camera.
+    """
+    own = np.linalg.inv(hessians / least + weak_information(lens))
+    own[:, :6, :6] += of_poses
+    return np.asarray(np.linalg.inv(np.linalg.inv(own).sum(axis=0)))
+
+
+def weak_information(lens: LensVariable | None) -> Array:
+    """(6 + k, 6 + k) of a pose within sight and a lens, so that few matches have an inverse."""
+    return WEAK if lens is None else block_diag(WEAK, _WEAK_PRIOR * np.eye(len(lens.free)))
+
+
+def _minimum(
+    by_place: FreeLensByPlace, T_camera_lidar: Array, lens: LensVariable
+) -> tuple[Array, Array]:
+    """(p, 4, 4) pose, the same at each place, and (k,) values where all matches fit best."""
+    pose, values, weak = to_T_lidar_camera(T_camera_lidar), lens.values, weak_information(lens)
+    each = len(by_place.places), 1, 1
+    for _ in range(_MOST_STEPS):
+        sums = by_place.sums(np.tile(to_T_camera_lidar(pose), each), values)
+        pull = sum(one.gradient for one in sums) + weak @ np.concatenate([np.zeros(6), values])
+        step = -np.linalg.solve(sum(one.hessian for one in sums) + weak, pull)
+        pose, values = pose.retract(step[:6]), values + step[6:]
+        if -step @ pull < _MINIMAL:
+            break
+    return np.tile(to_T_camera_lidar(pose), each), values
+
+
+def _frame_scatter(
+    free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array], hessian: Array
+) -> Array:
+    """(6 + k, 6 + k) sum of the outer products of the gradients of frames; few have usual ones."""
+    counts = placed.count_of_frame[np.argsort(placed.place_of_frame, kind="stable")]
+    columns = free.columns(at[0][0], at[1])
+    pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
+    gradients = np.add.reduceat(pulls, np.cumsum(counts) - counts, axis=1).T
+    known, frames = error_components(), len(counts)
+    prior = known.prior_frames / known.pseudo_frames
+    usual = 1 + known.frame_correlation * (counts.mean() - 1)
+    own = gradients.T @ gradients + prior * usual * hessian / frames
+    return np.asarray(own * frames / (prior + frames - 1))
+
+
+def _positive(matrix: Array) -> Array:
+    """The positive part of a symmetric matrix."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
+    """Lenses where a fit has them, and the largest change of a value in standard deviations."""
+    found = {} if fit is None else lens_values(fit)
+    moved = {name: lenses[name].moved_to(values) for name, (values, _) in found.items()}
+    changes = [abs(v - lenses[n].values) / s for n, (v, s) in found.items()]
+    return {**lenses, **moved}, float(np.concatenate([*changes, [0.0]]).max())
+
+
+def lens_values(fit: LatentPoseFit) -> dict[str, tuple[Array, Array]]:
+    """Per camera whose lens is free, its (k,) values and their (k,) standard deviations."""
+    covariance = _marginal(fit, [*map(lens_key, fit.linear.model.lenses)])
+    found, first = {}, 0
+    for number, term in fit.linear.model.lenses.items():
+        rows = slice(first, first := first + len(term.variable.free))
+        sigmas = np.sqrt(np.diag(covariance)[rows])
+        values = fit.linear.values.atVector(lens_key(number))
+        found[fit.linear.model.cameras[number]] = values, sigmas
+    return found
+
+
+def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
+    """Per camera whose lens is free, its parameters with their marginal."""
+    model, found = fit.linear.model, {}
+    for number, term in model.lenses.items():
+        own = [lens_key(number), model.reported_keys[number]]
+        covariance = _marginal(fit, own)
+        sigmas = np.sqrt(np.diag(covariance))
+        values = fit.linear.values.atVector(own[0])
+        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
+        found[model.cameras[number]] = tuple(
+            _estimate(term.variable, row, values, (sigmas, with_pose)) for row in range(len(values))
+        )
+    return found
+
+
+def _estimate(
+    lens: LensVariable, row: int, values: Array, marginal: tuple[Array, Array]
+) -> LensEstimate:
+    """One parameter, with standard deviation and correlation with the pose of its camera."""
+    name, step = lens.free.parameters[row], lens.free.sigmas[row]
+    before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
+    unit = step * (before if name in (FOCAL, ASPECT) else 1.0)
+    sigmas, correlation = marginal
+    most = int(np.argmax(correlation[row]))
+    return LensEstimate(
+        name=name,
+        unit="px" if name == FOCAL or name.startswith("centre") else "",
+        value=after,
+        sigma=float(sigmas[row] * unit),
+        prior=before,
+        prior_sigma=float(unit),
+        direction=_DIRECTIONS[most],
+        correlation=float(correlation[row, most]),
+    )
+
+
+def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
+    """A parameter at some values, as people state it."""
+    camera = lens.put_into(lens.camera, values)
+    k = camera.intrinsics_px
+    known = {
+        FOCAL: float(np.sqrt(k.fx * k.fy)),
+        ASPECT: k.fx / k.fy,
+        "centre_x": k.cx,
+        "centre_y": k.cy,
+    }
+    return known[name] if name in known else lens.free.coefficient(name, values)
+
+
+def _marginal(fit: LatentPoseFit, kept: list[int]) -> Array:
+    """The covariance of some variables."""
+    if not kept:
+        return np.zeros((0, 0))
+    model = fit.linear.model
+    keys = model.place_keys + model.shared_keys
+    return np.asarray(np.linalg.inv(marginal_information(fit.linear.graph, keys, kept)))

@@ -1,0 +1,242 @@
+"""A lens with free parameters, and the block factor on a pose and that lens.
+
+With k free parameters l, the lossless block factor of ``factors.block`` has 6 + k columns: a
+derivative of the pixels by each parameter stands beside those by the pose. Every model here maps to
+u = fx a + cx, v = fy b + cy, and (a, b) is linear in the coefficients that may be free, so that all
+derivatives are products of known numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.block import ProjectionBlock
+from factors.block_sums import BlockSums, square_root
+from factors.compiled import compiled
+from factors.lens import Lens
+from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE, RADTAN
+from factors.loss import loss_and_weight, loss_id
+
+Array = NDArray[np.float64]
+
+COEFFICIENT_NUMBERS: Mapping[int, Mapping[str, int]] = {
+    **dict.fromkeys((PINHOLE, RADTAN), {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4}),
+    FISHEYE: {"k1": 0, "k2": 1, "k3": 2, "k4": 3},
+    OMNIDIRECTIONAL: {"k1": 1, "k2": 2, "p1": 3, "p2": 4},
+    EQUIRECTANGULAR: {},
+}
+"""By the kind of lens, the distortion coefficients that may be free, and their places."""
+
+FOCAL, ASPECT, CENTRE_X, CENTRE_Y = "focal", "aspect", "centre_x", "centre_y"
+
+_MAKERS: Mapping[int, tuple[Callable[..., Lens], int]] = {
+    **dict.fromkeys((PINHOLE, RADTAN), (Lens.pinhole, 8)),
+    FISHEYE: (Lens.fisheye, 4),
+    OMNIDIRECTIONAL: (Lens.omnidirectional, 5),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FreeLens:
+    """A lens and its free parameters, each in standard deviations of its prior.
+
+    Attributes:
+        lens: at the mean of the prior, where all values are zero.
+        parameters: (k,) names: ``focal`` [of the logarithm of both focal lengths], ``aspect`` [of
+            the logarithm of fx / fy], ``centre_x`` and ``centre_y`` [px], and distortion
+            coefficients as in ``COEFFICIENT_NUMBERS``.
+        sigmas: (k,) their standard deviations.
+
+    Raises:
+        ValueError: if the kind of lens has no such parameter.
+    """
+
+    lens: Lens
+    parameters: tuple[str, ...]
+    sigmas: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        known = [FOCAL, ASPECT, CENTRE_X, CENTRE_Y, *COEFFICIENT_NUMBERS[self.lens.kind]]
+        unknown = [name for name in self.parameters if name not in known]
+        if unknown or self.lens.kind == EQUIRECTANGULAR:
+            raise ValueError(f"this lens has no free {', '.join(unknown or self.parameters)}")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def at(self, values: Array) -> Lens:
+        """The lens of (k,) values."""
+        steps = dict(zip(self.parameters, np.multiply(values, self.sigmas).tolist(), strict=True))
+        packed, half = self.lens.packed.copy(), 0.5 * steps.get(ASPECT, 0.0)
+        packed[:2] *= np.exp(steps.get(FOCAL, 0.0) + np.array([half, -half]))
+        packed[2:4] += steps.get(CENTRE_X, 0.0), steps.get(CENTRE_Y, 0.0)
+        for name, number in COEFFICIENT_NUMBERS[self.lens.kind].items():
+            packed[4 + number] += steps.get(name, 0.0)
+        make, size = _MAKERS[self.lens.kind]
+        named = dict(zip(("fx", "fy", "cx", "cy"), packed.tolist(), strict=False))
+        return make(**named, distortion=packed[4 : 4 + size].tolist())
+
+    def coefficient(self, name: str, values: Array) -> float:
+        """A distortion coefficient of the lens of (k,) values."""
+        return float(self.at(values).packed[4 + COEFFICIENT_NUMBERS[self.lens.kind][name]])
+
+    def fill_columns(self, lens: Lens, points_camera_m: Array, columns: Array) -> None:
+        """Derivatives of the pixels of some points by the values.
+
+        Args:
+            lens: at the values.
+            points_camera_m: (n, 3).
+            columns: (k, 2, n), filled; zero where a point is not projectable.
+        """
+        pixels, projectable = lens.project(points_camera_m)
+        off_centre = pixels.T - lens.packed[2:4, None]
+        fields = {
+            FOCAL: off_centre,
+            ASPECT: off_centre * [[0.5], [-0.5]],
+            CENTRE_X: np.array([[1.0], [0.0]]),
+            CENTRE_Y: np.array([[0.0], [1.0]]),
+        }
+        plane, squared = _on_plane(lens, points_camera_m.T)
+        for row, (name, sigma) in enumerate(zip(self.parameters, self.sigmas, strict=True)):
+            field = fields.get(name)
+            if field is None:
+                field = lens.packed[:2, None] * _by_coefficient(lens, name, plane, squared)
+            columns[row] = field * (sigma * projectable)
+
+
+def _on_plane(lens: Lens, points: Array) -> tuple[Array, Array]:
+    """(2, n) undistorted points; (n,) radius squared, of a fisheye the squared field angle."""
+    x, y, z = points
+    if lens.kind == FISHEYE:
+        radius = np.hypot(x, y)
+        theta = np.arctan2(radius, z)
+        return points[:2] * (theta / np.maximum(radius, np.finfo(float).tiny)), theta**2
+    depth = z + lens.packed[4] * np.sqrt(x**2 + y**2 + z**2) if lens.kind == OMNIDIRECTIONAL else z
+    with np.errstate(divide="ignore", invalid="ignore"):  # of points that are not projectable
+        plane = np.nan_to_num(points[:2] / depth, posinf=0.0, neginf=0.0)
+    return plane, (plane**2).sum(axis=0)
+
+
+def _by_coefficient(lens: Lens, name: str, plane: Array, squared: Array) -> Array:
+    """(2, n) derivative of the distorted points by a coefficient."""
+    a, b = plane
+    if name == "p1":
+        return np.stack([2 * a * b, squared + 2 * b**2])
+    if name == "p2":
+        return np.stack([squared + 2 * a**2, 2 * a * b])
+    over = np.ones_like(squared)
+    if lens.kind == RADTAN:
+        k4, k5, k6 = lens.packed[9:12]
+        over += squared * (k4 + squared * (k5 + squared * k6))
+    return np.asarray(plane * (squared ** int(name[1]) / over))
+
+
+@dataclass(frozen=True, eq=False)
+class FreeLensBlock:
+    """The correspondences of one camera whose lens has free parameters.
+
+    Attributes:
+        block: with its loss; its own lens takes no part.
+        lens: of the camera.
+    """
+
+    block: ProjectionBlock
+    lens: FreeLens
+
+    def columns(self, T_camera_lidar: Array, values: Array) -> Array:
+        """(6 + k + 1, 2, n) derivatives of the whitened residuals, and last the residuals.
+
+        In GTSAM's tangent of T_lidar_camera, and by the lens.
+
+        Args:
+            T_camera_lidar: (4, 4).
+            values: (k,) of the lens.
+        """
+        block, lens = self.block, self.lens.at(values)
+        columns = np.empty((7 + len(self.lens), 2, len(block)))
+        pixels = lens.fill_twist_columns(T_camera_lidar, block.points_lidar_m, columns[:6])
+        columns[:6] *= -1.0  # T_lidar_camera exp(xi) is exp(-xi) T_camera_lidar
+        points = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        self.lens.fill_columns(lens, points, columns[6:-1])
+        columns[-1] = lens.subtract(pixels.T, block.pixels_px).T
+        if block.sqrt_information is not None:
+            s00, s01, s11 = block.sqrt_information.T
+            columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
+            columns[:, 1] *= s11
+        return np.asarray(columns / block.sigma)
+
+    def loss(self, columns: Array) -> tuple[Array, Array]:
+        """(n,) robust loss of the residuals of some columns, and its weight."""
+        squares = np.square(columns[-1]).sum(axis=0)
+        losses: tuple[Array, Array] = _losses(loss_id(self.block.loss), self.block.scale, squares)
+        return losses
+
+    def sums(self, T_camera_lidar: Array, values: Array) -> BlockSums:
+        """H (6 + k, 6 + k), b and c of the whole block."""
+        columns = self.columns(T_camera_lidar, values)
+        loss, weight = self.loss(columns)
+        flat = columns.reshape(len(columns), -1)
+        products = (flat[:-1] * np.tile(weight, 2)) @ flat.T
+        return BlockSums(products[:, :-1], products[:, -1], np.asarray(loss.sum()))
+
+    def select(self, rows: NDArray[np.int64]) -> FreeLensBlock:
+        """The block with only some correspondences."""
+        return FreeLensBlock(self.block.select(rows), self.lens)
+
+
+@compiled()
+def _losses(loss, scale, squares):  # type: ignore[no-untyped-def]
+    """(n,) losses and (n,) weights of (n,) squared norms."""
+    found, weights = np.empty(len(squares)), np.empty(len(squares))
+    for i in range(len(squares)):
+        found[i], weights[i] = loss_and_weight(loss, scale, squares[i])
+    return found, weights
+
+
+def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomFactor:
+    """The block as one factor on ``T_lidar_camera`` and the lens, equal to its separate factors.
+
+    Args:
+        keys: of the pose and of the lens, a vector of k numbers; a pose ``T_lidar_cloud`` before
+            these displaces the points.
+        block: of the camera.
+    """
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        *clouds, pose = (values.atPose3(key) for key in keys[:-1])
+        seen = clouds[0].between(pose) if clouds else pose
+        T_camera_cloud = seen.inverse().matrix()
+        found, jacobian = square_root(block.sums(T_camera_cloud, values.atVector(keys[-1])))
+        if jacobians is not None:
+            parts = [jacobian[:, :6], jacobian[:, 6:]]
+            if clouds:
+                parts.insert(0, -jacobian[:, :6] @ seen.inverse().AdjointMap())
+            for number, part in enumerate(parts):
+                jacobians[number] = np.asfortranarray(part)
+        return found
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), list(keys), error)
+
+
+def linear_factor(
+    keys: Sequence[int], matrices: Sequence[Array], noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """A factor on vectors, whose error is the sum of matrices times them."""
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        if jacobians is not None:
+            for number, matrix in enumerate(matrices):
+                jacobians[number] = np.asfortranarray(matrix)
+        vectors = (values.atVector(key) for key in keys)
+        return np.asarray(sum(m @ v for m, v in zip(matrices, vectors, strict=True)))
+
+    return gtsam.CustomFactor(noise, list(keys), error)

@@ -1,0 +1,184 @@
+"""Lenses that are estimated with the extrinsics: found, not overrated, and exact in the graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calibgraph import Config, MatcherErrors, Rig, preset, simulate_correspondences, solve
+from calibgraph.graph.latent_poses import latent_pose_graph
+from calibgraph.graph.variables import aligned_key, lens_key
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import twist_between
+from calibgraph.model.rig import IntrinsicsSigma
+from calibgraph.simulation.lens_errors import put_lens_error
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.lens import lens_estimates
+from calibgraph.solver.solution import Solution
+from tests.solver.test_elimination import STATED
+
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+FIVE_SIGMAS = 5.0  # one of 3 million
+
+
+@pytest.fixture(scope="module")
+def drawn() -> tuple[Rig, Correspondences]:
+    """Two cameras like KITTI's, and matches of ten frames."""
+    return simulated(seed=0, frames=10, matches=150)
+
+
+def simulated(seed: int, frames: int, matches: int) -> tuple[Rig, Correspondences]:
+    rig = rig_of("kitti")
+    return rig, simulate_correspondences(
+        rig, frames=frames, matches=matches, errors=ERRORS, seed=seed
+    )
+
+
+def squared_errors(found: Solution, truth: Rig) -> list[float]:
+    """Per camera, the squared error of its pose in the metric of its covariance."""
+    assert found.covariance is not None
+    squared = []
+    for number, (name, T) in enumerate(found.T_camera_lidar.items()):
+        own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
+        twist = twist_between(T, truth.cameras[name].T_camera_lidar)
+        squared.append(float(twist @ np.linalg.solve(own, twist)))
+    return squared
+
+
+def known_to(rig: Rig, focal_px: float) -> Rig:
+    sigma = IntrinsicsSigma(focal=focal_px)
+    cameras = {
+        name: camera.model_copy(update={"intrinsics_sigma_px": sigma})
+        for name, camera in rig.cameras.items()
+    }
+    return rig.model_copy(update={"cameras": cameras})
+
+
+@pytest.mark.parametrize(
+    ("part", "error"), [("focal", 0.05), ("centre", 30.0), ("distortion", 0.1)]
+)
+def test_a_wrong_lens_is_found(drawn: tuple[Rig, Correspondences], part: str, error: float) -> None:
+    truth, table = drawn
+    wrong = put_lens_error(truth, part, error)
+    found = solve_joint(wrong, table, Config(estimate=(part,)))
+    right = {"focal": 718.856, "centre_x": 607.1928, "centre_y": 185.2157}
+    for of_camera in found.lens.values():
+        for one in of_camera:
+            assert abs(one.value - right.get(one.name, 0.0)) < FIVE_SIGMAS * one.sigma
+        assert of_camera[0].is_determined
+        assert abs(of_camera[0].value - of_camera[0].prior) > FIVE_SIGMAS * of_camera[0].sigma
+    assert max(squared_errors(found, truth)) < chi2.isf(1e-6, 6)
+
+
+def test_a_lens_that_is_known_exactly_changes_nothing(drawn: tuple[Rig, Correspondences]) -> None:
+    """Its excess displaces pose and lens together, so that nothing of it is left."""
+    truth, table = drawn
+    fixed = solve_joint(truth, table, Config())
+    free = solve_joint(known_to(truth, 1e-4), table, Config(estimate=("focal",)))
+    assert fixed.covariance is not None
+    assert free.covariance is not None
+    sigmas = np.sqrt(np.diag(fixed.covariance))
+    for number, name in enumerate(truth.cameras):
+        twist = twist_between(free.T_camera_lidar[name], fixed.T_camera_lidar[name])
+        # The matches' pull on a focal length 1e-4 px (1e-7) off displaces by 1e-6 m, of 5e-4 m.
+        assert np.abs(twist / sigmas[6 * number : 6 * number + 6]).max() < 0.02
+    np.testing.assert_allclose(np.sqrt(np.diag(free.covariance)), sigmas, rtol=0.02)
+
+
+def test_an_uncertain_lens_widens_the_error_bar(drawn: tuple[Rig, Correspondences]) -> None:
+    """Along the axis by 1 % of the distances, but for what the matches know of the lens."""
+    truth, table = drawn
+    known, unknown = (
+        solve_joint(known_to(truth, focal_px), table, Config(estimate=("focal",)))
+        for focal_px in (0.01, 7.0)
+    )
+    for number, name in enumerate(truth.cameras):
+        (one,) = unknown.lens[name]
+        assert (one.direction, one.is_determined) == ("z", True)
+        ahead = 6 * number + 5
+        assert unknown.covariance[ahead, ahead] > 1.1 * known.covariance[ahead, ahead]
+        assert known.lens[name][0].describe().startswith("not determined by these data")
+        assert unknown.errors is not None
+        assert known.marginals.error_sources(known.covariance)[name]
+
+
+def test_estimate_and_sigma_are_those_of_the_whole_graph(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    """By GTSAM's Levenberg-Marquardt and Marginals, with places and scan distortion."""
+    truth, table = drawn
+    stated = table.with_findings(replace(table.findings, **STATED))
+    wrong = put_lens_error(truth, "focal", 0.01)
+    found = solve_joint(wrong, stated, Config(estimate=("focal", "centre")))
+    assert found.errors is not None
+    fit, graph = found.errors.fit, latent_pose_graph(found.errors.model)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-14)
+    parameters.setAbsoluteErrorTol(0.0)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, fit.linear.values, parameters).optimize()
+    assert 2 * graph.error(fit.linear.values) == pytest.approx(fit.cost, rel=1e-9)
+    assert 2 * graph.error(values) == pytest.approx(fit.cost, rel=1e-5)  # its tolerance is 1e-6
+    marginals = gtsam.Marginals(graph, values)
+    for number, (name, estimates) in enumerate(lens_estimates(fit).items()):
+        own, lens = (
+            marginals.marginalCovariance(lens_key(number)),
+            values.atVector(lens_key(number)),
+        )
+        sigmas = np.sqrt(np.diag(own))
+        relative = [one.sigma / one.prior_sigma for one in estimates]
+        np.testing.assert_allclose(relative, sigmas, rtol=0.01)
+        assert np.abs((fit.linear.values.atVector(lens_key(number)) - lens) / sigmas).max() < 0.02
+        pose = marginals.marginalCovariance(aligned_key(number))
+        rows = slice(6 * number, 6 * number + 6)
+        np.testing.assert_allclose(
+            np.sqrt(np.diag(fit.covariance[rows, rows])), np.sqrt(np.diag(pose)), rtol=0.01
+        )
+        assert name in truth.cameras
+
+
+def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    wrong = put_lens_error(truth, "focal", 0.02)
+    plain, found = solve(wrong, table), solve(wrong, table, Config(estimate=("focal",)))
+    assert plain.lens == {}
+    assert plain.rig.with_lenses_of(wrong) is plain.rig
+    assert "intrinsics" in plain.not_included
+    assert "intrinsics" not in found.not_included
+    for name, camera in found.rig.cameras.items():
+        assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
+        assert found.initial_rig.cameras[name] == wrong.cameras[name]
+        assert "uncertain lenses" in found.error_sources[name].translation
+
+
+def test_refuses_what_has_no_lens_or_no_error_model(drawn: tuple[Rig, Correspondences]) -> None:
+    truth, table = drawn
+    with pytest.raises(ValueError, match="preset auto"):
+        solve(truth, table, preset("kitti").changed(estimate="focal"))
+    with pytest.raises(ValueError, match="equirectangular"):
+        solve(rig_of("panorama"), table, Config(estimate=("focal",)))
+    assert Config(estimate="lens").estimate == ("focal", "centre", "distortion")
+    with pytest.raises(ValueError, match="estimate"):
+        Config(estimate="focus")
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(
+    ("part", "error"),
+    [("focal", 0.003), ("focal", 0.05), ("centre", 10.0), ("distortion", 0.1), ("lens", 0.0)],
+)
+def test_errors_are_as_large_as_the_error_bar_says(part: str, error: float) -> None:
+    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
+    squared, draws = [], 40
+    for seed in range(draws):
+        truth, table = simulated(seed, frames=30, matches=100)
+        found = solve_joint(put_lens_error(truth, part, error), table, Config(estimate=part))
+        squared += squared_errors(found, truth)
+    scatter = 3 * np.sqrt(2 / 6 / draws)  # as if both cameras erred alike
+    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
