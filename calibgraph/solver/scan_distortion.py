@@ -8,8 +8,10 @@ matches by an amount that depends on their points. The part that no pose can fol
 residuals and measures the distortion: informative for a panoramic camera, weak for a narrow one.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -24,6 +26,7 @@ from factors import ProjectionBlock
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
+_DISTORTIONS = 3
 _SAMPLE = 4000  # correspondences: they know the displacement to some 1 % of its size
 
 
@@ -65,6 +68,29 @@ class DistortionEvidence:
     hessian: Array
     information: Array
     vector: Array
+
+    @staticmethod
+    def none(weak: Array, *, places: int) -> DistortionEvidence:
+        """No matches, with the weak prior alone."""
+        jacobian = np.zeros((len(weak), _DISTORTIONS))
+        information = np.zeros((places, _DISTORTIONS, _DISTORTIONS))
+        return DistortionEvidence(jacobian, weak, information, information[:, 0])
+
+    def as_of_one_place(self) -> DistortionEvidence:
+        """The sum over places."""
+        information, vector = self.information.sum(axis=0), self.vector.sum(axis=0)
+        return replace(self, information=information[None], vector=vector[None])
+
+    def __add__(self, other: DistortionEvidence) -> DistortionEvidence:
+        """Both sets of matches of as many places."""
+        hessian = self.hessian + other.hessian
+        pulled = self.hessian @ self.jacobian + other.hessian @ other.jacobian
+        return DistortionEvidence(
+            np.linalg.solve(hessian, pulled),
+            hessian,
+            self.information + other.information,
+            self.vector + other.vector,
+        )
 
 
 def distortion_evidence(

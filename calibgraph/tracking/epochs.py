@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import add
 
 import gtsam
 import numpy as np
@@ -50,15 +51,15 @@ def close_epoch(
     state = replace(state, cameras=cameras)
     state = regate(state)
     epochs = state.epochs
-    epochs = (*epochs[:-1], _with_bends(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
+    epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
     return report_drift(replace(state, epochs=epochs))
 
 
-def _with_bends(state: State, epoch: Epoch) -> Epoch:
-    """The epoch with what its matches have to do with bends of the cloud, if these are stated."""
+def _with_distortion(state: State, epoch: Epoch) -> Epoch:
+    """The epoch with the evidence of the scan distortion, if its size is stated."""
     if any(state.findings.bend_sigmas):
         for camera, one in enumerate(state.cameras):
-            epoch = epoch.with_bends(camera, one.scale)
+            epoch = epoch.with_distortion(camera, one.scale)
     return epoch
 
 
@@ -198,7 +199,7 @@ def _summarize_oldest(state: State) -> State:
         cameras=tuple(summarized),
         cross=gain @ cross @ gain.T,
         epochs=tuple(younger),
-        bends=state.bends + epoch.bends,
+        distortion=tuple(map(add, state.distortion, epoch.distortion)),
     )
     parts = [_to_part(name, [at[row] for at in at_places]) for row, name in enumerate(names)]
     return _with_places(state, parts, drifted)

@@ -9,11 +9,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.bends import BendSums
+from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
+from calibgraph.solver.within_place import WEAK
 
 Array = NDArray[np.float64]
+
+NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
+"""Without matches."""
 
 _SUMS = ("hessian", "gradient", "reweighted")
 
@@ -81,28 +85,35 @@ class Epoch:
     Attributes:
         frames: in order.
         T_lidar_camera: per camera, the estimate.
-        bends: what its matches have to do with bends of the cloud; of an open epoch, those of the
-            frames from which a camera has started in it.
+        distortion: per camera, of its matches in the scan distortion, as if of one place; in an
+            open epoch, of the frames from which it has started there.
     """
 
     frames: tuple[LiveFrame, ...]
     T_lidar_camera: tuple[gtsam.Pose3, ...]
-    bends: BendSums
+    distortion: tuple[DistortionEvidence, ...]
 
     @staticmethod
     def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
         """Without frames."""
-        return Epoch((), T_lidar_camera, BendSums.empty(len(T_lidar_camera)))
+        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera))
 
-    def with_bends(self, camera: int, scale: ResidualScale) -> Epoch:
-        """The epoch with what a camera's matches have to do with bends computed anew."""
-        parts = [frame.raw[camera] for frame in self.frames if camera in frame.raw]
-        numbers: dict[str, list[int]] = {}
-        for frame in self.frames:
-            numbers.setdefault(frame.place, []).append(frame.number)
-        places = [np.array(of_place, dtype=np.int64) for of_place in numbers.values()]
-        pose = self.T_lidar_camera[camera]
-        return replace(self, bends=self.bends.with_epoch(camera, parts, places, scale, pose))
+    def with_distortion(self, camera: int, scale: ResidualScale) -> Epoch:
+        """The epoch with a camera's evidence of the scan distortion computed anew.
+
+        At each place the camera has a pose of its own. What no such pose can follow is left in the
+        residuals, at whatever estimate: so it holds on when a camera moves or drifts.
+        """
+        own, found = inliers_of(self.frames, camera), NO_DISTORTION
+        if own is not None and len(own) >= MIN_MATCHES:
+            numbers: dict[str, list[int]] = {}
+            for frame in self.frames:
+                numbers.setdefault(frame.place, []).append(frame.number)
+            places = [np.array(of_place, dtype=np.int64) for of_place in numbers.values()]
+            pose = self.T_lidar_camera[camera]
+            found = distortion_evidence(own, scale, pose, WEAK, places=places).as_of_one_place()
+        before, after = self.distortion[:camera], self.distortion[camera + 1 :]
+        return replace(self, distortion=(*before, found, *after))
 
 
 @dataclass(frozen=True, eq=False)

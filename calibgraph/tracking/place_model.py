@@ -232,11 +232,11 @@ def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | 
     """The quadratics of all epochs, as if of the first place; None if there are none."""
     if not any(state.findings.bend_sigmas):
         return None
-    sums = state.all_bends
-    information, vector = np.zeros((places, 3, 3)), np.zeros((places, 3))
+    own = state.all_distortion[camera]
+    found = DistortionEvidence.none(WEAK, places=places)
     if state.config.preset == "auto":
-        information[0], vector[0] = sums.information[camera], sums.vector[camera]
-    return DistortionEvidence(sums.shifts[camera], sums.hessian[camera], information, vector)
+        found.information[0], found.vector[0] = own.information[0], own.vector[0]
+    return replace(found, jacobian=own.jacobian, hessian=own.hessian)
 
 
 def _states_places(state: State) -> bool:

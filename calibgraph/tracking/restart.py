@@ -15,7 +15,7 @@ from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary, step_between
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.place_shift import shift_since
 from calibgraph.tracking.posterior import Posterior, inverse, posterior, quadratic
@@ -165,12 +165,15 @@ def _restart_camera(
         absent=0,
     )
     drift = None if state.drift is not None and state.drift.camera == camera else state.drift
+    at_new_pose = replace(  # its matches follow the distortion in another way now
+        state.distortion[camera], jacobian=NO_DISTORTION.jacobian, hessian=NO_DISTORTION.hessian
+    )
     state = replace(
         state,
         epochs=epochs,
         cross=cross,
         places=state.places.without(camera),
-        bends=state.bends.at_new_pose(camera),
+        distortion=replace_item(state.distortion, camera, at_new_pose),
         references=replace_item(state.references, camera, T_lidar_camera),
         drift=_with_anchor_at(
             drift, camera, step_between(state.references[camera], T_lidar_camera)

@@ -115,7 +115,7 @@ def absorb_frames(
             )
         )
     if any(state.findings.bend_sigmas):
-        epochs = [epoch.with_bends(camera, state.cameras[camera].scale) for epoch in epochs]
+        epochs = [epoch.with_distortion(camera, state.cameras[camera].scale) for epoch in epochs]
     state = replace(state, epochs=tuple(epochs), optimum=None)
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
 from typing import TypeVar
 
 import gtsam
@@ -15,10 +17,10 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
-from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
-from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
+from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
@@ -121,7 +123,7 @@ class State:
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
         places: sums of the older frames, place by place, of cameras that do not drift.
-        bends: what the matches of older epochs have to do with bends of the cloud.
+        distortion: per camera, of its matches in older epochs in the scan distortion.
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
@@ -140,7 +142,7 @@ class State:
     total_hessian: Array
     total_frames: Array
     places: PlaceSums
-    bends: BendSums
+    distortion: tuple[DistortionEvidence, ...]
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
@@ -166,7 +168,7 @@ class State:
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
             places=PlaceSums.empty(n),
-            bends=BendSums.empty(n),
+            distortion=(NO_DISTORTION,) * n,
         )
 
     @property
@@ -185,9 +187,10 @@ class State:
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
 
     @property
-    def all_bends(self) -> BendSums:
-        """What the matches of all epochs have to do with bends of the cloud."""
-        return sum((epoch.bends for epoch in self.epochs), self.bends)
+    def all_distortion(self) -> tuple[DistortionEvidence, ...]:
+        """Per camera, of its matches in all epochs in the scan distortion."""
+        every = zip(self.distortion, *(epoch.distortion for epoch in self.epochs), strict=True)
+        return tuple(reduce(add, parts) for parts in every)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""

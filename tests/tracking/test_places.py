@@ -32,10 +32,9 @@ from calibgraph.simulation.place_draws import Drawn, draw_places, tied
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.scan_distortion import distortions_at
+from calibgraph.solver.scan_distortion import DistortionEvidence, distortions_at
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
-from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.joint_estimate import ClosedPlaces
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
@@ -196,9 +195,9 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(spread, np.ones(2))
     shifts = 0.1 * np.random.default_rng(0).normal(size=(2, 6, 3))
-    bends = replace(BendSums.empty(2), hessian=np.tile(np.eye(6), (2, 1, 1)))
-    bends = replace(bends, pull=(bends.hessian + WEAK) @ shifts)
-    state = replace(tracker._state, bends=bends)
+    none = DistortionEvidence.none(WEAK, places=1)
+    distortion = tuple(replace(none, jacobian=shift, hessian=1e6 * np.eye(6)) for shift in shifts)
+    state = replace(tracker._state, distortion=distortion)
     model = place_model(state, sums, seen, PlaceData.of(state, sums, (), {"a": 1}))
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
     assert found is not None
