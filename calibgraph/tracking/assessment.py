@@ -13,12 +13,11 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_l
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.elimination import LatentPoseFit
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.posterior import Posterior, is_determined
-from calibgraph.tracking.split_half import SplitHalf
+from calibgraph.tracking.posterior import estimates_of_halves
 from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.sums import Sums, is_determined, step_between
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
@@ -44,20 +43,20 @@ class Assessment:
     fit: LatentPoseFit
 
 
-def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces) -> Assessment:
+def assess(state: State, sums: Sums, halves: Sums, closed: ClosedPlaces) -> Assessment:
     """Assess the present estimates.
 
     Args:
         state: the tracker's.
         sums: over its summaries and live frames.
-        halves: the same sums, of every other epoch.
+        halves: (n, 2) the same sums, of every other epoch.
         closed: sums over places, of its closed epochs.
     """
     joint = joint_estimate(state, sums, closed)
     verdicts = {}
     for camera, name in enumerate(state.names):
         own = tuple(c for c in joint.conflicts if name in (c.pair.a, c.pair.b))
-        estimates = halves.estimates(state, camera)
+        estimates = estimates_of_halves(state, halves, camera)
         verdicts[name] = _verdict(
             state, sums, camera, joint.covariance, conflicts=own, halves=estimates
         )
@@ -66,7 +65,7 @@ def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlace
 
 def _verdict(
     state: State,
-    sums: Posterior,
+    sums: Sums,
     camera: int,
     covariance: Array,
     *,

@@ -22,7 +22,6 @@ from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import (
     invert_each,
-    pose_rows,
     to_T_lidar_camera,
 )
 from calibgraph.solver.conflicts import Conflict
@@ -40,7 +39,6 @@ from calibgraph.tracking.contradictions import (
     poses_by_name,
     with_pose_graph,
 )
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -49,9 +47,9 @@ from calibgraph.tracking.place_model import (
     place_model,
     summary_factor,
 )
-from calibgraph.tracking.place_sums import PlaceSums, parts_of
-from calibgraph.tracking.posterior import Posterior, steps_of
+from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import pose_priors
 
 Array = NDArray[np.float64]
@@ -95,7 +93,7 @@ class ClosedPlaces:
             at_optimum: stay at the one that the state has, if it has one.
         """
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
-        sums, earlier = state.places.add(parts_of(frames, steps_of(state))), state.places
+        sums, earlier = state.places.add(sums_by_place(frames)), state.places
         for camera, one in enumerate(state.cameras):
             if one.summary.walk:
                 sums, earlier = sums.without(camera), earlier.without(camera)
@@ -129,7 +127,7 @@ class ClosedPlaces:
         cameras = zip(state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def fit_with(self, state: State, sums: Posterior) -> tuple[LatentPoseFit, Conflicts]:
+    def fit_with(self, state: State, sums: Sums) -> tuple[LatentPoseFit, Conflicts]:
         """The optimum with the frames of the open epoch, and the relative poses that contradict.
 
         Args:
@@ -137,7 +135,7 @@ class ClosedPlaces:
             sums: over its summaries and live frames.
         """
         frames = state.epochs[-1].frames
-        every = self.sums.add(parts_of(frames, steps_of(state)))
+        every = self.sums.add(sums_by_place(frames))
         every, earlier = (_with_drifting(state, sums, own) for own in (every, self.linear))
         seen = self.seen if self.is_settled(state) else FrameSpread.of(state, every)
         if state.config.preset == "auto":
@@ -169,7 +167,7 @@ class ClosedPlaces:
 
 def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFit) -> PlaceSums:
     """The sums with the quadratics that all matches have at the pose of their place in a fit."""
-    gradient, reweighted = np.zeros_like(sums.gradient), np.zeros_like(sums.reweighted)
+    gradient, reweighted = np.zeros_like(sums.rows.gradient), np.zeros_like(sums.rows.reweighted)
     values, count = fit.linear.values, len(data.rows)
     clouds = poses_of(values, map(cloud_at_key, range(count)))
     for camera, matches in data.cameras.items():
@@ -182,7 +180,8 @@ def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFi
             step = step_between(pose, state.references[camera])
             reweighted[row, camera] = here.hessian[place]
             gradient[row, camera] = here.gradient[place] + here.hessian[place] @ step
-    return replace(sums, hessian=reweighted, gradient=gradient, reweighted=reweighted)
+    rows = replace(sums.rows, hessian=reweighted, gradient=gradient, reweighted=reweighted)
+    return replace(sums, rows=rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +202,7 @@ class JointEstimate:
     fit: LatentPoseFit
 
 
-def joint_estimate(state: State, sums: Posterior, closed: ClosedPlaces) -> JointEstimate:
+def joint_estimate(state: State, sums: Sums, closed: ClosedPlaces) -> JointEstimate:
     """The present estimates.
 
     A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
@@ -244,18 +243,10 @@ def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.
     return state.optimum.values(model, names, state.references)
 
 
-def _with_drifting(state: State, sums: Posterior, places: PlaceSums) -> PlaceSums:
+def _with_drifting(state: State, sums: Sums, places: PlaceSums) -> PlaceSums:
     """The sums of places, with those of cameras that drift at the present one."""
     live = state.live_frames
     for camera, one in enumerate(state.cameras):
         if one.summary.walk and live:
-            rows = pose_rows(camera)
-            own = (
-                sums.hessian[camera],
-                sums.gradient[camera],
-                sums.scatter[rows, rows],
-                float(sums.frames[camera]),
-            )
-            used = state.matches_of_frame(camera)
-            places = places.with_camera_at(live[-1].place, camera, own, used)
+            places = places.with_camera_at(live[-1].place, camera, sums[camera])
     return places

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -13,13 +14,10 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
-
-Array = NDArray[np.float64]
+from calibgraph.tracking.sums import Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
 """Without matches."""
-
-_SUMS = ("hessian", "gradient", "reweighted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,52 +28,38 @@ class LiveFrame:
         number: of the frame.
         raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
         inliers: per camera, (m,) which of them are within the gate.
-        hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
-        gradient: (n, 6) at the cameras' references.
-        reweighted: (n, 6, 6) Hessian by the matches' weights in the loss, positive semidefinite.
+        sums: (n,) of them, per camera.
         place: name of the place that it is of; empty: not known.
     """
 
     number: int
     raw: dict[int, CameraBlock]
     inliers: dict[int, NDArray[np.bool_]]
-    hessian: Array
-    gradient: Array
-    reweighted: Array
+    sums: Sums
     place: str = ""
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
-        sums = {name: getattr(self, name).copy() for name in _SUMS}
-        for values in sums.values():
-            values[camera] = 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
         inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
-        return replace(self, raw=raw, inliers=inliers, **sums)
+        sums = self.sums.replace_at(camera, Sums.zeros())
+        return replace(self, raw=raw, inliers=inliers, sums=sums)
 
     def add(
-        self,
-        camera: int,
-        raw: CameraBlock,
-        inliers: NDArray[np.bool_],
-        sums: Mapping[str, Array],
+        self, camera: int, raw: CameraBlock, inliers: NDArray[np.bool_], sums: Sums
     ) -> LiveFrame:
-        """The frame with a camera's matches, and their sums by the names of the attributes."""
-        own = {name: getattr(self, name).copy() for name in _SUMS}
-        for name, values in own.items():
-            values[camera] = sums[name]
+        """The frame with a camera's matches, and their sums."""
         return replace(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: inliers},
-            **own,
+            sums=self.sums.replace_at(camera, sums),
         )
 
     @staticmethod
     def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
         """A frame without matches."""
-        zero, none = np.zeros((cameras, 6, 6)), np.zeros((cameras, 6))
-        return LiveFrame(number, {}, {}, zero, none, zero, place)
+        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +81,12 @@ class Epoch:
     def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
         """Without frames."""
         return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera))
+
+    @cached_property
+    def sums(self) -> Sums:
+        """(n,) over its frames, per camera."""
+        none = Sums.zeros(len(self.T_lidar_camera))
+        return Sums.stack([none, *(frame.sums for frame in self.frames)]).total()
 
     def with_distortion(self, camera: int, scale: ResidualScale) -> Epoch:
         """The epoch with a camera's evidence of the scan distortion computed anew.

@@ -26,10 +26,10 @@ from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import step_between
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -59,9 +59,9 @@ class FrameSpread:
         frames, the scatter is shrunk towards that of all its frames so far. Where the matcher
         states nothing of places it is wider if epochs scatter more than their frames suggest.
         """
-        scatter, frames, left = sums.of_all
-        hessian, reweighted = sums.hessian.sum(axis=0), sums.reweighted.sum(axis=0)
-        matches = sums.matches.sum(axis=0)
+        (scatter, left), every = sums.within_places, sums.rows.total()
+        hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
+        matches = every.matches
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
         correlation = error_components().frame_correlation
         for camera in np.flatnonzero(frames):
@@ -84,7 +84,7 @@ class FrameSpread:
         return WithinPlace.of(
             self.covariance[camera],
             float(self.efficiency[camera]),
-            roots=np.linalg.cholesky(sums.reweighted[rows, camera] + WEAK),
+            roots=np.linalg.cholesky(sums.rows.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
@@ -206,26 +206,18 @@ def _quadratic(
     """
     rows = {name: row for row, name in enumerate(sums.names) if sums.frames[row, camera]}
     places = np.array([place for place, name in enumerate(names) if name in rows], dtype=np.int64)
-    own, poses = [rows[names[place]] for place in places], []
-    for row in own:
-        true, gradient = sums.hessian[row, camera], sums.gradient[row, camera]
-        pose = _pose_at(state, sums.names[row], camera)
+    chosen, poses = [rows[names[place]] for place in places], []
+    for row in chosen:
+        own, pose = sums.rows[row, camera], state.pose_at(sums.names[row], camera)
         if pose is None:
-            true = convex_hessian(true, sums.reweighted[row, camera])
-            step = np.linalg.solve(true + WEAK, -gradient)
+            true = convex_hessian(own.hessian, own.reweighted)
+            step = np.linalg.solve(true + WEAK, -own.gradient)
         else:
             step = step_between(state.references[camera], pose)
-            information = sums.reweighted[row, camera] + WEAK
-            step = step - np.linalg.solve(information, gradient + true @ step)
+            pull = own.gradient + own.hessian @ step
+            step = step - np.linalg.solve(own.reweighted + WEAK, pull)
         poses.append(state.references[camera].retract(step))
-    return QuadraticByPlace(places, poses, sums.reweighted[own, camera] + WEAK)
-
-
-def _pose_at(state: State, place: str, camera: int) -> gtsam.Pose3 | None:
-    """Of a place at the optimum of the last epoch; None if a camera drifts, or was not there."""
-    if state.optimum is None or state.cameras[camera].summary.walk:
-        return None
-    return state.optimum.pose_at(place, camera)
+    return QuadraticByPlace(places, poses, sums.rows.reweighted[chosen, camera] + WEAK)
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:

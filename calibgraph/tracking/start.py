@@ -22,7 +22,7 @@ from calibgraph.solver.camera_block import (
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.noise import ResidualHistogram, median
-from calibgraph.tracking.posterior import quadratic
+from calibgraph.tracking.posterior import sums_of_frame
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
@@ -129,8 +129,8 @@ def _absorb(
     inliers = residuals.inliers(scale)
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
-    sums = quadratic(residuals, inliers, scale, T_lidar_camera, state.references[camera])
-    return frame.add(camera, raw, inliers, sums._asdict())
+    sums = sums_of_frame(residuals, inliers, scale, state.references[camera])
+    return frame.add(camera, raw, inliers, sums)
 
 
 def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:

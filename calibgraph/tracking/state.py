@@ -31,6 +31,7 @@ from calibgraph.tracking.noise import (
 )
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.sums import Sums
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -97,13 +98,13 @@ class DriftWatch:
         camera: that showed it first.
         begun: number of updates at its detection.
         frame: number of the frame since which it drifts.
-        anchors: per camera, its summary at the time.
+        anchors: (n,) static sums of older epochs at the time.
     """
 
     camera: int
     begun: int
     frame: int
-    anchors: tuple[EpochSummary, ...]
+    anchors: Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,6 @@ class State:
         cameras: per camera of the rig.
         references: per camera, T_lidar_camera about which sums are taken.
         epochs: the live ones; the last is open.
-        cross: (6 n, 6 n) scatter between different cameras in the summaries.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
         total_frames: (n,) and of frames.
@@ -137,7 +137,6 @@ class State:
     cameras: tuple[CameraState, ...]
     references: tuple[gtsam.Pose3, ...]
     epochs: tuple[Epoch, ...]
-    cross: Array
     total: Array
     total_hessian: Array
     total_frames: Array
@@ -163,7 +162,6 @@ class State:
             cameras=tuple(CameraState() for _ in range(n)),
             references=guess,
             epochs=(Epoch.empty(guess),),
-            cross=np.zeros((6 * n, 6 * n)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
@@ -191,6 +189,12 @@ class State:
         """Per camera, of its matches in all epochs in the scan distortion."""
         every = zip(self.distortion, *(epoch.distortion for epoch in self.epochs), strict=True)
         return tuple(reduce(add, parts) for parts in every)
+
+    def pose_at(self, place: str, camera: int) -> gtsam.Pose3 | None:
+        """Of a place at the optimum; None if it is not known, a camera drifts, or was not there."""
+        if self.optimum is None or self.cameras[camera].summary.walk:
+            return None
+        return self.optimum.pose_at(place, camera)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""
@@ -229,11 +233,6 @@ class State:
             return None
         rows = pose_rows(index)
         return np.asarray(self.total[rows, rows] / (frames - 1))
-
-    def matches_of_frame(self, index: int) -> float:
-        """Mean number of a camera's matches that are used, of a frame."""
-        counts = self.cameras[index].counts
-        return counts.get("used", 0) / max(counts.get("absorbed", 0), 1)
 
     def overconfidence(self, index: int) -> float:
         """Mean ratio of a camera's Hessian to its information, at least 1."""

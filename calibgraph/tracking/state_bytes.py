@@ -40,6 +40,7 @@ from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
+from calibgraph.tracking.sums import Sums
 from factors import Lens, ProjectionBlock
 
 FORMAT = "calibgraph-tracker-state/7"
@@ -52,7 +53,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
+                 EpochSummary, Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                  VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
                  ProjectionBlock)
 }  # fmt: skip

@@ -36,10 +36,9 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import closed_posterior, with_open_epoch
+from calibgraph.tracking.posterior import closed_posterior, in_its_half, split_halves
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
-from calibgraph.tracking.split_half import SplitHalf
 from calibgraph.tracking.start import try_to_start
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
@@ -192,8 +191,8 @@ class IncrementalCalibrator:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
         if self._assessed is None or self._assessed[0] is not state:
-            sums, halves = with_open_epoch(self._closed, state), self._closed_halves
-            halves = halves.add(state.epochs[-1].frames)
+            sums, epoch = self._closed + state.epochs[-1].sums, state.epochs[-1]
+            halves = self._closed_halves + in_its_half(state, epoch, len(state.epochs) - 1)
             found = assess(state, sums, halves, self._closed_places)
             self._assessed = state, found
         return self._assessed[1]
@@ -252,7 +251,7 @@ class IncrementalCalibrator:
         self._window = Window(self._state)
         self._state = with_estimates(self._state, self._window)
         self._closed = closed_posterior(self._state)
-        self._closed_halves = SplitHalf.of_closed_epochs(self._state)
+        self._closed_halves = split_halves(self._state)
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add the blocks, gate them at the new estimate, replace them."""

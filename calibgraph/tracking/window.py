@@ -134,13 +134,12 @@ class Window:
         """The summaries of older epochs as factors on the first live one."""
         graph = gtsam.NonlinearFactorGraph()
         for camera, camera_state in enumerate(state.cameras):
-            summary = camera_state.summary
-            hessian, gradient = summary.hessian[summary.walk], summary.gradient[summary.walk]
-            if hessian.any():
+            sums = camera_state.summary.selected
+            if sums.hessian.any():
                 key = self._key(0, camera)
                 reference = gtsam.Values()
                 reference.insert(key, state.references[camera])
-                factor = gtsam.HessianFactor(key, hessian, -gradient, 0.0)
+                factor = gtsam.HessianFactor(key, sums.hessian, -sums.gradient, 0.0)
                 graph.add(gtsam.LinearContainerFactor(factor, reference))
         return graph
 

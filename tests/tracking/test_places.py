@@ -39,8 +39,7 @@ from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.joint_estimate import ClosedPlaces
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
 from calibgraph.tracking.place_shift import shift_covariance
-from calibgraph.tracking.place_sums import PlaceSums, parts_of
-from calibgraph.tracking.posterior import steps_of
+from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.tracking.window import pose_priors
@@ -191,7 +190,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     rig = pair_of()
     tracker = IncrementalCalibrator(rig, Config(of="mount"))
     tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
-    sums = PlaceSums.empty(2).add([replace(part("a", 0), gradient=np.zeros((2, 6)))])
+    sums = PlaceSums.empty(2).add({"a": replace(part("a", 0)["a"], gradient=np.zeros((2, 6)))})
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(spread, np.ones(2))
     shifts = 0.1 * np.random.default_rng(0).normal(size=(2, 6, 3))
@@ -207,7 +206,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     expected += flat @ (parts.cloud + parts.cloud_at_place[0]) @ flat.T
     for camera in range(2):
         rows = slice(6 * camera, 6 * camera + 6)
-        own = np.linalg.inv(sums.reweighted[1, camera] + np.diag([1.0] * 3 + [0.01] * 3))
+        own = np.linalg.inv(sums.rows.reweighted[1, camera] + np.diag([1.0] * 3 + [0.01] * 3))
         expected[rows, rows] += (spread[camera, 0, 0] + 8.0 * 3) * own
     units = np.sqrt(np.diag(expected))
     units = np.outer(units, units)  # the least excess is a thousandth
@@ -266,7 +265,7 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     """
     tracker, update = tracked_at_three_places(24)
     state, closed, joint = tracker._state, tracker._closed_places, tracker._assess()
-    places = closed.sums.add(parts_of(state.epochs[-1].frames, steps_of(state)))
+    places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
     data = PlaceData.of(
         state, state.places, state.live_frames, {places.names[row]: row for row in (1, 2, 3)}
     )
