@@ -10,16 +10,17 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.model.geometry import pose_rows
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import merge
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.live_frames import Epoch
+from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.regate import regate
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, step_between
+from factors import to_runs
 
 Array = NDArray[np.float64]
 
@@ -110,7 +111,27 @@ def _summarize_oldest(state: State) -> State:
         epochs=tuple(younger),
         distortion=tuple(map(add, state.distortion, epoch.distortion)),
     )
-    return _with_places(state, sums_by_place(epoch.frames), drifted)
+    return _with_places(state, sums_by_place(_at_places(state, epoch)), drifted)
+
+
+def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
+    """The frames of an epoch, linearized at the poses of their places at the optimum."""
+    frames = [replace(frame, sums=frame.sums.copy()) for frame in epoch.frames]
+    for camera, (estimate, reference) in enumerate(
+        zip(epoch.T_lidar_camera, state.references, strict=True)
+    ):
+        own = [frame for frame in frames if camera in frame.raw]
+        inliers = inliers_of(own, camera)
+        if inliers is None:
+            continue
+        poses = [state.pose_at(frame.place, camera) or estimate for frame in own]
+        block, runs = inliers.with_scale(state.cameras[camera].scale), to_runs(inliers.frame_edges)
+        here = block.run_sums(np.array([*map(to_T_camera_lidar, poses)]), runs)
+        for row, (frame, pose) in enumerate(zip(own, poses, strict=True)):
+            step = step_between(pose, reference)
+            frame.sums.gradient[camera] = here.gradient[row] + frame.sums.hessian[camera] @ step
+            frame.sums.reweighted[camera] = here.hessian[row]
+    return frames
 
 
 def _ungated(state: State, epoch: Epoch, camera: int) -> Sums:

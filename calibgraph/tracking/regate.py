@@ -15,13 +15,12 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import step_between
-from factors import to_runs
 
 _GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
 
 
 def regate(state: State) -> State:
-    """The state with its live frames gated anew, and linearized at the poses of their places."""
+    """The state with its live frames gated, and linearized, at the newest estimates."""
     frames = {
         f.number: replace(f, inliers=dict(f.inliers), sums=f.sums.copy()) for f in state.live_frames
     }
@@ -42,7 +41,7 @@ def regate(state: State) -> State:
 def _regate_camera(
     state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
 ) -> None:
-    """Fill in a camera's inliers of frames, and their sums at the poses of their places.
+    """Fill in a camera's inliers of frames, and their sums at an estimate.
 
     Hessians of frames are as they were, but for a share of what their sum is now.
     """
@@ -54,19 +53,16 @@ def _regate_camera(
             frame.inliers[camera] = found
     inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
     block = inliers.with_scale(scale)
-    poses = [state.pose_at(frame.place, camera) or T_lidar_camera for frame in frames]
-    by_frame = np.array([*map(to_T_camera_lidar, poses)])
-    here = block.run_sums(by_frame, to_runs(inliers.frame_edges))
+    here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
     true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
     missing = true - sum(frame.sums.hessian[camera] for frame in frames)
     shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
-    for row, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
-        sums, gradient = frame.sums, here.gradient[row]
+    step = step_between(T_lidar_camera, state.references[camera])
+    for row, frame in enumerate(frames):
+        sums, score = frame.sums, here.gradient[row]
         sums.hessian[camera] += (shares[row] + shares[row].T) / 2
-        hessian = sums.hessian[camera]
-        score = gradient + hessian @ step_between(pose, T_lidar_camera)
-        sums.gradient[camera] = gradient + hessian @ step_between(pose, state.references[camera])
+        sums.gradient[camera] = score + sums.hessian[camera] @ step
         sums.reweighted[camera] = here.hessian[row]
         sums.score[camera], sums.scatter[camera] = score, np.outer(score, score)
         sums.matches[camera] = np.count_nonzero(frame.inliers[camera])
