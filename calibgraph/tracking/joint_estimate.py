@@ -31,7 +31,7 @@ from calibgraph.solver.elimination import (
     Linearization,
     start_values,
 )
-from calibgraph.solver.variance_components import estimate_variance_ratios
+from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.tracking.contradictions import (
     Conflicts,
     Rows,
@@ -57,7 +57,7 @@ Array = NDArray[np.float64]
 NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
-_ROUNDS = 2  # of fits and estimates of the variance ratios; the next epoch goes on from there
+STEPS = 5  # fits, and estimates of the variance ratios between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,10 @@ class ClosedPlaces:
         findings: with which the rest was made.
         seen: by the frames of each camera.
         data: of the places of the graph.
-        fit: its optimum.
-        optimum: the poses there.
+        fit: the graph near its optimum.
+        contradicting: places in ``rig.relative_poses`` of those that take no part.
+        pose_graphs: the priors, without some relative poses.
+        sizes: the variance ratios of the graph.
     """
 
     sums: PlaceSums
@@ -80,18 +82,14 @@ class ClosedPlaces:
     seen: FrameSpread
     data: PlaceData
     fit: LatentPoseFit
-    optimum: Optimum
+    contradicting: Rows
+    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph]
+    sizes: VarianceRatios
     _summaries: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
-    _pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
 
     @staticmethod
-    def of(state: State, *, at_optimum: bool = False) -> ClosedPlaces:
-        """Of a state's closed epochs.
-
-        Args:
-            state: of the tracker.
-            at_optimum: stay at the one that the state has, if it has one.
-        """
+    def of(state: State) -> ClosedPlaces:
+        """Of a state's closed epochs, at the optimum that the state has, or else fitted."""
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
         sums, earlier = state.places.add(sums_by_place(frames)), state.places
         for camera, one in enumerate(state.cameras):
@@ -101,25 +99,47 @@ class ClosedPlaces:
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
         data = PlaceData.of(state, earlier, frames, rows)
         model = place_model(state, sums, seen, data)
-        pose_graphs, found = {NO_ROWS: pose_priors(state)}, state.optimum
+        pose_graphs = {NO_ROWS: pose_priors(state)}
         values = _start(state, model, data.names)
-        if found is None or not at_optimum:
-            fit, contradicting, _ = fit_without_contradictions(
+        if state.optimum is None:
+            fit, dropped, _ = fit_without_contradictions(
                 state, sums, model, values, pose_graphs=pose_graphs
             )
-            found = Optimum.of(model, fit.linear.values, data.names, contradicting)
         else:
-            model = with_pose_graph(state, model, found.contradicting, pose_graphs)
+            dropped = state.optimum.contradicting
+            model = with_pose_graph(state, model, dropped, pose_graphs)
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         linear = linearized(state, sums, data, fit)
         return ClosedPlaces(
-            sums, linear, state.findings, seen, data, fit, found, _pose_graphs=pose_graphs
+            sums, linear, state.findings, seen, data, fit, dropped, pose_graphs, state.sizes
         )
+
+    def fitted(self, state: State) -> ClosedPlaces:
+        """At the optimum for the variance ratios of the state."""
+        model = place_model(state, self.sums, self.seen, self.data)
+        fit, dropped, _ = fit_without_contradictions(
+            state, self.sums, model, self.fit.linear.values, pose_graphs=self.pose_graphs
+        )
+        linear = linearized(state, self.sums, self.data, fit)
+        return ClosedPlaces(
+            self.sums, linear, self.findings, self.seen, self.data, fit, dropped,
+            self.pose_graphs, state.sizes,
+        )  # fmt: skip
+
+    @property
+    def optimum(self) -> Optimum:
+        """The poses there."""
+        linear = self.fit.linear
+        return Optimum.of(linear.model, linear.values, self.data.names, self.contradicting)
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
+
+    def shows_ratios(self, state: State) -> bool:
+        """Whether anything is measured twice."""
+        return not self.sums.is_of_one_place or bool(state.rig.relative_poses)
 
     def is_settled(self, state: State) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
@@ -151,7 +171,7 @@ class ClosedPlaces:
         model = replace(model, pose_graph=self._summaries[kept])
         values = _start(state, model, data.names)
         fit, _, conflicts = fit_without_contradictions(
-            state, every, model, values, pose_graphs=self._pose_graphs
+            state, every, model, values, pose_graphs=self.pose_graphs
         )
         return fit, conflicts
 
@@ -213,8 +233,6 @@ def joint_estimate(state: State, sums: Sums, closed: ClosedPlaces) -> JointEstim
         sums: over its summaries and live frames.
         closed: of its closed epochs.
     """
-    if closed.findings != state.findings:
-        closed = ClosedPlaces.of(state)
     fit, conflicts = closed.fit_with(state, sums)
     estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
     covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
@@ -222,18 +240,33 @@ def joint_estimate(state: State, sums: Sums, closed: ClosedPlaces) -> JointEstim
     return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
 
 
-def close_places(state: State) -> tuple[State, ClosedPlaces]:
-    """The state with the optimum of its closed epochs, and the variance ratios that these show."""
+def settle(state: State) -> State:
+    """The state with optimum and variance ratios of its closed epochs, while these are few.
+
+    Later an epoch changes little, and the frames after it do the work step by step.
+    """
     closed = ClosedPlaces.of(state)
-    for _ in range(_ROUNDS):
-        if closed.sums.is_of_one_place and not state.rig.relative_poses:
-            break
+    if not closed.is_settled(state):
+        for step in range(1, STEPS + 1):
+            state, closed = refine(state, closed, step)
+    return state
+
+
+def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, ClosedPlaces]:
+    """One step towards optimum and variance ratios of the closed epochs.
+
+    The first is a fit, the second an estimate of the ratios; and so again while these change. The
+    next epoch goes on from there.
+    """
+    if step % 2:
+        if step == 1 or closed.sizes != state.sizes:
+            closed = closed.fitted(state)
+            state = replace(state, optimum=closed.optimum)
+    elif closed.sizes == state.sizes and closed.shows_ratios(state):
         found = estimate_variance_ratios(closed.fit, state.sizes)
-        if found.is_near(state.sizes):
-            break
-        state = replace(state, sizes=found, optimum=closed.optimum)
-        closed = ClosedPlaces.of(state)
-    return replace(state, optimum=closed.optimum), closed
+        if not found.is_near(state.sizes):
+            state = replace(state, sizes=found)
+    return state, closed
 
 
 def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:

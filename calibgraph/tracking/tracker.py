@@ -34,7 +34,7 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
+from calibgraph.tracking.joint_estimate import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.posterior import closed_posterior, in_its_half, split_halves
 from calibgraph.tracking.repeated_frames import without_repeats
@@ -73,6 +73,7 @@ class IncrementalCalibrator:
 
     _rig_at: tuple[tuple[gtsam.Pose3, ...], Rig] | None = None
     _assessed: tuple[State, Assessment] | None = None
+    _closed_places: ClosedPlaces
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -183,9 +184,18 @@ class IncrementalCalibrator:
         events = self._start_cameras(table, blocks)
         self._state, seen = count_absent(self._state, used)
         events += seen + self._restart_after_step()
+        self._refine()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
         return make_update(self._state, self.rig, self._assess(), tuple(events), used=used)
+
+    def _refine(self) -> None:
+        """Do a part of the work that the end of an epoch has left to the frames after it."""
+        state, step = self._state, len(self._state.epochs[-1].frames)
+        if self._closed_places.findings != state.findings:
+            self._closed_places = ClosedPlaces.of(state)
+        if step <= STEPS and len(state.epochs) > 1:
+            self._state, self._closed_places = refine(state, self._closed_places, step)
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
@@ -238,16 +248,16 @@ class IncrementalCalibrator:
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
 
-    def _resume(self, state: State, closed: ClosedPlaces | None = None) -> None:
+    def _resume(self, state: State) -> None:
         """Continue from a state: at the start, at each new epoch, and after an error."""
         self._state = state
         self._epoch_start = state
         self._since_epoch_start = []
-        self._rebuild(closed)
+        self._rebuild()
 
-    def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
+    def _rebuild(self) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed_places = closed or ClosedPlaces.of(self._state, at_optimum=True)
+        self._closed_places = ClosedPlaces.of(self._state)
         self._window = Window(self._state)
         self._state = with_estimates(self._state, self._window)
         self._closed = closed_posterior(self._state)
@@ -295,5 +305,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(*close_places(self._state))
+        self._resume(settle(self._state))
         return events

@@ -342,19 +342,22 @@ def test_the_journal_keeps_the_name_of_the_place_and_no_lists() -> None:
     assert with_place(listed, None).metadata == {PLACE: "0", "of": "someone"}
 
 
-def test_places_are_there_after_a_restart(tmp_path: Path) -> None:
-    tables = [states(table) for table in drive(pair_of(), 24)]
-    folder = tmp_path / "state"
-    whole = IncrementalCalibrator(pair_of())
-    with DurableCalibrator(folder, pair_of()) as calibrator:
-        for frame, table in enumerate(tables[:17]):
+@pytest.mark.parametrize("cut", [41, 63, 69, 70])
+def test_places_are_there_after_a_restart(tmp_path: Path, cut: int) -> None:
+    """With summaries of places, within the steps that an epoch's end leaves, and between them."""
+    tables = [states(table) for table in drive(pair_of(), 82)]
+    folder, config = tmp_path / "state", Config().changed(tracking={"live_epochs": 1})
+    whole = IncrementalCalibrator(pair_of(), config)
+    with DurableCalibrator(folder, pair_of(), config) as calibrator:
+        for frame, table in enumerate(tables[:cut]):
             calibrator.update(table, place=frame // 4 % 3)
-    with DurableCalibrator(folder, pair_of()) as calibrator:
-        assert calibrator.tracker.place == "1"
-        assert calibrator.tracker.places == ("2", "0", "1")
+    with DurableCalibrator(folder, pair_of(), config) as calibrator:
+        last = (cut - 1) // 4
+        assert calibrator.tracker.place == str(last % 3)
+        assert calibrator.tracker.places == tuple(str(n % 3) for n in range(last - 2, last + 1))
         for frame, table in enumerate(tables):
             expected = whole.update(table, place=frame // 4 % 3)
-            if frame >= 17:
+            if frame >= cut:
                 found = calibrator.update(table, place=frame // 4 % 3)
     for name, T in expected.T_camera_lidar.items():
         np.testing.assert_array_equal(found.T_camera_lidar[name], T)
@@ -432,7 +435,7 @@ def test_a_camera_that_sees_all_round_shows_the_motion_as_in_a_batch() -> None:
         tracker.update(one)
         mounted.update(one)
         unstated.update(replace(one, metadata=places))
-    value, covariance = ClosedPlaces.of(tracker._state).fit.distortion
+    value, covariance = ClosedPlaces.of(tracker._state).fitted(tracker._state).fit.distortion
     np.testing.assert_allclose(0.15 * covariance[2, 2] ** 0.5, sigma_m, rtol=0.1)
     assert abs(0.15 * value[2] - motion_m) < 0.1 * sigma_m
     (truth,) = rig.T_camera_lidar.values()
