@@ -64,7 +64,7 @@ def _with_distortion(state: State, epoch: Epoch) -> Epoch:
 
 
 def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with its sums about other references."""
+    """The state with its sums about other references, but those of live frames."""
     steps = np.array([*map(step_between, state.references, references)])
     cameras = tuple(
         replace(camera_state, summary=camera_state.summary.shift_reference(step))
@@ -74,17 +74,9 @@ def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State
     if drift is not None:
         drift = replace(drift, anchors=drift.anchors.shift_reference(steps))
     places = state.places.shift_reference(steps)
-    epochs = tuple(
-        replace(
-            epoch,
-            frames=tuple(replace(f, sums=f.sums.shift_reference(steps)) for f in epoch.frames),
-        )
-        for epoch in state.epochs
-    )
     return replace(
         state,
         cameras=cameras,
-        epochs=epochs,
         references=references,
         places=places,
         drift=drift,

@@ -249,9 +249,8 @@ def _covariance(
     rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])
     covariance = np.zeros((len(rows), len(rows)))
     new = [camera for camera in cameras if state.frame_noise(camera) is None]
-    drifting = [camera for camera in cameras if state.cameras[camera].summary.walk]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
-    own = {camera: before.scatter[camera] for camera in (*new, *drifting)}
+    own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
     for sums, known in ((before, own), (after, guessed)):
         by_gradient = block_diagonal(np.asarray(np.linalg.inv(sums.hessian[cameras])))
         scatter = _scatter(state, sums.frames, known)[np.ix_(rows, rows)]

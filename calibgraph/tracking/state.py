@@ -190,6 +190,11 @@ class State:
         every = zip(self.distortion, *(epoch.distortion for epoch in self.epochs), strict=True)
         return tuple(reduce(add, parts) for parts in every)
 
+    @property
+    def drifting(self) -> list[int]:
+        """The cameras that are followed by a random walk, by their places in the rig."""
+        return [camera for camera, one in enumerate(self.cameras) if one.summary.walk]
+
     def pose_at(self, place: str, camera: int) -> gtsam.Pose3 | None:
         """Of a place at the optimum; None if it is not known, a camera drifts, or was not there."""
         if self.optimum is None or self.cameras[camera].summary.walk:

@@ -26,6 +26,7 @@ from calibgraph.tracking.absorption import (
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
+from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
@@ -34,9 +35,7 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import closed_posterior, in_its_half, split_halves
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import try_to_start
@@ -73,7 +72,7 @@ class IncrementalCalibrator:
 
     _rig_at: tuple[tuple[gtsam.Pose3, ...], Rig] | None = None
     _assessed: tuple[State, Assessment] | None = None
-    _closed_places: ClosedPlaces
+    _closed: ClosedPlaces
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -192,19 +191,16 @@ class IncrementalCalibrator:
     def _refine(self) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
         state, step = self._state, len(self._state.epochs[-1].frames)
-        if self._closed_places.findings != state.findings:
-            self._closed_places = ClosedPlaces.of(state)
+        if self._closed.findings != state.findings:
+            self._closed = ClosedPlaces.of(state)
         if step <= STEPS and len(state.epochs) > 1:
-            self._state, self._closed_places = refine(state, self._closed_places, step)
+            self._state, self._closed = refine(state, self._closed, step)
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
         if self._assessed is None or self._assessed[0] is not state:
-            sums, epoch = self._closed + state.epochs[-1].sums, state.epochs[-1]
-            halves = self._closed_halves + in_its_half(state, epoch, len(state.epochs) - 1)
-            found = assess(state, sums, halves, self._closed_places)
-            self._assessed = state, found
+            self._assessed = state, assess(state, self._closed)
         return self._assessed[1]
 
     def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
@@ -257,11 +253,9 @@ class IncrementalCalibrator:
 
     def _rebuild(self) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed_places = ClosedPlaces.of(self._state)
+        self._closed = ClosedPlaces.of(self._state)
         self._window = Window(self._state)
         self._state = with_estimates(self._state, self._window)
-        self._closed = closed_posterior(self._state)
-        self._closed_halves = split_halves(self._state)
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add the blocks, gate them at the new estimate, replace them."""

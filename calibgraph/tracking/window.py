@@ -1,7 +1,7 @@
 """Where frames are gated and moves are found: the live epochs as an iSAM2 problem.
 
 It takes all matches for independent (Eq. 5 of the paper), so that each frame is one step. What is
-reported is the optimum of the error model, see ``calibgraph.tracking.joint_estimate``; with a
+reported is the optimum of the error model, see ``calibgraph.tracking.closed_places``; with a
 preset of the paper it is the optimum of this graph.
 
 A camera with a random walk has a variable per epoch:

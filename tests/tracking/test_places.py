@@ -35,9 +35,9 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortions_at
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
+from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.frame_order import PLACE, with_place
-from calibgraph.tracking.joint_estimate import ClosedPlaces
-from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
+from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model, quadratics_of
 from calibgraph.tracking.place_shift import shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.stream_lines import frames_of_lines
@@ -197,7 +197,9 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     none = DistortionEvidence.none(WEAK, places=1)
     distortion = tuple(replace(none, jacobian=shift, hessian=1e6 * np.eye(6)) for shift in shifts)
     state = replace(tracker._state, distortion=distortion)
-    model = place_model(state, sums, seen, PlaceData.of(state, sums, (), {"a": 1}))
+    model = place_model(
+        state, sums, seen, PlaceData.of(state, quadratics_of(state, sums), (), {"a": 1})
+    )
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
     assert found is not None
     parts, A = model.components, [*map(adjoint_camera_lidar, tracker._state.references)]
@@ -264,11 +266,10 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     Within 0.02 sigma: their losses have the weights of the optimum at the end of the last epoch.
     """
     tracker, update = tracked_at_three_places(24)
-    state, closed, joint = tracker._state, tracker._closed_places, tracker._assess()
+    state, closed, joint = tracker._state, tracker._closed, tracker._assess()
     places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
-    data = PlaceData.of(
-        state, state.places, state.live_frames, {places.names[row]: row for row in (1, 2, 3)}
-    )
+    rows = {places.names[row]: row for row in (1, 2, 3)}
+    data = PlaceData.of(state, quadratics_of(state, state.places), state.live_frames, rows)
     model = place_model(state, places, FrameSpread.of(state, places), data)
     model = replace(model, pose_graph=pose_priors(state))
     whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))

@@ -1,4 +1,4 @@
-"""The estimate of all cameras and its covariance: optimum and marginal of the error model's graph.
+"""The closed epochs, and with the open one optimum and marginal of the error model's graph.
 
 Frames are gated, and moves are found, at another estimate (``calibgraph.tracking.window``).
 
@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.linear_data import poses_of
-from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import (
-    invert_each,
-    to_T_lidar_camera,
-)
-from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import (
     LatentPoseFit,
     Linearization,
@@ -43,13 +35,17 @@ from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
     PlaceData,
+    Quadratics,
+    linearized,
     marginals_of_places,
     place_model,
+    quadratics_of,
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, step_between
+from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.window import pose_priors
 
 Array = NDArray[np.float64]
@@ -66,22 +62,26 @@ class ClosedPlaces:
 
     Attributes:
         sums: per place; of a camera that drifts, none.
-        linear: the same, linearized at the pose that each place has there.
+        posterior: (n,) over summaries and frames.
+        halves: (n, 2) over every other epoch.
         findings: with which the rest was made.
         seen: by the frames of each camera.
         data: of the places of the graph.
         fit: the graph near its optimum.
+        quadratics: of its matches there.
         contradicting: places in ``rig.relative_poses`` of those that take no part.
         pose_graphs: the priors, without some relative poses.
         sizes: the variance ratios of the graph.
     """
 
     sums: PlaceSums
-    linear: PlaceSums
+    posterior: Sums
+    halves: Sums
     findings: MatcherFindings
     seen: FrameSpread
     data: PlaceData
     fit: LatentPoseFit
+    quadratics: Quadratics
     contradicting: Rows
     pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph]
     sizes: VarianceRatios
@@ -92,12 +92,11 @@ class ClosedPlaces:
         """Of a state's closed epochs, at the optimum that the state has, or else fitted."""
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
         sums, earlier = state.places.add(sums_by_place(frames)), state.places
-        for camera, one in enumerate(state.cameras):
-            if one.summary.walk:
-                sums, earlier = sums.without(camera), earlier.without(camera)
+        for camera in state.drifting:
+            sums, earlier = sums.without(camera), earlier.without(camera)
         seen = FrameSpread.of(state, sums)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
-        data = PlaceData.of(state, earlier, frames, rows)
+        data = PlaceData.of(state, quadratics_of(state, earlier), frames, rows)
         model = place_model(state, sums, seen, data)
         pose_graphs = {NO_ROWS: pose_priors(state)}
         values = _start(state, model, data.names)
@@ -109,10 +108,10 @@ class ClosedPlaces:
             dropped = state.optimum.contradicting
             model = with_pose_graph(state, model, dropped, pose_graphs)
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
-        linear = linearized(state, sums, data, fit)
         return ClosedPlaces(
-            sums, linear, state.findings, seen, data, fit, dropped, pose_graphs, state.sizes
-        )
+            sums, closed_posterior(state), split_halves(state), state.findings, seen, data,
+            fit, linearized(data, fit), dropped, pose_graphs, state.sizes,
+        )  # fmt: skip
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
@@ -120,11 +119,14 @@ class ClosedPlaces:
         fit, dropped, _ = fit_without_contradictions(
             state, self.sums, model, self.fit.linear.values, pose_graphs=self.pose_graphs
         )
-        linear = linearized(state, self.sums, self.data, fit)
-        return ClosedPlaces(
-            self.sums, linear, self.findings, self.seen, self.data, fit, dropped,
-            self.pose_graphs, state.sizes,
-        )  # fmt: skip
+        return replace(
+            self,
+            fit=fit,
+            quadratics=linearized(self.data, fit),
+            contradicting=dropped,
+            sizes=state.sizes,
+            _summaries={},
+        )
 
     @property
     def optimum(self) -> Optimum:
@@ -156,12 +158,15 @@ class ClosedPlaces:
         """
         frames = state.epochs[-1].frames
         every = self.sums.add(sums_by_place(frames))
-        every, earlier = (_with_drifting(state, sums, own) for own in (every, self.linear))
+        for camera in state.drifting:  # its sums are as if of the present place
+            every = every.with_camera_at(state.live_frames[-1].place, camera, sums[camera])
+        earlier = self.quadratics | quadratics_of(state, every, state.drifting)
         seen = self.seen if self.is_settled(state) else FrameSpread.of(state, every)
         if state.config.preset == "auto":
             kept, rows = self._split(every, {f.place for f in (*frames, *state.live_frames[-1:])})
         else:  # the weights of a preset of the paper
-            earlier = every = every.bounded(most=0)
+            every = every.bounded(most=0)
+            earlier = quadratics_of(state, every)
             frames, kept, rows = (), NO_ROWS, [0] if every.frames.any() else []
         if kept not in self._summaries:
             chosen = [self.marginals[i] for i in kept]
@@ -183,61 +188,6 @@ class ClosedPlaces:
         if not rows and kept:  # the scan distortion needs a place
             kept, rows = kept[:-1], [every.names.index(names[kept[-1]])]
         return kept, rows
-
-
-def linearized(state: State, sums: PlaceSums, data: PlaceData, fit: LatentPoseFit) -> PlaceSums:
-    """The sums with the quadratics that all matches have at the pose of their place in a fit."""
-    gradient, reweighted = np.zeros_like(sums.rows.gradient), np.zeros_like(sums.rows.reweighted)
-    values, count = fit.linear.values, len(data.rows)
-    clouds = poses_of(values, map(cloud_at_key, range(count)))
-    for camera, matches in data.cameras.items():
-        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
-        keys = [matched_at_key(int(place), camera) for place in places]
-        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
-        here = matches.sums(T_camera_cloud)
-        for place, row in zip(places, data.rows[places], strict=True):
-            pose = to_T_lidar_camera(T_camera_cloud[place])
-            step = step_between(pose, state.references[camera])
-            reweighted[row, camera] = here.hessian[place]
-            gradient[row, camera] = here.gradient[place] + here.hessian[place] @ step
-    rows = replace(sums.rows, hessian=reweighted, gradient=gradient, reweighted=reweighted)
-    return replace(sums, rows=rows)
-
-
-@dataclass(frozen=True, eq=False)
-class JointEstimate:
-    """All cameras' estimates.
-
-    Attributes:
-        T_lidar_camera: per camera.
-        covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras with too
-            few frames.
-        conflicts: of the relative poses with the correspondences of both their cameras.
-        fit: the graph at its optimum.
-    """
-
-    T_lidar_camera: tuple[gtsam.Pose3, ...]
-    covariance: Array
-    conflicts: tuple[Conflict, ...]
-    fit: LatentPoseFit
-
-
-def joint_estimate(state: State, sums: Sums, closed: ClosedPlaces) -> JointEstimate:
-    """The present estimates.
-
-    A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
-    batch.
-
-    Args:
-        state: the tracker's.
-        sums: over its summaries and live frames.
-        closed: of its closed epochs.
-    """
-    fit, conflicts = closed.fit_with(state, sums)
-    estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
-    covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
-    covariance[few], covariance[:, few] = np.nan, np.nan
-    return JointEstimate(estimates, covariance, tuple(conflicts.values()), fit)
 
 
 def settle(state: State) -> State:
@@ -274,12 +224,3 @@ def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.
     if state.optimum is None:
         return start_values(model, poses_by_name(state))
     return state.optimum.values(model, names, state.references)
-
-
-def _with_drifting(state: State, sums: Sums, places: PlaceSums) -> PlaceSums:
-    """The sums of places, with those of cameras that drift at the present one."""
-    live = state.live_frames
-    for camera, one in enumerate(state.cameras):
-        if one.summary.walk and live:
-            places = places.with_camera_at(live[-1].place, camera, sums[camera])
-    return places
