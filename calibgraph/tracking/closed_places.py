@@ -181,25 +181,32 @@ class ClosedPlaces:
         return fit, conflicts
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
-        """Which of the closed places a summary stands for, and the rows of the other places."""
-        names, present = self.data.names, np.flatnonzero(every.frames.any(axis=1))
-        kept = tuple(i for i, name in enumerate(names) if name not in touched)
-        rows = [int(row) for row in present if every.names[row] in touched]
-        if not rows and kept:  # the scan distortion needs a place
-            kept, rows = kept[:-1], [every.names.index(names[kept[-1]])]
-        return kept, rows
+        """Which of the closed places a summary stands for, and the rows of the other places.
+
+        These have the last place of every camera that was at none of those that are touched: a
+        graph has the variables of the cameras that have matches in it.
+        """
+        seen, names = every.frames > 0, every.names
+        rows = {row for row in np.flatnonzero(seen.any(axis=1)).tolist() if names[row] in touched}
+        for camera in np.flatnonzero(seen.any(axis=0)):
+            own = np.flatnonzero(seen[:, camera]).tolist()
+            rows |= set() if rows.intersection(own) else {own[-1]}
+        others = {names[row] for row in rows}
+        kept = tuple(i for i, name in enumerate(self.data.names) if name not in others)
+        return kept, sorted(rows)
 
 
-def settle(state: State) -> State:
+def settle(state: State) -> tuple[State, ClosedPlaces]:
     """The state with optimum and variance ratios of its closed epochs, while these are few.
 
     Later an epoch changes little, and the frames after it do the work step by step.
     """
     closed = ClosedPlaces.of(state)
-    if not closed.is_settled(state):
-        for step in range(1, STEPS + 1):
-            state, closed = refine(state, closed, step)
-    return state
+    if closed.is_settled(state):
+        return state, closed
+    for step in range(1, STEPS + 1):
+        state, closed = refine(state, closed, step)
+    return state, ClosedPlaces.of(state)
 
 
 def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, ClosedPlaces]:

@@ -244,16 +244,16 @@ class IncrementalCalibrator:
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
 
-    def _resume(self, state: State) -> None:
+    def _resume(self, state: State, closed: ClosedPlaces | None = None) -> None:
         """Continue from a state: at the start, at each new epoch, and after an error."""
         self._state = state
         self._epoch_start = state
         self._since_epoch_start = []
-        self._rebuild()
+        self._rebuild(closed)
 
-    def _rebuild(self) -> None:
+    def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed = ClosedPlaces.of(self._state)
+        self._closed = closed or ClosedPlaces.of(self._state)
         self._window = Window(self._state)
         self._state = with_estimates(self._state, self._window)
 
@@ -299,5 +299,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(settle(self._state))
+        self._resume(*settle(self._state))
         return events

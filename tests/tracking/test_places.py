@@ -291,6 +291,20 @@ def test_places_on_both_sides_of_a_time_cancel() -> None:
     np.testing.assert_allclose(half, apart / 4, rtol=1e-9)
 
 
+def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:
+    """Its error bar stays that of the places where it saw something."""
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(drive(pair_of(), 40)):
+        seen = states(table if frame < 25 else table.of_camera("left"))
+        update = tracker.update(seen, place=str(frame // 6))
+        sigmas = {name: np.sqrt(np.diag(own)) for name, own in update.covariance.items()
+                  if own is not None}  # fmt: skip
+        if frame == 24:
+            before = sigmas
+    np.testing.assert_allclose(sigmas["right"], before["right"], rtol=0.2)
+    assert (sigmas["left"][:3] < before["left"][:3]).all()
+
+
 # Where the place of a frame comes from
 
 
