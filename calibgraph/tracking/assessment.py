@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -36,12 +37,14 @@ class Assessment:
             with too few frames.
         verdicts: per camera.
         fit: the error model at its optimum.
+        places: names of its places.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
     fit: LatentPoseFit
+    places: Sequence[str]
 
 
 def assess(state: State, closed: ClosedPlaces) -> Assessment:
@@ -56,7 +59,7 @@ def assess(state: State, closed: ClosedPlaces) -> Assessment:
     """
     sums = closed.posterior + state.epochs[-1].sums
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    fit, conflicts = closed.fit_with(state, sums)
+    fit, conflicts, places = closed.fit_with(state, sums)
     estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
     covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
@@ -65,7 +68,7 @@ def assess(state: State, closed: ClosedPlaces) -> Assessment:
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
         apart = estimates_of_halves(state, halves, camera)
         verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
-    return Assessment(estimates, covariance, verdicts, fit)
+    return Assessment(estimates, covariance, verdicts, fit, places)
 
 
 def _verdict(

@@ -149,8 +149,10 @@ class ClosedPlaces:
         cameras = zip(state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def fit_with(self, state: State, sums: Sums) -> tuple[LatentPoseFit, Conflicts]:
+    def fit_with(self, state: State, sums: Sums) -> tuple[LatentPoseFit, Conflicts, Sequence[str]]:
         """The optimum with the frames of the open epoch, and the relative poses that contradict.
+
+        Further the names of its places.
 
         Args:
             state: of the tracker.
@@ -178,7 +180,7 @@ class ClosedPlaces:
         fit, _, conflicts = fit_without_contradictions(
             state, every, model, values, pose_graphs=self.pose_graphs
         )
-        return fit, conflicts
+        return fit, conflicts, data.names
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
         """Which of the closed places a summary stands for, and the rows of the other places.

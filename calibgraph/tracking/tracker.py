@@ -36,6 +36,7 @@ from calibgraph.tracking.frame_order import (
     with_place,
 )
 from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import try_to_start
@@ -294,7 +295,13 @@ class IncrementalCalibrator:
 
     def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, set up iSAM2 anew."""
-        self._state, events = close_epoch(self._state, self._window.T_lidar_camera_by_epoch())
+        state = self._state
+        if state.optimum is not None and self._assessed is not None:
+            found = self._assessed[1]
+            model, values = found.fit.linear.model, found.fit.linear.values
+            newer = Optimum.of(model, values, found.places, ())
+            state = replace(state, optimum=state.optimum.updated(newer))
+        self._state, events = close_epoch(state, self._window.T_lidar_camera_by_epoch())
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
