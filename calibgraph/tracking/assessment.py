@@ -17,6 +17,7 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.noise import median
+from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.posterior import estimates_of_halves, in_its_half
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, is_determined, step_between
@@ -45,6 +46,12 @@ class Assessment:
     verdicts: dict[str, Verdict]
     fit: LatentPoseFit
     places: Sequence[str]
+
+    def newest(self, optimum: Optimum | None) -> Optimum | None:
+        """The optimum of closed epochs, with the newer poses of this one."""
+        model, values = self.fit.linear.model, self.fit.linear.values
+        newer = Optimum.of(model, values, self.places, ())
+        return None if optimum is None else optimum.updated(newer)
 
 
 def assess(state: State, closed: ClosedPlaces) -> Assessment:

@@ -47,7 +47,6 @@ FORMAT = "calibgraph-tracker-state/7"
 """Of the archive; earlier ones held other sums."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
-_EARLIER_MARK = b"calibgraph-tracker/1\n"
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 _DATACLASSES: dict[str, type] = {
@@ -120,9 +119,6 @@ def load_state_file(path: Path) -> bytes:
     data = require_file(path).read_bytes()
     start = len(_FILE_MARK) + _DIGEST_BYTES
     expected = _FILE_MARK.decode().strip()
-    if data.startswith(_EARLIER_MARK):
-        message = "holds a tracker of the earlier format calibgraph-tracker/1, expected"
-        raise FileError(path, f"{message} {expected}; track anew from a rig")
     if not data.startswith(_FILE_MARK):
         raise FileError(path, f"is not a {expected} file; track anew from a rig")
     if hashlib.sha256(data[start:]).digest() != data[len(_FILE_MARK) : start]:

@@ -36,10 +36,9 @@ from calibgraph.tracking.frame_order import (
     with_place,
 )
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
-from calibgraph.tracking.start import try_to_start
+from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
     StateError,
@@ -181,7 +180,9 @@ class IncrementalCalibrator:
         """Absorb the blocks that agree, set aside the others, detect events."""
         self._state, agreeing = select_agreeing(self._state, blocks)
         used = self._absorb(agreeing)
-        events = self._start_cameras(table, blocks)
+        self._state, events = start_cameras(self._state, table, blocks)
+        if events:
+            self._rebuild()
         self._state, seen = count_absent(self._state, used)
         events += seen + self._restart_after_step()
         self._refine()
@@ -271,19 +272,6 @@ class IncrementalCalibrator:
         self._state = absorb(self._state, agreeing, inliers)
         return used
 
-    def _start_cameras(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> list[Event]:
-        """Try to estimate the cameras that have no estimate yet."""
-        events = []
-        for camera in blocks:
-            if self._state.cameras[camera].started:
-                continue
-            self._state = try_to_start(self._state, camera, table)
-            if self._state.cameras[camera].started:
-                self._rebuild()
-                name, number = self._state.names[camera], self._state.frame or 0
-                events.append(Event("started", name, number, number, self._state.stamp_ns))
-        return events
-
     def _restart_after_step(self) -> list[Event]:
         """Restart what has moved so far that frames disagree with the estimate."""
         detected = detect_step(self._state)
@@ -296,11 +284,8 @@ class IncrementalCalibrator:
     def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, set up iSAM2 anew."""
         state = self._state
-        if state.optimum is not None and self._assessed is not None:
-            found = self._assessed[1]
-            model, values = found.fit.linear.model, found.fit.linear.values
-            newer = Optimum.of(model, values, found.places, ())
-            state = replace(state, optimum=state.optimum.updated(newer))
+        if self._assessed is not None:
+            state = replace(state, optimum=self._assessed[1].newest(state.optimum))
         self._state, events = close_epoch(state, self._window.T_lidar_camera_by_epoch())
         detected = detect_small_step(self._state)
         if detected is not None:

@@ -56,7 +56,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
         (data[:head], "is damaged: its checksum is wrong"),
         (b"", "is not a calibgraph-tracker-file/1 file"),
         (b"calibgraph-tracker-file/2\n" + data[head:], "is not a calibgraph-tracker-file/1 file"),
-        (b"calibgraph-tracker/1\n" + data[head:], "the earlier format calibgraph-tracker/1"),
+        (b"calibgraph-tracker/1\n" + data[head:], "is not a calibgraph-tracker-file/1 file"),
         (b"SQLite format 3\0" + bytes(100), "is not a calibgraph-tracker-file/1 file"),
     ):
         path.write_bytes(wrong)
