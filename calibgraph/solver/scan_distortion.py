@@ -86,7 +86,7 @@ class DistortionEvidence:
         hessian = self.hessian + other.hessian
         pulled = self.hessian @ self.jacobian + other.hessian @ other.jacobian
         return DistortionEvidence(
-            np.linalg.solve(hessian, pulled),
+            np.asarray(np.linalg.solve(hessian, pulled), dtype=np.float64),
             hessian,
             self.information + other.information,
             self.vector + other.vector,
