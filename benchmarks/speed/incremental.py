@@ -25,6 +25,7 @@ from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.simulation.drive_matches import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.optimizer import to_values
@@ -38,6 +39,16 @@ RIG = Rig(
 GUESS = perturb(RIG, rotation_deg=1.0, translation_m=0.1, seed=0)
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 POOL = 400
+PLACES, AT_PLACE = 24, 12  # places along a circuit, and frames at each before the next
+STATED = MatcherFindings(
+    systematic_rotation_rad=0.0005,
+    systematic_translation_m=0.005,
+    elevation_rad=0.001,
+    scan_motion_m=0.01,
+    place_rotation_rad=0.001,
+    place_translation_m=0.01,
+    place_variance=0.5,
+)
 EARLY, SAMPLE = 100, 100  # medians are of so many updates, around this frame and at the end
 PLAIN_AT = (100, 500, 2000)
 
@@ -85,6 +96,20 @@ def measure_ours(count: int) -> tuple[dict[int, float], Table]:
     ]
     at = {n: float(np.median(seconds[n - 50 : n + 50])) for n in PLAIN_AT if n + 50 <= count}
     return at, Table("Updates", ("", "value"), tuple(rows))
+
+
+def measure_load(count: int, places: int) -> tuple[str, ...]:
+    """Processor time of the updates along some places, as a row."""
+    tracker, seconds = IncrementalCalibrator(GUESS), []
+    for number, table in enumerate(frames(count)):
+        stated = table.with_findings(STATED) if places > 1 else table
+        start = time.process_time()
+        tracker.update(stated, place=number // AT_PLACE % places)
+        seconds.append(time.process_time() - start)
+    late = np.array(seconds[EARLY:])
+    median, most = float(np.median(late)), float(late.max())
+    numbers = 1e3 * median, 1e3 * float(np.quantile(late, 0.95)), 1e3 * most, most / median
+    return str(places), *(f"{number:.1f}" for number in numbers)
 
 
 def measure_plain_isam2(count: int) -> dict[int, float]:
@@ -139,7 +164,10 @@ def main() -> None:
         rows.append((str(number), *(f"{value:.2f}" for value in numbers), *batch))
     columns = ("frame", "ours [ms]", "plain iSAM2 [ms]", "ratio", "batch again [ms]", "ratio")
     comparison = Table("An update, beside other ways", columns, tuple(rows))
-    publish("speed.incremental", [updates, comparison], record=options.record)
+    of_load = ("places", "median [ms]", "95 % [ms]", "longest [ms]", "longest / median")
+    load = tuple(measure_load(min(options.frames, 600), places) for places in (1, PLACES))
+    tables = [updates, Table("Processor time of updates", of_load, load), comparison]
+    publish("speed.incremental", tables, record=options.record)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,10 @@ matches by an amount that depends on their points. The part that no pose can fol
 residuals and measures the distortion: informative for a panoramic camera, weak for a narrow one.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -25,6 +27,7 @@ from factors import FreeLensBlock, ProjectionBlock
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
+_DISTORTIONS = 3
 _SAMPLE = 4000  # correspondences: they know the displacement to some 1 % of its size
 
 
@@ -68,6 +71,29 @@ class DistortionEvidence:
     information: Array
     vector: Array
     lens_jacobian: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @staticmethod
+    def none(weak: Array, *, places: int) -> DistortionEvidence:
+        """No matches, with the weak prior alone."""
+        jacobian = np.zeros((len(weak), _DISTORTIONS))
+        information = np.zeros((places, _DISTORTIONS, _DISTORTIONS))
+        return DistortionEvidence(jacobian, weak, information, information[:, 0])
+
+    def as_of_one_place(self) -> DistortionEvidence:
+        """The sum over places."""
+        information, vector = self.information.sum(axis=0), self.vector.sum(axis=0)
+        return replace(self, information=information[None], vector=vector[None])
+
+    def __add__(self, other: DistortionEvidence) -> DistortionEvidence:
+        """Both sets of matches of as many places, of cameras with known lenses."""
+        hessian = self.hessian + other.hessian
+        pulled = self.hessian @ self.jacobian + other.hessian @ other.jacobian
+        return DistortionEvidence(
+            np.asarray(np.linalg.solve(hessian, pulled), dtype=np.float64),
+            hessian,
+            self.information + other.information,
+            self.vector + other.vector,
+        )
 
 
 def distortion_evidence(

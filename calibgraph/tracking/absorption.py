@@ -19,12 +19,11 @@ from calibgraph.solver.camera_block import (
 )
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.cause import squared_sigmas
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_shift import agrees_at_its_place
-from calibgraph.tracking.posterior import quadratic
+from calibgraph.tracking.posterior import sums_of_frame
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
 from calibgraph.tracking.window import Window
@@ -130,8 +129,8 @@ def absorb(
     for camera, rows in inliers.items():
         pose, scale = state.T_lidar_camera[camera], state.cameras[camera].scale
         residuals = blocks[camera].at(to_T_camera_lidar(pose))
-        sums = quadratic(residuals, rows, scale, pose, state.references[camera])
-        frame = frame.add(camera, blocks[camera], rows, sums._asdict())
+        sums = sums_of_frame(residuals, rows, scale, state.references[camera])
+        frame = frame.add(camera, blocks[camera], rows, sums)
         state = count_absorbed(state, camera, residuals, int(np.count_nonzero(rows)))
     return add_to_totals(with_open_frame(state, frame), frame)
 
@@ -158,20 +157,18 @@ def add_to_totals(state: State, frame: LiveFrame) -> State:
 
     An unusual frame is down-weighted: it may come after a move that has not been detected yet.
     """
-    steps = np.array([*map(step_between, state.references, state.T_lidar_camera)])
-    scores = frame.gradient + np.einsum("nij,nj->ni", frame.hessian, steps)
+    scores = frame.sums.score.copy()
     for camera in frame.raw:
         noise = state.frame_noise(camera)
         if noise is not None:
             unusual = squared_sigmas(scores[camera], noise)
             scores[camera] *= min(1.0, (_UNUSUAL / unusual) ** 0.5)
-    seen = np.array([camera in frame.raw for camera in range(len(steps))])
     flat = scores.ravel()
     return replace(
         state,
         total=_TOTAL_KEPT * state.total + np.outer(flat, flat),
-        total_hessian=_TOTAL_KEPT * state.total_hessian + frame.hessian,
-        total_frames=_TOTAL_KEPT * state.total_frames + seen,
+        total_hessian=_TOTAL_KEPT * state.total_hessian + frame.sums.hessian,
+        total_frames=_TOTAL_KEPT * state.total_frames + frame.sums.frames,
     )
 
 

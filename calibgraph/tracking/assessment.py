@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -12,13 +13,14 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import LatentPoseFit
-from calibgraph.tracking.epoch_summary import step_between
-from calibgraph.tracking.joint_estimate import ClosedPlaces, joint_estimate
+from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.posterior import Posterior, is_determined
-from calibgraph.tracking.split_half import SplitHalf
+from calibgraph.tracking.optimum import Optimum
+from calibgraph.tracking.posterior import estimates_of_halves, in_its_half
 from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.sums import Sums, is_determined, step_between
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
@@ -36,37 +38,49 @@ class Assessment:
             with too few frames.
         verdicts: per camera.
         fit: the error model at its optimum.
+        places: names of its places.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
     fit: LatentPoseFit
+    places: Sequence[str]
+
+    def newest(self, optimum: Optimum | None) -> Optimum | None:
+        """The optimum of closed epochs, with the newer poses of this one."""
+        model, values = self.fit.linear.model, self.fit.linear.values
+        newer = Optimum.of(model, values, self.places, ())
+        return None if optimum is None else optimum.updated(newer)
 
 
-def assess(state: State, sums: Posterior, halves: SplitHalf, closed: ClosedPlaces) -> Assessment:
+def assess(state: State, closed: ClosedPlaces) -> Assessment:
     """Assess the present estimates.
+
+    A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
+    batch.
 
     Args:
         state: the tracker's.
-        sums: over its summaries and live frames.
-        halves: the same sums, of every other epoch.
-        closed: sums over places, of its closed epochs.
+        closed: its closed epochs.
     """
-    joint = joint_estimate(state, sums, closed)
+    sums = closed.posterior + state.epochs[-1].sums
+    halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
+    fit, conflicts, places = closed.fit_with(state, sums)
+    estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
+    covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
+    covariance[few], covariance[:, few] = np.nan, np.nan
     verdicts = {}
     for camera, name in enumerate(state.names):
-        own = tuple(c for c in joint.conflicts if name in (c.pair.a, c.pair.b))
-        estimates = halves.estimates(state, camera)
-        verdicts[name] = _verdict(
-            state, sums, camera, joint.covariance, conflicts=own, halves=estimates
-        )
-    return Assessment(joint.T_lidar_camera, joint.covariance, verdicts, joint.fit)
+        own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
+        apart = estimates_of_halves(state, halves, camera)
+        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
+    return Assessment(estimates, covariance, verdicts, fit, places)
 
 
 def _verdict(
     state: State,
-    sums: Posterior,
+    sums: Sums,
     camera: int,
     covariance: Array,
     *,

@@ -19,8 +19,8 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, fit_latent_poses
 from calibgraph.solver.error_model import held_graph
 from calibgraph.tracking.place_sums import PlaceSums
-from calibgraph.tracking.posterior import is_determined
 from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import is_determined
 from calibgraph.tracking.window import pose_priors
 
 Array = NDArray[np.float64]
@@ -71,11 +71,13 @@ def _conflicts(
     state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
 ) -> Conflicts:
     """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
-    frames, hessian = sums.frames.sum(axis=0), sums.hessian.sum(axis=0)
+    every = sums.rows.total()
     known = [
         camera
         for camera, one in enumerate(state.cameras)
-        if one.started and frames[camera] >= ENOUGH_FRAMES and is_determined(hessian[camera])
+        if one.started
+        and every.frames[camera] >= ENOUGH_FRAMES
+        and is_determined(every.hessian[camera])
     ]
     names = [state.names[camera] for camera in known]
     measured = {

@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import CLEARLY, Steps, alarm_limit, find_cause, unexplained
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.posterior import inverse, is_determined, posterior
+from calibgraph.tracking.posterior import posterior
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal
+from calibgraph.tracking.sums import Sums
 
 _QUIET = 1000  # frames in which a drift of the same camera is not reported again
 _PATIENCE = 300  # frames until it is reported in any case
@@ -28,7 +28,7 @@ def follow_drift(state: State, camera: int, walk: int) -> State:
     reported_at = camera_state.drift_reported_at
     quiet = reported_at >= 0 and state.updates - reported_at < _QUIET
     if state.drift is None and not quiet:
-        anchors = tuple(one.summary for one in state.cameras)
+        anchors = Sums.stack([one.summary.walks[0] for one in state.cameras])
         since = _frames_ago(state, camera_state.summary, walk)
         watch = DriftWatch(camera, state.updates, since, anchors)
         state = replace(state, drift=watch)
@@ -42,7 +42,7 @@ def follow_drift(state: State, camera: int, walk: int) -> State:
 def _frames_ago(state: State, summary: EpochSummary, walk: int) -> int:
     """Number of the first frame that the summary of a walk still remembers."""
     oldest = state.live_frames[0].number if state.live_frames else state.frame or 0
-    return max(0, oldest - int(summary.frames[walk]))
+    return max(0, oldest - int(summary.walks.frames[walk]))
 
 
 def report_drift(state: State) -> tuple[State, list[Event]]:
@@ -74,17 +74,14 @@ def _steps(state: State, watch: DriftWatch) -> Steps:
     """The step of each camera since its anchor."""
     sums = posterior(state)
     cameras, steps, covariances = [], [], []
-    for camera, anchor in enumerate(watch.anchors):
-        now = sums.step(camera)
-        if now is None or not is_determined(anchor.hessian[0]):
+    for camera in range(len(state.cameras)):
+        now, then = sums.step(camera), watch.anchors.step(camera)
+        if now is None or then is None:
             continue
-        rows = pose_rows(camera)
-        pairs = ((anchor.hessian[0], anchor.scatter[0]),
-                 (sums.hessian[camera], sums.scatter[rows, rows]))  # fmt: skip
-        spreads = [inverse(hessian) @ scatter @ inverse(hessian) for hessian, scatter in pairs]
+        both = sums.covariance(camera) + watch.anchors.covariance(camera)
         cameras.append(camera)
-        steps.append(now - np.linalg.solve(anchor.hessian[0], -anchor.gradient[0]))
-        covariances.append(sum(spreads) * state.inflation(camera))
+        steps.append(now - then)
+        covariances.append(both * state.inflation(camera))
     return Steps(
         tuple(cameras),
         np.ravel(steps),

@@ -1,17 +1,4 @@
-"""One camera's older epochs in constant size: sums of quadratics, discounted by a random walk.
-
-Near a reference T_lidar_camera, half the cost of a block of correspondences is
-``d^T H d / 2 + b^T d + c`` for the tangent step d from the reference. Such sums add: thousands of
-frames are one (H, b). H is the true Hessian of the robust cost: with it the step to the minimum is
-exact to second order, while with the reweighted Hessian it is 20 to 40 percent too short. The
-scatter ``B = sum g g^T`` of the frames' gradients is summed too: ``H^-1 B H^-1`` is the covariance.
-
-If the extrinsic may have walked by a covariance Q since, then
-
-    H' = (H^-1 + Q / k)^-1 = G H,   b' = G b,   B' = G B G^T + H' Q H'
-
-so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
-``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
+"""One camera's older epochs in constant size: their sums, discounted by a random walk.
 
 Several walks are kept side by side: static, and a few strengths of drift. Each predicts every new
 epoch; the log-likelihoods of these predictions are its evidence, and the best one is selected.
@@ -19,11 +6,12 @@ epoch; the log-likelihoods of these predictions are its evidence, and the best o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
+
+from calibgraph.tracking.sums import Sums
 
 Array = NDArray[np.float64]
 
@@ -43,123 +31,68 @@ class EpochSummary:
     """Sums over one camera's older epochs, for every walk.
 
     Attributes:
-        hessian: (w, 6, 6) sum of the frames' true Hessians, in the tangent of T_lidar_camera.
-        gradient: (w, 6) at the reference, which ``State`` holds.
-        scatter: (w, 6, 6) sum of the outer products of the frames' gradients, and the walk.
-        frames: (w,) how many frames that is, after forgetting.
+        walks: (w,) sums, each discounted by its walk.
         evidence: (w,) log-likelihoods of the epochs, forgotten slowly.
         walk: which of the walks is selected.
-        halves_hessian, halves_gradient: (2, 6, 6) and (2, 6) of every other epoch.
+        halves: (2,) sums of every other epoch.
         next_half: which of the two the next epoch is added to.
-        ungated_hessian, ungated_gradient: (6, 6) and (6,) of all matches, outliers too.
+        ungated: of all matches, outliers too: Hessian by their weights, and gradient.
     """
 
-    hessian: Array
-    gradient: Array
-    scatter: Array
-    frames: Array
+    walks: Sums
     evidence: Array
     walk: int
-    halves_hessian: Array
-    halves_gradient: Array
+    halves: Sums
     next_half: int
-    ungated_hessian: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    ungated_gradient: Array = field(default_factory=lambda: np.zeros(6))
+    ungated: Sums
 
     @staticmethod
     def empty() -> EpochSummary:
-        """Sums over no epochs."""
+        """Over no epochs."""
         w = len(STRENGTHS)
-        return EpochSummary(
-            hessian=np.zeros((w, 6, 6)),
-            gradient=np.zeros((w, 6)),
-            scatter=np.zeros((w, 6, 6)),
-            frames=np.zeros(w),
-            evidence=np.zeros(w),
-            walk=0,
-            halves_hessian=np.zeros((2, 6, 6)),
-            halves_gradient=np.zeros((2, 6)),
-            next_half=0,
-        )
+        return EpochSummary(Sums.zeros(w), np.zeros(w), 0, Sums.zeros(2), 0, Sums.zeros())
 
     def shift_reference(self, step: Array) -> EpochSummary:
         """The sums about a reference that is moved by a tangent step."""
-        return replace(
-            self,
-            gradient=self.gradient + self.hessian @ step,
-            halves_gradient=self.halves_gradient + self.halves_hessian @ step,
-            ungated_gradient=self.ungated_gradient + self.ungated_hessian @ step,
+        walks, halves, ungated = (
+            sums.shift_reference(step) for sums in (self.walks, self.halves, self.ungated)
         )
+        return replace(self, walks=walks, halves=halves, ungated=ungated)
 
-    def add(self, hessian: Array, gradient: Array, scatter: Array, frames: int) -> EpochSummary:
+    def add(self, epoch: Sums, ungated: Sums) -> EpochSummary:
         """The sums with an epoch's added, taken at the same reference."""
-        halves_hessian, halves_gradient = self.halves_hessian.copy(), self.halves_gradient.copy()
-        halves_hessian[self.next_half] += hessian
-        halves_gradient[self.next_half] += gradient
         return replace(
             self,
-            hessian=self.hessian + hessian,
-            gradient=self.gradient + gradient,
-            scatter=self.scatter + scatter,
-            frames=self.frames + frames,
-            halves_hessian=halves_hessian,
-            halves_gradient=halves_gradient,
+            walks=self.walks + epoch,
+            halves=self.halves + epoch[None] * np.eye(2)[self.next_half],
             next_half=1 - self.next_half,
+            ungated=self.ungated + ungated,
         )
 
-    def add_ungated(self, hessian: Array, gradient: Array) -> EpochSummary:
-        """The sums with those over all matches of an epoch added."""
-        return replace(
-            self,
-            ungated_hessian=self.ungated_hessian + hessian,
-            ungated_gradient=self.ungated_gradient + gradient,
-        )
-
-    def propagate(self, variance: Array, inflation: float) -> tuple[EpochSummary, Array]:
-        """The sums after the random walk of an epoch, and the gain.
+    def propagate(self, variance: Array, overconfidence: float) -> EpochSummary:
+        """The sums after the random walk of an epoch.
 
         Args:
             variance: (6,) of the configured walk over the epoch.
-            inflation: k of the module's description.
-
-        Returns:
-            The summary; (6, 6) G of the selected walk.
+            overconfidence: of the Hessian, see ``calibgraph.tracking.sums``.
         """
-        gains = np.stack([
-            gain_of_walk(H, strength**2 * variance / inflation)
-            for H, strength in zip(self.hessian, STRENGTHS, strict=True)
-        ])  # fmt: skip
-        hessian = gains @ self.hessian
-        hessian = (hessian + hessian.transpose(0, 2, 1)) / 2
-        walked = STRENGTHS[:, None, None] ** 2 * np.diag(variance)
-        kept = np.trace(gains, axis1=1, axis2=2) / 6
-        summary = replace(
-            self,
-            hessian=hessian,
-            gradient=np.einsum("wij,wj->wi", gains, self.gradient),
-            scatter=gains @ self.scatter @ gains.transpose(0, 2, 1) + hessian @ walked @ hessian,
-            frames=self.frames * kept,
-            halves_hessian=self.halves_hessian * kept[self.walk],
-            halves_gradient=self.halves_gradient * kept[self.walk],
-            ungated_hessian=self.ungated_hessian * kept[self.walk],
-            ungated_gradient=self.ungated_gradient * kept[self.walk],
-        )
-        return summary, gains[self.walk]
+        walks, kept = self.walks.after_walk(np.outer(STRENGTHS**2, variance), overconfidence)
+        by = kept[self.walk]
+        return replace(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
 
-    def update_evidence(self, hessian: Array, gradient: Array, noise: Array) -> EpochSummary:
+    def update_evidence(self, epoch: Sums, noise: Array) -> EpochSummary:
         """The summary with the walks' evidence updated by how well each predicts an epoch.
 
         Args:
-            hessian: (6, 6) the epoch's.
-            gradient: (6,) the epoch's, at the reference.
+            epoch: its sums.
             noise: (6, 6) covariance of such a gradient at the true extrinsic.
         """
-        if not (self.frames >= _LEAST_FRAMES).all():
+        if not (self.walks.frames >= _LEAST_FRAMES).all():
             return self
-        steps = np.linalg.solve(self.hessian, -self.gradient[..., None])[..., 0]
-        score = gradient + steps @ hessian
-        spread = np.linalg.solve(self.hessian, hessian[None])
-        covariance = noise + spread.transpose(0, 2, 1) @ self.scatter @ spread
+        steps = np.linalg.solve(self.walks.hessian, -self.walks.gradient[..., None])[..., 0]
+        score = epoch.gradient + steps @ epoch.hessian
+        spread = np.linalg.solve(self.walks.hessian, epoch.hessian[None])
+        covariance = noise + spread.transpose(0, 2, 1) @ self.walks.scatter @ spread
         whitened = np.linalg.solve(covariance, score[..., None])[..., 0]
         distance = (score * whitened).sum(axis=1)
         logarithm = np.linalg.slogdet(covariance)[1]
@@ -177,9 +110,7 @@ class EpochSummary:
         if self.walk == 0:
             if self.evidence[best] - self.evidence[0] <= _SELECT_WALK:
                 return self
-            return replace(
-                self, walk=best, evidence=np.zeros_like(self.evidence)
-            )._restart_static_from(best)
+            return self.with_walk(best)
         if self.evidence[0] - self.evidence[self.walk] > _SELECT_STATIC:
             return replace(self, walk=0, evidence=np.zeros_like(self.evidence))
         walk = self.walk
@@ -191,10 +122,9 @@ class EpochSummary:
         return summary
 
     @property
-    def selected(self) -> tuple[Array, Array, Array, float]:
-        """The sums of the selected walk: Hessian, gradient, scatter, frames."""
-        w = self.walk
-        return self.hessian[w], self.gradient[w], self.scatter[w], float(self.frames[w])
+    def selected(self) -> Sums:
+        """The sums of the selected walk."""
+        return self.walks[self.walk]
 
     @property
     def best_walk(self) -> int:
@@ -202,28 +132,12 @@ class EpochSummary:
         return 1 + int(np.argmax(self.evidence[1:]))
 
     def with_walk(self, walk: int) -> EpochSummary:
-        """The summary with a walk selected for other reasons than the evidence."""
-        return replace(self, walk=walk, evidence=np.zeros_like(self.evidence))._restart_static_from(
-            walk
-        )
+        """The summary with a walk selected, whose evidence begins anew."""
+        new = replace(self, walk=walk, evidence=np.zeros_like(self.evidence))
+        return new._restart_static_from(walk)
 
     def _restart_static_from(self, walk: int) -> EpochSummary:
         """The summary with the static sums restarted from those of a walk."""
-        columns = {}
-        for name in ("hessian", "gradient", "scatter", "frames", "evidence"):
-            column = getattr(self, name).copy()
-            column[0] = column[walk]
-            columns[name] = column
-        return replace(self, **columns)
-
-
-def gain_of_walk(hessian: Array, variance: Array) -> Array:
-    """(6, 6) G with ``(H^-1 + diag(variance))^-1 = G H``; H may be singular."""
-    if not variance.any():
-        return np.eye(6)
-    return np.asarray(np.linalg.inv(np.eye(6) + hessian * variance), dtype=np.float64)
-
-
-def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
-    """(6,) tangent step from one T_lidar_camera to another."""
-    return np.asarray(one.localCoordinates(two))
+        evidence = self.evidence.copy()
+        evidence[0] = evidence[walk]
+        return replace(self, walks=self.walks.replace_at(0, self.walks[walk]), evidence=evidence)

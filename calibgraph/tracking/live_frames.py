@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.tracking.bends import BendSums
+from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
+from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.sums import Sums
 
-Array = NDArray[np.float64]
-
-_SUMS = ("hessian", "gradient", "reweighted")
+NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
+"""Without matches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,52 +28,38 @@ class LiveFrame:
         number: of the frame.
         raw: per camera (by its place in the rig) whose matches were absorbed: all of them.
         inliers: per camera, (m,) which of them are within the gate.
-        hessian: (n, 6, 6) true Hessian of each camera's robust cost; zero where there is none.
-        gradient: (n, 6) at the cameras' references.
-        reweighted: (n, 6, 6) Hessian by the matches' weights in the loss, positive semidefinite.
+        sums: (n,) of them, per camera.
         place: name of the place that it is of; empty: not known.
     """
 
     number: int
     raw: dict[int, CameraBlock]
     inliers: dict[int, NDArray[np.bool_]]
-    hessian: Array
-    gradient: Array
-    reweighted: Array
+    sums: Sums
     place: str = ""
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
-        sums = {name: getattr(self, name).copy() for name in _SUMS}
-        for values in sums.values():
-            values[camera] = 0.0
         raw = {c: m for c, m in self.raw.items() if c != camera}
         inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
-        return replace(self, raw=raw, inliers=inliers, **sums)
+        sums = self.sums.replace_at(camera, Sums.zeros())
+        return replace(self, raw=raw, inliers=inliers, sums=sums)
 
     def add(
-        self,
-        camera: int,
-        raw: CameraBlock,
-        inliers: NDArray[np.bool_],
-        sums: Mapping[str, Array],
+        self, camera: int, raw: CameraBlock, inliers: NDArray[np.bool_], sums: Sums
     ) -> LiveFrame:
-        """The frame with a camera's matches, and their sums by the names of the attributes."""
-        own = {name: getattr(self, name).copy() for name in _SUMS}
-        for name, values in own.items():
-            values[camera] = sums[name]
+        """The frame with a camera's matches, and their sums."""
         return replace(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: inliers},
-            **own,
+            sums=self.sums.replace_at(camera, sums),
         )
 
     @staticmethod
     def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
         """A frame without matches."""
-        zero, none = np.zeros((cameras, 6, 6)), np.zeros((cameras, 6))
-        return LiveFrame(number, {}, {}, zero, none, zero, place)
+        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,28 +69,41 @@ class Epoch:
     Attributes:
         frames: in order.
         T_lidar_camera: per camera, the estimate.
-        bends: what its matches have to do with bends of the cloud; of an open epoch, those of the
-            frames from which a camera has started in it.
+        distortion: per camera, of its matches in the scan distortion, as if of one place; in an
+            open epoch, of the frames from which it has started there.
     """
 
     frames: tuple[LiveFrame, ...]
     T_lidar_camera: tuple[gtsam.Pose3, ...]
-    bends: BendSums
+    distortion: tuple[DistortionEvidence, ...]
 
     @staticmethod
     def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
         """Without frames."""
-        return Epoch((), T_lidar_camera, BendSums.empty(len(T_lidar_camera)))
+        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera))
 
-    def with_bends(self, camera: int, scale: ResidualScale) -> Epoch:
-        """The epoch with what a camera's matches have to do with bends computed anew."""
-        parts = [frame.raw[camera] for frame in self.frames if camera in frame.raw]
-        numbers: dict[str, list[int]] = {}
-        for frame in self.frames:
-            numbers.setdefault(frame.place, []).append(frame.number)
-        places = [np.array(of_place, dtype=np.int64) for of_place in numbers.values()]
-        pose = self.T_lidar_camera[camera]
-        return replace(self, bends=self.bends.with_epoch(camera, parts, places, scale, pose))
+    @cached_property
+    def sums(self) -> Sums:
+        """(n,) over its frames, per camera."""
+        none = Sums.zeros(len(self.T_lidar_camera))
+        return Sums.stack([none, *(frame.sums for frame in self.frames)]).total()
+
+    def with_distortion(self, camera: int, scale: ResidualScale) -> Epoch:
+        """The epoch with a camera's evidence of the scan distortion computed anew.
+
+        At each place the camera has a pose of its own. What no such pose can follow is left in the
+        residuals, at whatever estimate: so it holds on when a camera moves or drifts.
+        """
+        own, found = inliers_of(self.frames, camera), NO_DISTORTION
+        if own is not None and len(own) >= MIN_MATCHES:
+            numbers: dict[str, list[int]] = {}
+            for frame in self.frames:
+                numbers.setdefault(frame.place, []).append(frame.number)
+            places = [np.array(of_place, dtype=np.int64) for of_place in numbers.values()]
+            pose = self.T_lidar_camera[camera]
+            found = distortion_evidence(own, scale, pose, WEAK, places=places).as_of_one_place()
+        before, after = self.distortion[:camera], self.distortion[camera + 1 :]
+        return replace(self, distortion=(*before, found, *after))
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,6 +60,16 @@ class Optimum:
             contradicting,
         )
 
+    def updated(self, newer: Optimum) -> Optimum:
+        """With the poses of another optimum where it has some, the same relative poses left out."""
+        return Optimum(
+            {**self.shared, **newer.shared},
+            newer.distortion,
+            {**self.clouds, **newer.clouds},
+            {**self.matched, **newer.matched},
+            self.contradicting,
+        )
+
     def values(
         self, model: LatentPoseModel, names: Sequence[str], guess: Sequence[gtsam.Pose3]
     ) -> gtsam.Values:

@@ -7,7 +7,7 @@ marginal on the cloud and the cameras as matches show them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import BlockByPlace, QuadraticByPlace, SummarizedByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.linear_data import poses_of
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import pose_rows
+from calibgraph.model.geometry import invert_each, pose_rows, to_T_lidar_camera
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.data_by_place import block_by_place
@@ -26,14 +27,16 @@ from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import Sums, step_between
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
+Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, Array]]]
+"""Per camera and name of a place: the minimum T_lidar_camera, and (6, 6) information."""
 
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
@@ -59,9 +62,9 @@ class FrameSpread:
         frames, the scatter is shrunk towards that of all its frames so far. Where the matcher
         states nothing of places it is wider if epochs scatter more than their frames suggest.
         """
-        scatter, frames, left = sums.of_all
-        hessian, reweighted = sums.hessian.sum(axis=0), sums.reweighted.sum(axis=0)
-        matches = sums.matches.sum(axis=0)
+        (scatter, left), every = sums.within_places, sums.rows.total()
+        hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
+        matches = every.matches
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
         correlation = error_components().frame_correlation
         for camera in np.flatnonzero(frames):
@@ -84,7 +87,7 @@ class FrameSpread:
         return WithinPlace.of(
             self.covariance[camera],
             float(self.efficiency[camera]),
-            roots=np.linalg.cholesky(sums.reweighted[rows, camera] + WEAK),
+            roots=np.linalg.cholesky(sums.rows.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
@@ -106,13 +109,13 @@ class PlaceData:
 
     @staticmethod
     def of(
-        state: State, earlier: PlaceSums, frames: Sequence[LiveFrame], places: Mapping[str, int]
+        state: State, earlier: Quadratics, frames: Sequence[LiveFrame], places: Mapping[str, int]
     ) -> PlaceData:
-        """Of frames whose matches are kept, and the sums over earlier ones.
+        """Of frames whose matches are kept, and the quadratics of earlier ones.
 
         Args:
             state: of the tracker.
-            earlier: those sums; those of a camera that drifts are over all frames.
+            earlier: these; of a camera that drifts, of all frames.
             frames: the others.
             places: the rows by their names.
         """
@@ -122,7 +125,7 @@ class PlaceData:
         ]
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
-            quadratic = _quadratic(state, earlier, camera, [*places])
+            quadratic = _by_place(earlier.get(camera, {}), [*places])
             own = None if one.summary.walk else inliers_of(kept, camera)
             if own is not None:
                 block = block_by_place(own, one.scale, numbers)
@@ -131,6 +134,19 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
+
+
+def _by_place(
+    known: Mapping[str, tuple[gtsam.Pose3, Array]], names: Sequence[str]
+) -> QuadraticByPlace:
+    """The quadratics of a camera at those of some places where it has one."""
+    places = [place for place, name in enumerate(names) if name in known]
+    chosen = [known[names[place]] for place in places]
+    return QuadraticByPlace(
+        np.array(places, dtype=np.int64),
+        [pose for pose, _ in chosen],
+        np.array([information for _, information in chosen]).reshape(-1, 6, 6),
+    )
 
 
 def place_model(
@@ -196,47 +212,64 @@ def summary_factor(
     return graph
 
 
-def _quadratic(
-    state: State, sums: PlaceSums, camera: int, names: Sequence[str]
-) -> QuadraticByPlace:
-    """The quadratics of a camera at some places.
+def quadratics_of(
+    state: State, sums: PlaceSums, cameras: Iterable[int] | None = None
+) -> Quadratics:
+    """The quadratics of some cameras, or all, at all places.
 
     As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
     last epoch, and the Hessian by the weights of the matches there.
     """
-    rows = {name: row for row, name in enumerate(sums.names) if sums.frames[row, camera]}
-    places = np.array([place for place, name in enumerate(names) if name in rows], dtype=np.int64)
-    own, poses = [rows[names[place]] for place in places], []
-    for row in own:
-        true, gradient = sums.hessian[row, camera], sums.gradient[row, camera]
-        pose = _pose_at(state, sums.names[row], camera)
-        if pose is None:
-            true = convex_hessian(true, sums.reweighted[row, camera])
-            step = np.linalg.solve(true + WEAK, -gradient)
-        else:
-            step = step_between(state.references[camera], pose)
-            information = sums.reweighted[row, camera] + WEAK
-            step = step - np.linalg.solve(information, gradient + true @ step)
-        poses.append(state.references[camera].retract(step))
-    return QuadraticByPlace(places, poses, sums.reweighted[own, camera] + WEAK)
+    return {
+        camera: {
+            name: _quadratic(state, sums.rows[row, camera], name, camera)
+            for row, name in enumerate(sums.names)
+            if sums.frames[row, camera]
+        }
+        for camera in (range(len(state.cameras)) if cameras is None else cameras)
+    }
 
 
-def _pose_at(state: State, place: str, camera: int) -> gtsam.Pose3 | None:
-    """Of a place at the optimum of the last epoch; None if a camera drifts, or was not there."""
-    if state.optimum is None or state.cameras[camera].summary.walk:
-        return None
-    return state.optimum.pose_at(place, camera)
+def _quadratic(state: State, own: Sums, place: str, camera: int) -> tuple[gtsam.Pose3, Array]:
+    pose, information = state.pose_at(place, camera), own.reweighted + WEAK
+    if pose is None:
+        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + WEAK, -own.gradient)
+    else:
+        step = step_between(state.references[camera], pose)
+        step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
+    return state.references[camera].retract(step), information
+
+
+def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
+    """The quadratics of all matches at the poses that their places have in a fit."""
+    values, count, found = fit.linear.values, len(data.names), Quadratics()
+    clouds = poses_of(values, map(cloud_at_key, range(count)))
+    for camera, matches in data.cameras.items():
+        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
+        keys = [matched_at_key(int(place), camera) for place in places]
+        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
+        here = matches.sums(T_camera_cloud)
+        information = here.hessian + WEAK
+        steps = -np.linalg.solve(information, here.gradient[..., None])[..., 0]
+        found[camera] = {
+            data.names[place]: (
+                to_T_lidar_camera(T_camera_cloud[place]).retract(steps[place]),
+                information[place],
+            )
+            for place in places
+        }
+    return found
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:
     """The quadratics of all epochs, as if of the first place; None if there are none."""
     if not any(state.findings.bend_sigmas):
         return None
-    sums = state.all_bends
-    information, vector = np.zeros((places, 3, 3)), np.zeros((places, 3))
+    own = state.all_distortion[camera]
+    found = DistortionEvidence.none(WEAK, places=places)
     if state.config.preset == "auto":
-        information[0], vector[0] = sums.information[camera], sums.vector[camera]
-    return DistortionEvidence(sums.shifts[camera], sums.hessian[camera], information, vector)
+        found.information[0], found.vector[0] = own.information[0], own.vector[0]
+    return replace(found, jacobian=own.jacobian, hessian=own.hessian)
 
 
 def _states_places(state: State) -> bool:

@@ -16,12 +16,12 @@ from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows, to_T_came
 from calibgraph.solver.prior_components import pose_covariance
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit, squared_sigmas
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.place_sums import PlaceSums, parts_of
-from calibgraph.tracking.posterior import is_determined, posterior, steps_of, true_hessian
+from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.posterior import posterior, steps_of, true_hessian
 from calibgraph.tracking.state import LEAST_FRAMES, State
+from calibgraph.tracking.sums import is_determined, step_between
 
 Array = NDArray[np.float64]
 
@@ -61,13 +61,14 @@ def agrees_at_its_place(state: State, camera: int, own: OutlierFrame) -> bool:
     hessian, reference = _frame_hessian(state, camera, own), state.references[camera]
     if before is None or not is_determined(hessian):
         return False
-    places = state.places.add(parts_of(state.live_frames, steps_of(state)))
+    places = state.places.add(sums_by_place(state.live_frames))
     noise = _frame_noise(places, camera, own, hessian)
     step, covariance = steps_of(state)[camera], before
     there = places.names.index(state.live_frames[-1].place), camera
-    if is_determined(places.hessian[there]):
-        shown = np.linalg.solve(places.hessian[there], -places.gradient[there]) - step
-        of_frames = _sandwich(places.hessian[there], places.frames[there] * noise)
+    at_place = places.rows[there]
+    if is_determined(at_place.hessian):
+        shown = np.linalg.solve(at_place.hessian, -at_place.gradient) - step
+        of_frames = _sandwich(at_place.hessian, at_place.frames * noise)
         gain = _gain(covariance, of_frames)
         step, covariance = step + gain @ shown, covariance - gain @ covariance
     shown, noise = step_between(reference, own.T_lidar_camera) - step, _sandwich(hessian, noise)
@@ -90,8 +91,7 @@ def _displacement(state: State, camera: int) -> Array | None:
     sums = posterior(state)
     if not is_determined(sums.hessian[camera]):
         return None
-    spread = sums.scatter[rows, rows] * state.inflation(camera)
-    return np.asarray(by_places + _sandwich(sums.hessian[camera], spread))
+    return np.asarray(by_places + sums.covariance(camera) * state.inflation(camera))
 
 
 def _sandwich(hessian: Array, scatter: Array) -> Array:
@@ -107,7 +107,7 @@ def _gain(covariance: Array, noise: Array) -> Array:
 
 def _frame_noise(places: PlaceSums, camera: int, own: OutlierFrame, hessian: Array) -> Array:
     """(6, 6) scatter of a frame's gradient about the mean of its place; of few frames, as usual."""
-    scatter, _, left = places.of_all
+    scatter, left = places.within_places
     if left[camera] >= LEAST_FRAMES:
         return np.asarray(scatter[camera] / left[camera])
     alike = error_components().frame_correlation
@@ -119,7 +119,7 @@ def _frame_hessian(state: State, camera: int, own: OutlierFrame) -> Array:
     scale = state.cameras[camera].scale
     residuals = own.raw.at(to_T_camera_lidar(own.T_lidar_camera))
     block = own.raw.select(residuals.inliers(scale)).with_scale(scale)
-    return true_hessian(residuals, block, scale, own.T_lidar_camera)
+    return true_hessian(residuals, block, scale)
 
 
 def _shift(state: State, first: dict[str, Array], second: dict[str, Array]) -> Array:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from calibgraph.model.rig import Camera, Intrinsics, Rig
 from calibgraph.simulation.correspondences import simulate_correspondences
+from calibgraph.simulation.rigs import rig_of
 from calibgraph.tracking.tracker import IncrementalCalibrator
 
 _FRAMES, _MATCHES = 24, 100  # as few as start a camera and close two epochs
@@ -16,13 +14,7 @@ def warm_up_tracker() -> None:
 
     Otherwise the first updates wait for it: for 0.3 s, and in a fresh install for seconds.
     """
-    camera = Camera(
-        width_px=800,
-        height_px=600,
-        intrinsics_px=Intrinsics(fx=500, fy=500, cx=400, cy=300),
-        T_camera_lidar=np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float),
-    )
-    rig = Rig(cameras={"one": camera, "two": camera})
+    rig = rig_of("kitti")
     tracker = IncrementalCalibrator(rig)
     table = simulate_correspondences(rig, frames=_FRAMES, matches=_MATCHES)
     for frame in range(_FRAMES):

@@ -1,4 +1,4 @@
-"""The frames that are kept, gated anew at the end of an epoch, with their sums."""
+"""The frames that are kept, gated and linearized anew at the end of an epoch."""
 
 from __future__ import annotations
 
@@ -12,24 +12,17 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.epoch_summary import step_between
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import step_between
 
 _GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
 
 
 def regate(state: State) -> State:
-    """The state with its live frames gated, and their gradients taken, at the newest estimates."""
+    """The state with its live frames gated, and linearized, at the newest estimates."""
     frames = {
-        f.number: replace(
-            f,
-            inliers=dict(f.inliers),
-            hessian=f.hessian.copy(),
-            gradient=f.gradient.copy(),
-            reweighted=f.reweighted.copy(),
-        )
-        for f in state.live_frames
+        f.number: replace(f, inliers=dict(f.inliers), sums=f.sums.copy()) for f in state.live_frames
     }
     for camera, one in enumerate(state.cameras):
         epochs = state.epochs if one.summary.walk else state.epochs[-1:]
@@ -60,16 +53,19 @@ def _regate_camera(
             frame.inliers[camera] = found
     inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
     block = inliers.with_scale(scale)
-    sums = block.frame_sums(T_lidar_camera, inliers.frame_edges)
+    here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
     true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
-    missing = true - sum(frame.hessian[camera] for frame in frames)
-    shares = sums.hessian @ np.linalg.solve(sums.hessian.sum(axis=0) + WEAK, missing)
+    missing = true - sum(frame.sums.hessian[camera] for frame in frames)
+    shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
     step = step_between(T_lidar_camera, state.references[camera])
     for row, frame in enumerate(frames):
-        frame.hessian[camera] += (shares[row] + shares[row].T) / 2
-        frame.gradient[camera] = sums.gradient[row] + frame.hessian[camera] @ step
-        frame.reweighted[camera] = sums.hessian[row]
+        sums, score = frame.sums, here.gradient[row]
+        sums.hessian[camera] += (shares[row] + shares[row].T) / 2
+        sums.gradient[camera] = score + sums.hessian[camera] @ step
+        sums.reweighted[camera] = here.hessian[row]
+        sums.score[camera], sums.scatter[camera] = score, np.outer(score, score)
+        sums.matches[camera] = np.count_nonzero(frame.inliers[camera])
 
 
 def _gate_pose(
@@ -83,10 +79,10 @@ def _gate_pose(
     one, reference = state.cameras[camera], state.references[camera]
     if one.summary.walk:
         return T_lidar_camera
-    block, older = raw.with_scale(one.scale), one.summary
+    block, older = raw.with_scale(one.scale), one.summary.ungated
     for _ in range(_GATE_STEPS):
         sums, step = block.sums(T_lidar_camera), step_between(reference, T_lidar_camera)
-        pull = sums.gradient + older.ungated_gradient + older.ungated_hessian @ step
-        whole = sums.hessian + older.ungated_hessian + WEAK
+        pull = sums.gradient + older.gradient + older.hessian @ step
+        whole = sums.hessian + older.hessian + WEAK
         T_lidar_camera = T_lidar_camera.retract(-np.linalg.solve(whole, pull))
     return T_lidar_camera

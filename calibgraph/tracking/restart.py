@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import gtsam
@@ -13,15 +13,16 @@ from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
 from calibgraph.tracking.drift import follow_drift
-from calibgraph.tracking.epoch_summary import EpochSummary, step_between
+from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.place_shift import shift_since
-from calibgraph.tracking.posterior import Posterior, inverse, posterior, quadratic
+from calibgraph.tracking.posterior import posterior, sums_of_frame
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
+from calibgraph.tracking.sums import Sums, step_between
 
 Array = NDArray[np.float64]
 Measured = tuple[Steps, dict[int, Array]]
@@ -150,9 +151,6 @@ def _restart_camera(
         replace(epoch, frames=tuple(frame.without(camera) for frame in epoch.frames))
         for epoch in state.epochs
     )
-    cross = state.cross.copy()
-    rows = pose_rows(camera)
-    cross[rows], cross[:, rows] = 0.0, 0.0
     camera_state = camera_state.count(
         left_out=-sum(1 for part in parts if part.frame[0] in set_aside)
     )
@@ -165,12 +163,14 @@ def _restart_camera(
         absent=0,
     )
     drift = None if state.drift is not None and state.drift.camera == camera else state.drift
+    at_new_pose = replace(  # its matches follow the distortion in another way now
+        state.distortion[camera], jacobian=NO_DISTORTION.jacobian, hessian=NO_DISTORTION.hessian
+    )
     state = replace(
         state,
         epochs=epochs,
-        cross=cross,
         places=state.places.without(camera),
-        bends=state.bends.at_new_pose(camera),
+        distortion=replace_item(state.distortion, camera, at_new_pose),
         references=replace_item(state.references, camera, T_lidar_camera),
         drift=_with_anchor_at(
             drift, camera, step_between(state.references[camera], T_lidar_camera)
@@ -183,8 +183,8 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
     """The watch with one camera's anchor moved by the step of that camera."""
     if drift is None:
         return None
-    anchor = drift.anchors[camera].shift_reference(step)
-    return replace(drift, anchors=replace_item(drift.anchors, camera, anchor))
+    own = drift.anchors[camera].shift_reference(step)
+    return replace(drift, anchors=drift.anchors.replace_at(camera, own))
 
 
 def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
@@ -206,10 +206,9 @@ def _blocks_since(state: State, detected: DetectedStep, camera: int) -> list[Cam
     ]
 
 
-def _sums_since(state: State, detected: DetectedStep) -> Posterior:
+def _sums_since(state: State, detected: DetectedStep) -> Sums:
     """The sums over the frames since a step, linearized at the estimate that fits them."""
-    n = len(state.cameras)
-    hessian, gradient, frames = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n)
+    found = Sums.zeros(len(state.cameras))
     for camera, camera_state in enumerate(state.cameras):
         parts = _blocks_since(state, detected, camera)
         if not camera_state.started or not parts:
@@ -222,10 +221,9 @@ def _sums_since(state: State, detected: DetectedStep) -> Posterior:
         inliers = residuals.inliers(camera_state.scale)
         if np.count_nonzero(inliers) >= MIN_MATCHES:
             reference = state.references[camera]
-            sums = quadratic(residuals, inliers, camera_state.scale, T_lidar_camera, reference)
-            hessian[camera], gradient[camera] = sums.hessian, sums.gradient
-            frames[camera] = len(parts)
-    return Posterior(hessian, gradient, np.zeros((6 * n, 6 * n)), frames)
+            own = sums_of_frame(residuals, inliers, camera_state.scale, reference)
+            found = found.replace_at(camera, replace(own, frames=np.array(float(len(parts)))))
+    return found
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
@@ -245,22 +243,35 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
 
 
 def _covariance(
-    state: State, before: Posterior, after: Posterior, cameras: list[int], *, since: int
+    state: State, before: Sums, after: Sums, cameras: list[int], *, since: int
 ) -> Array:
     """(6 m, 6 m) covariance of the difference between the estimates before and after."""
     rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])
-    one, two = (block_diagonal(inverse(sums.hessian[cameras])) for sums in (before, after))
-    noise = state.total.copy()
-    for camera in cameras:
-        own = pose_rows(camera)
-        if state.frame_noise(camera) is None:
-            noise[own], noise[:, own] = 0.0, 0.0
-            noise[own, own] = after.hessian[camera] * _GUESSED_OVERCONFIDENCE
-        else:
-            noise[own] *= np.sqrt(after.frames[camera] / state.total_frames[camera])
-            noise[:, own] *= np.sqrt(after.frames[camera] / state.total_frames[camera])
-    scatter, spread = (sums[np.ix_(rows, rows)] for sums in (before.scatter, noise))
+    covariance = np.zeros((len(rows), len(rows)))
+    new = [camera for camera in cameras if state.frame_noise(camera) is None]
+    guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
+    own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
+    for sums, known in ((before, own), (after, guessed)):
+        by_gradient = block_diagonal(np.asarray(np.linalg.inv(sums.hessian[cameras])))
+        scatter = _scatter(state, sums.frames, known)[np.ix_(rows, rows)]
+        covariance += by_gradient @ scatter @ by_gradient
     inflation = np.repeat([np.sqrt(state.inflation(camera)) for camera in cameras], 6)
-    covariance = one @ scatter @ one + two @ spread @ two
     by_places = shift_since(state, since)[np.ix_(rows, rows)]
     return np.asarray(covariance * np.outer(inflation, inflation) + by_places)
+
+
+def _scatter(state: State, frames: Array, own: Mapping[int, Array]) -> Array:
+    """(6 n, 6 n) scatter of the gradients of (n,) numbers of frames, as that of all frames is.
+
+    Args:
+        state: of the tracker.
+        frames: of each camera.
+        own: per camera for which that does not hold, its (6, 6) scatter.
+    """
+    share = np.repeat(np.sqrt(frames / np.maximum(state.total_frames, 1.0)), 6)
+    found = state.total * np.outer(share, share)
+    for camera, scatter in own.items():
+        rows = pose_rows(camera)
+        found[rows], found[:, rows] = 0.0, 0.0
+        found[rows, rows] = scatter
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 
 import gtsam
@@ -20,22 +21,36 @@ from calibgraph.solver.camera_block import (
     camera_blocks,
 )
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.noise import ResidualHistogram, median
-from calibgraph.tracking.posterior import quadratic
+from calibgraph.tracking.posterior import sums_of_frame
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 
 
-def try_to_start(state: State, camera: int, table: Correspondences) -> State:
-    """The state after one more frame of a camera that has no estimate yet.
+def start_cameras(
+    state: State, table: Correspondences, seen: Iterable[int]
+) -> tuple[State, list[Event]]:
+    """The state after one more frame of the cameras that have no estimate yet.
 
     Args:
         state: before.
-        camera: its place in the rig.
-        table: the correspondences of that frame.
+        table: the correspondences of the frame.
+        seen: the cameras that have enough of them.
     """
+    events = []
+    for camera in seen:
+        if not state.cameras[camera].started:
+            state = _try_to_start(state, camera, table)
+            if state.cameras[camera].started:
+                name, number = state.names[camera], state.frame or 0
+                events.append(Event("started", name, number, number, state.stamp_ns))
+    return state, events
+
+
+def _try_to_start(state: State, camera: int, table: Correspondences) -> State:
     camera_state, name = state.cameras[camera], state.names[camera]
     own = table.of_camera(name)
     table = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
@@ -115,7 +130,7 @@ def absorb_frames(
             )
         )
     if any(state.findings.bend_sigmas):
-        epochs = [epoch.with_bends(camera, state.cameras[camera].scale) for epoch in epochs]
+        epochs = [epoch.with_distortion(camera, state.cameras[camera].scale) for epoch in epochs]
     state = replace(state, epochs=tuple(epochs), optimum=None)
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
@@ -129,8 +144,8 @@ def _absorb(
     inliers = residuals.inliers(scale)
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
-    sums = quadratic(residuals, inliers, scale, T_lidar_camera, state.references[camera])
-    return frame.add(camera, raw, inliers, sums._asdict())
+    sums = sums_of_frame(residuals, inliers, scale, state.references[camera])
+    return frame.add(camera, raw, inliers, sums)
 
 
 def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:

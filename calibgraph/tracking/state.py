@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
 from typing import TypeVar
 
 import gtsam
@@ -15,10 +17,10 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
-from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
-from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
+from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import (
     GroupScatter,
     ResidualHistogram,
@@ -29,6 +31,7 @@ from calibgraph.tracking.noise import (
 )
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.sums import Sums
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -95,13 +98,13 @@ class DriftWatch:
         camera: that showed it first.
         begun: number of updates at its detection.
         frame: number of the frame since which it drifts.
-        anchors: per camera, its summary at the time.
+        anchors: (n,) static sums of older epochs at the time.
     """
 
     camera: int
     begun: int
     frame: int
-    anchors: tuple[EpochSummary, ...]
+    anchors: Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +117,13 @@ class State:
         cameras: per camera of the rig.
         references: per camera, T_lidar_camera about which sums are taken.
         epochs: the live ones; the last is open.
-        cross: (6 n, 6 n) scatter between different cameras in the summaries.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
         total_frames: (n,) and of frames.
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         drift: whose cause is not clear yet, or None.
         places: sums of the older frames, place by place, of cameras that do not drift.
-        bends: what the matches of older epochs have to do with bends of the cloud.
+        distortion: per camera, of its matches in older epochs in the scan distortion.
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
@@ -135,12 +137,11 @@ class State:
     cameras: tuple[CameraState, ...]
     references: tuple[gtsam.Pose3, ...]
     epochs: tuple[Epoch, ...]
-    cross: Array
     total: Array
     total_hessian: Array
     total_frames: Array
     places: PlaceSums
-    bends: BendSums
+    distortion: tuple[DistortionEvidence, ...]
     dropped_pairs: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = MatcherFindings()
@@ -161,12 +162,11 @@ class State:
             cameras=tuple(CameraState() for _ in range(n)),
             references=guess,
             epochs=(Epoch.empty(guess),),
-            cross=np.zeros((6 * n, 6 * n)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
             places=PlaceSums.empty(n),
-            bends=BendSums.empty(n),
+            distortion=(NO_DISTORTION,) * n,
         )
 
     @property
@@ -185,9 +185,21 @@ class State:
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
 
     @property
-    def all_bends(self) -> BendSums:
-        """What the matches of all epochs have to do with bends of the cloud."""
-        return sum((epoch.bends for epoch in self.epochs), self.bends)
+    def all_distortion(self) -> tuple[DistortionEvidence, ...]:
+        """Per camera, of its matches in all epochs in the scan distortion."""
+        every = zip(self.distortion, *(epoch.distortion for epoch in self.epochs), strict=True)
+        return tuple(reduce(add, parts) for parts in every)
+
+    @property
+    def drifting(self) -> list[int]:
+        """The cameras that are followed by a random walk, by their places in the rig."""
+        return [camera for camera, one in enumerate(self.cameras) if one.summary.walk]
+
+    def pose_at(self, place: str, camera: int) -> gtsam.Pose3 | None:
+        """Of a place at the optimum; None if it is not known, a camera drifts, or was not there."""
+        if self.optimum is None or self.cameras[camera].summary.walk:
+            return None
+        return self.optimum.pose_at(place, camera)
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""
@@ -226,11 +238,6 @@ class State:
             return None
         rows = pose_rows(index)
         return np.asarray(self.total[rows, rows] / (frames - 1))
-
-    def matches_of_frame(self, index: int) -> float:
-        """Mean number of a camera's matches that are used, of a frame."""
-        counts = self.cameras[index].counts
-        return counts.get("used", 0) / max(counts.get("absorbed", 0), 1)
 
     def overconfidence(self, index: int) -> float:
         """Mean ratio of a camera's Hessian to its information, at least 1."""

@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import gtsam
@@ -31,36 +32,33 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
-from calibgraph.tracking.bends import BendSums
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
+from calibgraph.tracking.sums import Sums
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/6"
-"""Of the archive; 1 was a layout of its own without an archive, 2 held the inliers as copies, 3 had
-no places, 4 nothing of what residuals show of the cloud's bends, 5 no optimum."""
-
-_READABLE = "calibgraph-tracker-state/5", FORMAT
+FORMAT = "calibgraph-tracker-state/7"
+"""Of the archive; earlier ones held other sums."""
 
 _FILE_MARK = b"calibgraph-tracker-file/1\n"
-_EARLIER_MARK = b"calibgraph-tracker/1\n"
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 _DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                 EpochSummary, PlaceSums, Optimum, BendSums, MatcherFindings, VarianceRatios,
-                 ResidualHistogram, ResidualScale, Correspondences, CameraBlock, ProjectionBlock)
+                 EpochSummary, Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
+                 VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
+                 ProjectionBlock)
 }  # fmt: skip
-_DATACLASSES["Sizes"] = VarianceRatios  # its name in earlier releases
 _DECODING_ERRORS = (
     ValueError, LookupError, TypeError, AttributeError, OSError, MemoryError, EOFError,
-    NotImplementedError, RecursionError, zipfile.BadZipFile,
+    NotImplementedError, RecursionError, TokenError, zipfile.BadZipFile,
 )  # fmt: skip
 """What JSON, zipfile, numpy and the constructors of values raise on damaged bytes."""
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
@@ -121,9 +119,6 @@ def load_state_file(path: Path) -> bytes:
     data = require_file(path).read_bytes()
     start = len(_FILE_MARK) + _DIGEST_BYTES
     expected = _FILE_MARK.decode().strip()
-    if data.startswith(_EARLIER_MARK):
-        message = "holds a tracker of the earlier format calibgraph-tracker/1, expected"
-        raise FileError(path, f"{message} {expected}; track anew from a rig")
     if not data.startswith(_FILE_MARK):
         raise FileError(path, f"is not a {expected} file; track anew from a rig")
     if hashlib.sha256(data[start:]).digest() != data[len(_FILE_MARK) : start]:
@@ -138,7 +133,7 @@ def _decode(data: bytes) -> Any:
     with np.load(io.BytesIO(data), allow_pickle=False) as members:
         described = json.loads(members["json"].tobytes())
         flat = {dtype: members[dtype] for dtype in _DTYPES if dtype in members}
-    if described["format"] not in _READABLE:
+    if described["format"] != FORMAT:
         raise StateError(f"is of format {described['format']!r}, expected {FORMAT!r}")
     rig = Rig.model_validate(described["rig"])
     decoder = _Decoder(flat, rig)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,9 @@ from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.place_shift import shift_since
-from calibgraph.tracking.posterior import Posterior, posteriors_before_epochs
+from calibgraph.tracking.posterior import posteriors_before_epochs
 from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.sums import Sums
 
 Array = NDArray[np.float64]
 
@@ -114,7 +116,7 @@ def detect_small_step(state: State) -> DetectedStep | None:
     best, detected = 0.0, None
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
-    afterwards = _sums_from_each_epoch(state)
+    afterwards = [*accumulate(epoch.sums for epoch in reversed(state.epochs))][::-1]
     for place, before in posteriors_before_epochs(state):
         if not state.epochs[place].frames:
             continue
@@ -129,41 +131,11 @@ def detect_small_step(state: State) -> DetectedStep | None:
     return detected
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """Sums of the absorbed frames since a time, about the references.
-
-    Attributes:
-        hessian: (n, 6, 6) per camera.
-        gradient: (n, 6).
-        frames: (n,).
-    """
-
-    hessian: Array
-    gradient: Array
-    frames: Array
-
-
-def _sums_from_each_epoch(state: State) -> list[_Sums]:
-    """Per live epoch the sums over its frames and all later ones."""
-    n = len(state.cameras)
-    sums = _Sums(np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n))
-    found = []
-    for epoch in reversed(state.epochs):
-        hessian, gradient, frames = sums.hessian, sums.gradient, sums.frames
-        for frame in epoch.frames:
-            hessian, gradient = hessian + frame.hessian, gradient + frame.gradient
-            frames = frames + [camera in frame.raw for camera in range(n)]
-        sums = _Sums(hessian, gradient, frames)
-        found.append(sums)
-    return found[::-1]
-
-
 def _shift_excess(
     state: State,
     camera: int,
-    before: Posterior,
-    after: _Sums,
+    before: Sums,
+    after: Sums,
     *,
     by_places: Array | None = None,
 ) -> float:
@@ -182,7 +154,7 @@ def _shift_excess(
     rows = pose_rows(camera)
     inverse = np.linalg.inv(before.hessian[camera])
     uncertain = hessian @ inverse
-    scatter = before.scatter[rows, rows]
+    scatter = before.scatter[camera]
     covariance = (
         scatter * (after.frames[camera] / (frames - 1)) + uncertain @ scatter @ uncertain.T
     ) * state.inflation(camera)

@@ -26,6 +26,7 @@ from calibgraph.tracking.absorption import (
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
+from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
@@ -34,13 +35,10 @@ from calibgraph.tracking.frame_order import (
     with_metadata_per_frame,
     with_place,
 )
-from calibgraph.tracking.joint_estimate import ClosedPlaces, close_places
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import closed_posterior, with_open_epoch
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
-from calibgraph.tracking.split_half import SplitHalf
-from calibgraph.tracking.start import try_to_start
+from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import (
     StateError,
@@ -74,6 +72,7 @@ class IncrementalCalibrator:
 
     _rig_at: tuple[tuple[gtsam.Pose3, ...], Rig] | None = None
     _assessed: tuple[State, Assessment] | None = None
+    _closed: ClosedPlaces
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -181,21 +180,29 @@ class IncrementalCalibrator:
         """Absorb the blocks that agree, set aside the others, detect events."""
         self._state, agreeing = select_agreeing(self._state, blocks)
         used = self._absorb(agreeing)
-        events = self._start_cameras(table, blocks)
+        self._state, events = start_cameras(self._state, table, blocks)
+        if events:
+            self._rebuild()
         self._state, seen = count_absent(self._state, used)
         events += seen + self._restart_after_step()
+        self._refine()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
         return make_update(self._state, self.rig, self._assess(), tuple(events), used=used)
+
+    def _refine(self) -> None:
+        """Do a part of the work that the end of an epoch has left to the frames after it."""
+        state, step = self._state, len(self._state.epochs[-1].frames)
+        if self._closed.findings != state.findings:
+            self._closed = ClosedPlaces.of(state)
+        if step <= STEPS and len(state.epochs) > 1:
+            self._state, self._closed = refine(state, self._closed, step)
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
         if self._assessed is None or self._assessed[0] is not state:
-            sums, halves = with_open_epoch(self._closed, state), self._closed_halves
-            halves = halves.add(state.epochs[-1].frames)
-            found = assess(state, sums, halves, self._closed_places)
-            self._assessed = state, found
+            self._assessed = state, assess(state, self._closed)
         return self._assessed[1]
 
     def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
@@ -248,11 +255,9 @@ class IncrementalCalibrator:
 
     def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
         """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed_places = closed or ClosedPlaces.of(self._state, at_optimum=True)
+        self._closed = closed or ClosedPlaces.of(self._state)
         self._window = Window(self._state)
         self._state = with_estimates(self._state, self._window)
-        self._closed = closed_posterior(self._state)
-        self._closed_halves = SplitHalf.of_closed_epochs(self._state)
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
         """The two passes: add the blocks, gate them at the new estimate, replace them."""
@@ -267,19 +272,6 @@ class IncrementalCalibrator:
         self._state = absorb(self._state, agreeing, inliers)
         return used
 
-    def _start_cameras(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> list[Event]:
-        """Try to estimate the cameras that have no estimate yet."""
-        events = []
-        for camera in blocks:
-            if self._state.cameras[camera].started:
-                continue
-            self._state = try_to_start(self._state, camera, table)
-            if self._state.cameras[camera].started:
-                self._rebuild()
-                name, number = self._state.names[camera], self._state.frame or 0
-                events.append(Event("started", name, number, number, self._state.stamp_ns))
-        return events
-
     def _restart_after_step(self) -> list[Event]:
         """Restart what has moved so far that frames disagree with the estimate."""
         detected = detect_step(self._state)
@@ -291,10 +283,13 @@ class IncrementalCalibrator:
 
     def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, set up iSAM2 anew."""
-        self._state, events = close_epoch(self._state, self._window.T_lidar_camera_by_epoch())
+        state = self._state
+        if self._assessed is not None:
+            state = replace(state, optimum=self._assessed[1].newest(state.optimum))
+        self._state, events = close_epoch(state, self._window.T_lidar_camera_by_epoch())
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(*close_places(self._state))
+        self._resume(*settle(self._state))
         return events

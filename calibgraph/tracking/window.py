@@ -1,7 +1,7 @@
 """Where frames are gated and moves are found: the live epochs as an iSAM2 problem.
 
 It takes all matches for independent (Eq. 5 of the paper), so that each frame is one step. What is
-reported is the optimum of the error model, see ``calibgraph.tracking.joint_estimate``; with a
+reported is the optimum of the error model, see ``calibgraph.tracking.closed_places``; with a
 preset of the paper it is the optimum of this graph.
 
 A camera with a random walk has a variable per epoch:
@@ -134,13 +134,12 @@ class Window:
         """The summaries of older epochs as factors on the first live one."""
         graph = gtsam.NonlinearFactorGraph()
         for camera, camera_state in enumerate(state.cameras):
-            summary = camera_state.summary
-            hessian, gradient = summary.hessian[summary.walk], summary.gradient[summary.walk]
-            if hessian.any():
+            sums = camera_state.summary.selected
+            if sums.hessian.any():
                 key = self._key(0, camera)
                 reference = gtsam.Values()
                 reference.insert(key, state.references[camera])
-                factor = gtsam.HessianFactor(key, hessian, -gradient, 0.0)
+                factor = gtsam.HessianFactor(key, sums.hessian, -sums.gradient, 0.0)
                 graph.add(gtsam.LinearContainerFactor(factor, reference))
         return graph
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
+from calibgraph.tracking.sums import Sums
 
 Array = np.ndarray
 
@@ -13,19 +16,24 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     """H'^-1 B' H'^-1 = H^-1 B H^-1 + Q, whatever the gain."""
     rng = np.random.default_rng(0)
     A, C = rng.standard_normal((2, 6, 6))
-    memory = EpochSummary.empty().add(A @ A.T + np.eye(6), rng.standard_normal(6), C @ C.T, 10)
+    epoch = replace(
+        Sums.zeros(),
+        hessian=A @ A.T + np.eye(6),
+        gradient=rng.standard_normal(6),
+        scatter=C @ C.T,
+        frames=np.array(10.0),
+    )
+    memory = EpochSummary.empty().add(epoch, Sums.zeros())
     variance = np.linspace(0.1, 0.6, 6)
-    after, gain = memory.propagate(variance, inflation=3.0)
+    after = memory.propagate(variance, overconfidence=3.0)
     for walk, strength in enumerate(STRENGTHS):
         expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
         np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)
-    np.testing.assert_array_equal(gain, np.eye(6))  # it stands still
-    np.testing.assert_allclose(
-        np.linalg.solve(after.hessian, after.gradient[..., None]),
-        np.linalg.solve(memory.hessian, memory.gradient[..., None]),
-    )
+    np.testing.assert_array_equal(after.walks.hessian[0], memory.walks.hessian[0])  # it stands
+    np.testing.assert_array_equal(after.halves.hessian, memory.halves.hessian)
+    for walk in range(len(STRENGTHS)):
+        np.testing.assert_allclose(after.walks.step(walk), memory.walks.step(walk))
 
 
 def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
-    inverse = np.linalg.inv(memory.hessian[walk])
-    return np.asarray(inverse @ memory.scatter[walk] @ inverse)
+    return memory.walks.covariance(walk)

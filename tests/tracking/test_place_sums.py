@@ -2,84 +2,97 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calibgraph.tracking.place_sums import MOST_PLACES, PlacePart, PlaceSums
+from calibgraph.tracking.place_sums import MOST_PLACES, PlaceSums
+from calibgraph.tracking.sums import Sums
 
 Array = np.ndarray
 
 
-def part(name: str, seed: int, frames: int = 3) -> PlacePart:
-    """Of two cameras."""
+def part(name: str, seed: int, frames: int = 3) -> dict[str, Sums]:
+    """Sums of two cameras at a place."""
     rng = np.random.default_rng(seed)
     roots, scores = rng.standard_normal((2, 6, 6)), rng.standard_normal((frames, 2, 6))
     hessian = roots @ roots.swapaxes(1, 2)
-    return PlacePart(
-        name,
-        hessian,
-        rng.standard_normal((2, 6)),
-        hessian,
-        scores.sum(axis=0),
-        np.einsum("fni,fnj->nij", scores, scores),
-        np.full(2, float(frames)),
-        np.full(2, 100.0 * frames),
-    )
+    return {
+        name: Sums(
+            hessian,
+            rng.standard_normal((2, 6)),
+            hessian,
+            scores.sum(axis=0),
+            np.einsum("fni,fnj->nij", scores, scores),
+            np.full(2, float(frames)),
+            np.full(2, 100.0 * frames),
+        )
+    }
+
+
+def sums_of(*parts: dict[str, Sums]) -> PlaceSums:
+    found = PlaceSums.empty(2)
+    for one in parts:
+        found = found.add(one)
+    return found
 
 
 def test_whoever_comes_back_adds_to_the_same_place() -> None:
-    sums = PlaceSums.empty(2).add([part("a", 0), part("b", 1), part("a", 2)])
+    sums = sums_of(part("a", 0), part("b", 1), part("a", 2))
     assert sums.names[1:] == ("b", "a")
-    np.testing.assert_allclose(sums.hessian[2], part("a", 0).hessian + part("a", 2).hessian)
+    both = part("a", 0)["a"] + part("a", 2)["a"]
+    np.testing.assert_allclose(sums.rows.hessian[2], both.hessian)
     np.testing.assert_array_equal(sums.frames[1:], [[3, 3], [6, 6]])
-    assert not sums.is_of_one_place and PlaceSums.empty(2).add([part("a", 0)]).is_of_one_place
+    assert not sums.is_of_one_place and sums_of(part("a", 0)).is_of_one_place
 
 
 def test_older_places_are_one_row_that_counts_as_many() -> None:
     """Nothing is lost of the sums, and nothing of the scatter about the places' means."""
     names = [str(number) for number in range(MOST_PLACES + 5)]
-    whole = PlaceSums.empty(2).add(part(name, int(name)) for name in names)
+    whole = sums_of(*(part(name, int(name)) for name in names))
     bounded = whole.bounded()
     assert bounded.names[1:] == tuple(names[5:])
     np.testing.assert_allclose(bounded.places[0], 5.0)
-    np.testing.assert_allclose(bounded.hessian.sum(axis=0), whole.hessian.sum(axis=0))
-    for found, expected in zip(bounded.of_all, whole.of_all, strict=True):
+    np.testing.assert_allclose(bounded.rows.total().hessian, whole.rows.total().hessian)
+    for found, expected in zip(bounded.within_places, whole.within_places, strict=True):
         np.testing.assert_allclose(found, expected)
 
 
 def test_older_places_count_by_their_frames() -> None:
     """Of 12 frames at one place and 3 at another, the mean has the error of 15^2 / (12^2 + 3^2)."""
-    sums = PlaceSums.empty(2).add([part("a", 0, frames=12), part("b", 1)]).bounded(most=0)
+    sums = sums_of(part("a", 0, frames=12), part("b", 1)).bounded(most=0)
     np.testing.assert_allclose(sums.places[0], 15**2 / (12**2 + 3**2))
 
 
 def test_a_reference_that_moves_moves_the_gradient() -> None:
-    sums, steps = PlaceSums.empty(2).add([part("a", 0)]), np.arange(12.0).reshape(2, 6)
+    sums, steps = sums_of(part("a", 0)), np.arange(12.0).reshape(2, 6)
     moved = sums.shift_reference(steps)
     for camera in range(2):
-        before, after = (np.linalg.solve(one.hessian[1, camera], one.gradient[1, camera])
-                         for one in (sums, moved))  # fmt: skip
-        np.testing.assert_allclose(after - before, steps[camera], atol=1e-9)
+        before, after = (one.rows[1].step(camera) for one in (sums, moved))
+        assert before is not None and after is not None
+        np.testing.assert_allclose(before - after, steps[camera], atol=1e-9)
 
 
 def test_a_camera_restarts_without_the_others() -> None:
-    sums = PlaceSums.empty(2).add([part("a", 0), part("b", 1)]).bounded(most=1)
+    sums = sums_of(part("a", 0), part("b", 1)).bounded(most=1)
     left = sums.without(0)
-    assert not left.frames[:, 0].any() and not left.scatter[0].any() and not left.means[0]
-    np.testing.assert_array_equal(left.hessian[:, 1], sums.hessian[:, 1])
-    np.testing.assert_array_equal(left.scatter[1], sums.scatter[1])
+    assert not left.frames[:, 0].any() and not left.rows.scatter[:, 0].any() and not left.means[0]
+    np.testing.assert_array_equal(left.rows.hessian[:, 1], sums.rows.hessian[:, 1])
+    np.testing.assert_array_equal(left.rows.scatter[:, 1], sums.rows.scatter[:, 1])
 
 
 @pytest.mark.parametrize("name", ["b", "c"])
 def test_what_a_drift_leaves_is_of_one_place(name: str) -> None:
     """The drift discounts the sums, of which none are kept place by place."""
-    sums = PlaceSums.empty(2).add([part("a", 0), part("b", 1)])
-    held = 2 * np.eye(6), np.ones(6), 3 * np.eye(6), 7.5
-    found = sums.with_camera_at(name, 1, held, matches=50.0)
+    sums = sums_of(part("a", 0), part("b", 1))
+    none, scatter = Sums.zeros(), 3 * np.eye(6)
+    held = replace(none, hessian=2 * np.eye(6), scatter=scatter, frames=np.array(7.5))
+    found = sums.with_camera_at(name, 1, held)
     row = found.names.index(name)
     np.testing.assert_array_equal(
         found.frames[:, 1], [7.5 * (n == row) for n in range(len(found.names))]
     )
-    np.testing.assert_array_equal(found.hessian[row, 1], held[0])
-    np.testing.assert_array_equal(found.matches[row, 1], 375.0)
-    np.testing.assert_array_equal(found.hessian[1, 0], sums.hessian[1, 0])
+    np.testing.assert_array_equal(found.rows.hessian[row, 1], held.hessian)
+    np.testing.assert_allclose(found.within_places[0][1], scatter)
+    np.testing.assert_array_equal(found.rows.hessian[1, 0], sums.rows.hessian[1, 0])

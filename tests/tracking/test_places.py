@@ -32,16 +32,14 @@ from calibgraph.simulation.place_draws import Drawn, draw_places, tied
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.scan_distortion import distortions_at
+from calibgraph.solver.scan_distortion import DistortionEvidence, distortions_at
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
-from calibgraph.tracking.bends import BendSums
+from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.frame_order import PLACE, with_place
-from calibgraph.tracking.joint_estimate import ClosedPlaces
-from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
+from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model, quadratics_of
 from calibgraph.tracking.place_shift import shift_covariance
-from calibgraph.tracking.place_sums import PlaceSums, parts_of
-from calibgraph.tracking.posterior import steps_of
+from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.tracking.window import pose_priors
@@ -192,14 +190,16 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     rig = pair_of()
     tracker = IncrementalCalibrator(rig, Config(of="mount"))
     tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
-    sums = PlaceSums.empty(2).add([replace(part("a", 0), gradient=np.zeros((2, 6)))])
+    sums = PlaceSums.empty(2).add({"a": replace(part("a", 0)["a"], gradient=np.zeros((2, 6)))})
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(spread, np.ones(2))
     shifts = 0.1 * np.random.default_rng(0).normal(size=(2, 6, 3))
-    bends = replace(BendSums.empty(2), hessian=np.tile(np.eye(6), (2, 1, 1)))
-    bends = replace(bends, pull=(bends.hessian + WEAK) @ shifts)
-    state = replace(tracker._state, bends=bends)
-    model = place_model(state, sums, seen, PlaceData.of(state, sums, (), {"a": 1}))
+    none = DistortionEvidence.none(WEAK, places=1)
+    distortion = tuple(replace(none, jacobian=shift, hessian=1e6 * np.eye(6)) for shift in shifts)
+    state = replace(tracker._state, distortion=distortion)
+    model = place_model(
+        state, sums, seen, PlaceData.of(state, quadratics_of(state, sums), (), {"a": 1})
+    )
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
     assert found is not None
     parts, A = model.components, [*map(adjoint_camera_lidar, tracker._state.references)]
@@ -208,7 +208,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     expected += flat @ (parts.cloud + parts.cloud_at_place[0]) @ flat.T
     for camera in range(2):
         rows = slice(6 * camera, 6 * camera + 6)
-        own = np.linalg.inv(sums.reweighted[1, camera] + np.diag([1.0] * 3 + [0.01] * 3))
+        own = np.linalg.inv(sums.rows.reweighted[1, camera] + np.diag([1.0] * 3 + [0.01] * 3))
         expected[rows, rows] += (spread[camera, 0, 0] + 8.0 * 3) * own
     units = np.sqrt(np.diag(expected))
     units = np.outer(units, units)  # the least excess is a thousandth
@@ -266,11 +266,10 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     Within 0.02 sigma: their losses have the weights of the optimum at the end of the last epoch.
     """
     tracker, update = tracked_at_three_places(24)
-    state, closed, joint = tracker._state, tracker._closed_places, tracker._assess()
-    places = closed.sums.add(parts_of(state.epochs[-1].frames, steps_of(state)))
-    data = PlaceData.of(
-        state, state.places, state.live_frames, {places.names[row]: row for row in (1, 2, 3)}
-    )
+    state, closed, joint = tracker._state, tracker._closed, tracker._assess()
+    places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
+    rows = {places.names[row]: row for row in (1, 2, 3)}
+    data = PlaceData.of(state, quadratics_of(state, state.places), state.live_frames, rows)
     model = place_model(state, places, FrameSpread.of(state, places), data)
     model = replace(model, pose_graph=pose_priors(state))
     whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
@@ -290,6 +289,20 @@ def test_places_on_both_sides_of_a_time_cancel() -> None:
     apart, half = of(here, there), of(here + 2 * there, there)
     assert (np.diag(apart) > 0).all()
     np.testing.assert_allclose(half, apart / 4, rtol=1e-9)
+
+
+def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:
+    """Its error bar stays that of the places where it saw something."""
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(drive(pair_of(), 40)):
+        seen = states(table if frame < 25 else table.of_camera("left"))
+        update = tracker.update(seen, place=str(frame // 6))
+        sigmas = {name: np.sqrt(np.diag(own)) for name, own in update.covariance.items()
+                  if own is not None}  # fmt: skip
+        if frame == 24:
+            before = sigmas
+    np.testing.assert_allclose(sigmas["right"], before["right"], rtol=0.2)
+    assert (sigmas["left"][:3] < before["left"][:3]).all()
 
 
 # Where the place of a frame comes from
@@ -344,19 +357,22 @@ def test_the_journal_keeps_the_name_of_the_place_and_no_lists() -> None:
     assert with_place(listed, None).metadata == {PLACE: "0", "of": "someone"}
 
 
-def test_places_are_there_after_a_restart(tmp_path: Path) -> None:
-    tables = [states(table) for table in drive(pair_of(), 24)]
-    folder = tmp_path / "state"
-    whole = IncrementalCalibrator(pair_of())
-    with DurableCalibrator(folder, pair_of()) as calibrator:
-        for frame, table in enumerate(tables[:17]):
+@pytest.mark.parametrize("cut", [41, 63, 69, 70])
+def test_places_are_there_after_a_restart(tmp_path: Path, cut: int) -> None:
+    """With summaries of places, within the steps that an epoch's end leaves, and between them."""
+    tables = [states(table) for table in drive(pair_of(), 82)]
+    folder, config = tmp_path / "state", Config().changed(tracking={"live_epochs": 1})
+    whole = IncrementalCalibrator(pair_of(), config)
+    with DurableCalibrator(folder, pair_of(), config) as calibrator:
+        for frame, table in enumerate(tables[:cut]):
             calibrator.update(table, place=frame // 4 % 3)
-    with DurableCalibrator(folder, pair_of()) as calibrator:
-        assert calibrator.tracker.place == "1"
-        assert calibrator.tracker.places == ("2", "0", "1")
+    with DurableCalibrator(folder, pair_of(), config) as calibrator:
+        last = (cut - 1) // 4
+        assert calibrator.tracker.place == str(last % 3)
+        assert calibrator.tracker.places == tuple(str(n % 3) for n in range(last - 2, last + 1))
         for frame, table in enumerate(tables):
             expected = whole.update(table, place=frame // 4 % 3)
-            if frame >= 17:
+            if frame >= cut:
                 found = calibrator.update(table, place=frame // 4 % 3)
     for name, T in expected.T_camera_lidar.items():
         np.testing.assert_array_equal(found.T_camera_lidar[name], T)
@@ -438,7 +454,7 @@ def test_a_camera_that_sees_all_round_shows_the_motion_as_in_a_batch() -> None:
         tracker.update(one)
         mounted.update(one)
         unstated.update(replace(one, metadata=places))
-    value, covariance = ClosedPlaces.of(tracker._state).fit.distortion
+    value, covariance = ClosedPlaces.of(tracker._state).fitted(tracker._state).fit.distortion
     np.testing.assert_allclose(0.15 * covariance[2, 2] ** 0.5, sigma_m, rtol=0.1)
     assert abs(0.15 * value[2] - motion_m) < 0.1 * sigma_m
     (truth,) = rig.T_camera_lidar.values()

@@ -56,7 +56,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
         (data[:head], "is damaged: its checksum is wrong"),
         (b"", "is not a calibgraph-tracker-file/1 file"),
         (b"calibgraph-tracker-file/2\n" + data[head:], "is not a calibgraph-tracker-file/1 file"),
-        (b"calibgraph-tracker/1\n" + data[head:], "the earlier format calibgraph-tracker/1"),
+        (b"calibgraph-tracker/1\n" + data[head:], "is not a calibgraph-tracker-file/1 file"),
         (b"SQLite format 3\0" + bytes(100), "is not a calibgraph-tracker-file/1 file"),
     ):
         path.write_bytes(wrong)
@@ -88,10 +88,10 @@ def compressed() -> bytes:
         (b"", "is not a tracker's state"),
         (b"other", "is not a tracker's state"),
         (archive(json=np.array([object()])), "is not a tracker's state .*pickle"),
-        (archive(json=text({"format": "calibgraph-tracker-state/7"})), "is of format .*state/7"),
+        (archive(json=text({"format": "calibgraph-tracker-state/8"})), "is of format .*state/8"),
         (
-            archive(json=text({"format": "calibgraph-tracker-state/4"})),
-            "is of format .*state/4', expected .*state/6",
+            archive(json=text({"format": "calibgraph-tracker-state/6"})),
+            "is of format .*state/6', expected .*state/7",
         ),
         (archive(json=text([])), "is not a tracker's state"),
         (archive(other=text([])), "is not a tracker's state"),
@@ -102,27 +102,6 @@ def test_bytes_that_are_no_state_are_refused(data: bytes, match: str) -> None:
     with pytest.raises(StateError, match=match) as error:
         decode(data)
     assert "\n" not in str(error.value)
-
-
-def test_a_state_without_an_optimum_is_read_as_before(pair: Rig) -> None:
-    """One of format 5: the same but for the optimum, and the sums of all matches."""
-    tables = drive(lambda frame: pair, 24)
-    tracker, _ = tracked(pair, tables[:20])
-    data = tracker.to_bytes()
-    with np.load(io.BytesIO(data)) as members:
-        described = json.loads(members["json"].tobytes())
-        arrays = {name: members[name] for name in members if name != "json"}
-    without = json.loads(json.dumps(described), object_pairs_hook=_of_format_5)
-    resumed = IncrementalCalibrator.from_bytes(archive(json=text(without), **arrays))
-    found, expected = resumed.update(tables[20]), tracker.update(tables[20])
-    for name, T in expected.T_camera_lidar.items():
-        np.testing.assert_allclose(found.T_camera_lidar[name], T, atol=1e-5)  # rad and m
-
-
-def _of_format_5(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    new = "optimum", "ungated_hessian", "ungated_gradient"
-    kept = {key: value for key, value in pairs if key not in new}
-    return kept | {"format": "calibgraph-tracker-state/5"} if "tree" in kept else kept
 
 
 def test_a_class_that_is_not_listed_is_neither_written_nor_read(pair: Rig) -> None:

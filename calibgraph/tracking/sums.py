@@ -1,0 +1,142 @@
+"""Sums over frames: the one statistic that is left of matches, of epochs, places and halves alike.
+
+Near a reference T_lidar_camera, half the cost of a block of correspondences is
+``d^T H d / 2 + b^T d + c`` for the tangent step d from the reference. Such sums add: thousands of
+frames are one (H, b). H is the true Hessian of the robust cost: with it the step to the minimum is
+exact to second order, while with the reweighted Hessian it is 20 to 40 percent too short. The
+scatter ``B = sum g g^T`` of the frames' gradients is summed too: ``H^-1 B H^-1`` is the covariance.
+
+If the extrinsic may have walked by a covariance Q since, then
+
+    H' = (H^-1 + Q / k)^-1 = G H,   b' = G b,   B' = G B G^T + H' Q H'
+
+so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
+``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import smallest_scaled_eigenvalue
+
+Array = NDArray[np.float64]
+
+_SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
+_LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
+
+    Attributes:
+        hessian: (..., 6, 6) true Hessian of the robust cost, in the tangent of T_lidar_camera.
+        gradient: (..., 6) at the reference, which ``State`` holds.
+        reweighted: (..., 6, 6) Hessian by the matches' weights in the loss: it is positive
+            semidefinite, of however few.
+        score: (..., 6) sum of the frames' gradients, each at the estimate of its time.
+        scatter: (..., 6, 6) sum of the outer products of the same.
+        frames, matches: (...) how many.
+    """
+
+    hessian: Array
+    gradient: Array
+    reweighted: Array
+    score: Array
+    scatter: Array
+    frames: Array
+    matches: Array
+
+    @staticmethod
+    def zeros(*shape: int) -> Sums:
+        """Over no frames, with these leading axes."""
+        return Sums(*(np.zeros((*shape, *own)) for own in _SHAPES))
+
+    @staticmethod
+    def stack(parts: Sequence[Sums]) -> Sums:
+        """The sums along a new first axis."""
+        return Sums(*map(np.array, zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def copy(self) -> Sums:
+        """The same, to be filled in."""
+        return Sums(*map(np.copy, vars(self).values()))
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(*map(np.add, vars(self).values(), vars(other).values()))
+
+    def __mul__(self, weight: Array) -> Sums:
+        """All of them times (...) weights."""
+        return Sums(
+            *(
+                values * np.reshape(weight, (*np.shape(weight), *[1] * len(own)))
+                for values, own in zip(vars(self).values(), _SHAPES, strict=True)
+            )
+        )
+
+    def __getitem__(self, index: Any) -> Sums:
+        """A part of the leading axes."""
+        return Sums(*(values[index] for values in vars(self).values()))
+
+    def replace_at(self, index: Any, item: Sums) -> Sums:
+        """The sums with a part of the leading axes replaced."""
+        found = self.copy()
+        for values, new in zip(vars(found).values(), vars(item).values(), strict=True):
+            values[index] = new
+        return found
+
+    def total(self) -> Sums:
+        """The sum over the first axis."""
+        return Sums(*(values.sum(axis=0) for values in vars(self).values()))
+
+    def shift_reference(self, steps: Array) -> Sums:
+        """The sums about references that are moved by (..., 6) tangent steps."""
+        moved = (self.hessian @ steps[..., None])[..., 0]
+        return replace(self, gradient=self.gradient + moved)
+
+    def after_walk(self, variance: Array, overconfidence: Array | float) -> tuple[Sums, Array]:
+        """The sums after a random walk, and (...) which share of them is left.
+
+        Args:
+            variance: (..., 6) of the walk.
+            overconfidence: (...) k of the module's description.
+        """
+        by = variance / np.asarray(overconfidence)[..., None]
+        gain = np.linalg.inv(np.eye(6) + self.hessian * by[..., None, :])
+        hessian, back = gain @ self.hessian, gain.swapaxes(-1, -2)
+        hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
+        kept = np.trace(gain, axis1=-2, axis2=-1) / 6
+        walked = replace(
+            self * kept,
+            hessian=hessian,
+            gradient=(gain @ self.gradient[..., None])[..., 0],
+            scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
+        )
+        return walked, kept
+
+    def step(self, camera: int) -> Array | None:
+        """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""
+        if not is_determined(self.hessian[camera]):
+            return None
+        return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
+
+    def covariance(self, camera: int) -> Array:
+        """(6, 6) of that minimum, by the scatter of the frames."""
+        inverse = np.linalg.inv(self.hessian[camera])
+        return np.asarray(inverse @ self.scatter[camera] @ inverse)
+
+
+def is_determined(hessian: Array) -> bool:
+    """Whether all six directions are determined."""
+    return smallest_scaled_eigenvalue(hessian) > _LEAST_EIGENVALUE
+
+
+def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
+    """(6,) tangent step from one T_lidar_camera to another."""
+    return np.asarray(one.localCoordinates(two))
