@@ -44,7 +44,7 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
         values, vectors = np.linalg.eigh(scaled)
         known = values > _LEAST * max(values[-1], 0.0)
         roots = np.sqrt(np.where(known, values, 1.0))
-        root = vectors * np.where(known, roots, 0.0)
+        root = np.asarray(vectors * np.where(known, roots, 0.0), dtype=np.float64)
         error = np.where(known, vectors.T @ along / roots, 0.0)
     rest = math.sqrt(max(float(sums.cost) - float(error @ error), 0.0))
     jacobian = np.vstack([root.T * units, np.zeros(len(units))])

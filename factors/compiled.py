@@ -26,6 +26,7 @@ import platformdirs
 
 _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long is removed
 _log = logging.getLogger(__name__)
+_config: Any = numba.config  # its attributes are made when numba is imported
 
 _all_cores = Lock()
 os.register_at_fork(  # no child is made while another thread holds it
@@ -45,14 +46,14 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        folder, before = _folder(Path(function.__code__.co_filename).parent), numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = str(folder)  # numba reads it where it decorates
+        folder, before = _folder(Path(function.__code__.co_filename).parent), _config.CACHE_DIR
+        _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
         try:
             return numba.njit(nogil=True, error_model="numpy", cache=folder is not None, **options)(
                 function
             )
         finally:
-            numba.config.CACHE_DIR = before
+            _config.CACHE_DIR = before
 
     return decorate
 
@@ -76,7 +77,7 @@ def _folder(source: Path) -> Path | None:
     digest = hashlib.sha256()
     for file in sorted({*source.glob("*.py"), *Path(__file__).parent.glob("*.py")}):
         digest.update(file.read_bytes())
-    name, chosen = f"{source.name}-{digest.hexdigest()[:16]}", numba.config.CACHE_DIR
+    name, chosen = f"{source.name}-{digest.hexdigest()[:16]}", _config.CACHE_DIR
     user, beside = platformdirs.user_cache_path("calibgraph"), Path(__file__).parent / "__pycache__"
     reasons = []
     for place in [Path(chosen)] if chosen else [user, beside]:

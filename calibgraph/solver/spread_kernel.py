@@ -79,7 +79,7 @@ def _spreads(*, shared: bool) -> Any:
 
 @compiled()
 def _spread(values, raw, start, cut, rounds):  # type: ignore[no-untyped-def]
-    bits = np.int64(0)
+    bits: Any = np.int64(0)
     for least, some in _BITS:
         if len(values) >= least:
             bits = max(bits, some)
