@@ -60,7 +60,8 @@ docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 web: ## Build the page of `calibgraph pick` (needs node and a network; its bundle is committed)
 	cd web/pick && npm ci && npm run check && npm run build
 
-bench: $(VENV)/test ## Measure a calibration, and the solve, updates and network against other ways
+bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
+	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
 	$(BIN)/python -m benchmarks.speed.stages data/sample
 	$(BIN)/python -m benchmarks.speed.kernel
 	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2

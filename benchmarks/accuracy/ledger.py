@@ -168,6 +168,7 @@ def _camera(result: Calibration, name: str, truth: Rig, error: Any) -> Record:
         "sigma_deg": None if sigmas is None else sigmas[0].tolist(),
         "sigma_cm": None if sigmas is None else sigmas[1].tolist(),
         "normalised_squared": squared,
+        "beyond": verdict.error_probability and verdict.error_probability.by_error_bar,
         "checks": [
             [c.kind or c.name, c.status, _number(c.value), c.severity, c.decisive]
             for c in verdict.checks

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
 
 STREET = "street"
+SURROUNDINGS = STREET, "meadow", "motorway", "tunnel", "deck", "quay"
 RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of the street
 _STREET = "Scenario street"
 
@@ -89,6 +90,15 @@ def simulate(
             rich_help_panel=_STREET,
         ),
     ] = False,
+    surroundings: Annotated[
+        str | None,
+        typer.Option(
+            metavar="|".join(SURROUNDINGS),
+            help="What the road leads through; beside a street little is there to calibrate by. "
+            f"(default: {STREET})",
+            rich_help_panel=_STREET,
+        ),
+    ] = None,
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.simulation.recording import simulate_street
@@ -108,13 +118,14 @@ def simulate(
                 sensor_errors=0.0 if sensor_errors is None else sensor_errors,
                 lens_errors=0.0 if lens_errors is None else lens_errors,
                 vary_layout=vary_layout,
+                surroundings=STREET if surroundings is None else surroundings,
                 progress=progress,
             )
         else:
             of_street = {
                 "--rig": rig, "--beams": beams, "--step-m": step_m,
                 "--sensor-errors": sensor_errors, "--lens-errors": lens_errors,
-                "--vary-layout": vary_layout or None,
+                "--vary-layout": vary_layout or None, "--surroundings": surroundings,
             }  # fmt: skip
             _refuse_options_of_street(scenario, of_street)
             written = simulate_table(

@@ -39,9 +39,9 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     )
     console.print(error_bar_table(result))
     console.print(
-        "one standard deviation: scatter between frames, and the error that the matcher reports as "
-        f"common to its frames; {result.not_included}; A->B: of the transform from A to B, in B's "
-        "axes"
+        f"one standard deviation of the {config.of}: scatter between frames, and the error that "
+        f"the matcher reports as common to its frames; {result.not_included}; A->B: of the "
+        "transform from A to B, in B's axes"
     )
     time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
     console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)

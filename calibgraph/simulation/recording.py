@@ -29,10 +29,10 @@ from calibgraph.simulation.street import (
     LANE_Y_M,
     Centreline,
     Layout,
-    build_street,
     draw_layout,
     winding_line,
 )
+from calibgraph.simulation.surroundings import SURROUNDINGS
 from calibgraph.simulation.world import World, build_world
 
 Array = NDArray[np.float64]
@@ -75,6 +75,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     sensor_errors: float | ScanErrors = 0.0,
     lens_errors: float = 0.0,
     vary_layout: bool = False,
+    surroundings: str = "street",
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate a drive along a procedural street and write it as a dataset.
@@ -99,6 +100,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
             calibration with a target leaves; the truth is then what goes best with these lenses.
         vary_layout: draw the street's width, curves, gardens, heights and objects by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
+        surroundings: street, meadow, motorway, tunnel, deck or quay.
         progress: called with the stage, its steps done, and their number.
 
     Returns:
@@ -118,7 +120,9 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
-    drive = build_drive(frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout)
+    drive = build_drive(
+        frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout, surroundings=surroundings
+    )
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
         made = Path(folder)
@@ -146,14 +150,22 @@ def _size(of: str, wanted: float) -> float:
 
 
 def build_drive(
-    *, frames: int, step_m: float = 4.0, seed: int = 0, vary_layout: bool = False
+    *,
+    frames: int,
+    step_m: float = 4.0,
+    seed: int = 0,
+    vary_layout: bool = False,
+    surroundings: str = "street",
 ) -> Drive:
     """Build a street and drive along it; see :func:`simulate_street`."""
+    build = SURROUNDINGS.get(surroundings)
+    if build is None:
+        raise ValueError(f"surroundings {surroundings!r}: known are {', '.join(SURROUNDINGS)}")
     rng = np.random.default_rng([seed, _WORLD])
     length_m = (frames - 1) * step_m * (1 + _SWAY_STEP)
     drawn = draw_layout(np.random.default_rng([seed, _LAYOUT])) if vary_layout else Layout()
     line = winding_line(length_m, drawn, rng)
-    world = build_world(build_street(line, length_m, rng), _draw_sun(rng), rng)
+    world = build_world(build(line, length_m, rng), _draw_sun(rng), rng)
     return Drive(world, _draw_stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
 
 

@@ -60,7 +60,7 @@ _WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wave
 _STEP_M = 1.0
 _BALCONIES, _GABLE = 0.4, 0.6
 _CLEAR_M = 14.0
-_KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
+KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +158,7 @@ def winding_line(length_m: float, layout: Layout, rng: Rng) -> Centreline:
 
 def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     """Compose a street along a line; the lane at ``LANE_Y_M`` is free from 0 to ``length_m``."""
-    solids = [*_cars(line, length_m, rng), *_backdrop(line, rng)]
+    solids = [*draw_cars(line, length_m, rng), *_backdrop(line, rng)]
     for side in (1, -1):
         solids += [*_houses(line, side, rng), *_roadside(line, side, rng)]
     return join_meshes([*_ground(line), *map(mesh_of_solid, solids)])
@@ -190,7 +190,7 @@ def _band(
     return ribbon(line.with_left, marks_m, edges_m, albedo=albedo, paint=paint)
 
 
-def _place(
+def place_along(
     line: Centreline, parts: Iterable[Solid], s_m: float, y_m: float, *, yaw_deg: float,
     body: Albedo,
 ) -> list[Solid]:  # fmt: skip
@@ -199,11 +199,12 @@ def _place(
     return place(parts, xy, yaw_deg=heading_deg + yaw_deg, body=body)
 
 
-def _draw_colour(rng: Rng) -> Albedo:
+def draw_colour(rng: Rng) -> Albedo:
+    """The colour of a car or a house."""
     return COLOURS[rng.integers(len(COLOURS))]
 
 
-def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
+def draw_cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
     """Cars ahead, behind, oncoming, and parked on both sides."""
     first, last = line.along_m[[0, -1]]
     places = [(length_m + _CLEAR_M + 6, LANE_Y_M, 0.0), (-_CLEAR_M, LANE_Y_M, 0.0)]
@@ -215,9 +216,9 @@ def _cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
             if rng.random() < line.layout.parked:
                 places.append((s + 3 + rng.normal(0, 0.3), side * 4.75, 0.0))
     for s, y, yaw_deg in places:
-        kind = _KINDS[rng.choice(len(_KINDS), p=_KIND_SHARES)]
+        kind = KINDS[rng.choice(len(KINDS), p=_KIND_SHARES)]
         turned = yaw_deg + rng.normal(0, 2) + 180 * rng.integers(2)
-        yield from _place(line, kind, s, y, yaw_deg=turned, body=_draw_colour(rng))
+        yield from place_along(line, kind, s, y, yaw_deg=turned, body=draw_colour(rng))
 
 
 def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
@@ -229,12 +230,16 @@ def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
         front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * BAY_M / 2
         front += setback_m / layout.width
         if rng.random() < layout.gap:
-            yield from _place(line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK)
-            yield from _place(line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK)
+            yield from place_along(
+                line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK
+            )
+            yield from place_along(
+                line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK
+            )
             s += 11
             continue
-        parts, body = list(_house(bays, storeys, rng)), _draw_colour(rng)
-        yield from _place(line, parts, middle, side * front, yaw_deg=turned, body=body)
+        parts, body = list(_house(bays, storeys, rng)), draw_colour(rng)
+        yield from place_along(line, parts, middle, side * front, yaw_deg=turned, body=body)
         s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < layout.gap else 0)
 
 
@@ -268,13 +273,13 @@ def _roadside(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
     turned = 0.0 if side > 0 else 180.0
     stretch_m = STRETCH_M * line.layout.spacing
     for s in np.arange(line.along_m[0], line.along_m[-1], stretch_m) + rng.uniform(-1, 1):
-        colour, body = _draw_colour(rng), _draw_colour(rng)
-        yield from _place(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
+        colour, body = draw_colour(rng), draw_colour(rng)
+        yield from place_along(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
         person, person_y = s + rng.uniform(-5, 5), side * (KERB_Y_M + rng.uniform(1.2, 2.8))
-        yield from _place(line, PERSON, person, person_y, yaw_deg=0, body=body)
+        yield from place_along(line, PERSON, person, person_y, yaw_deg=0, body=body)
         if rng.random() < line.layout.tree:
             yaw, tree_y = rng.uniform(0, 360), side * (_PAVEMENT_Y_M - 0.5)
-            yield from _place(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
+            yield from place_along(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
 
 
 def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
@@ -284,11 +289,11 @@ def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
         while x < line.xy_m[-1, 0] + 40:
             bays, storeys = int(rng.integers(4, 8)), int(rng.integers(3, 7))
             xy = x + bays * BAY_M / 2, side * (48 + rng.uniform(-4, 4))
-            body = _draw_colour(rng)
+            body = draw_colour(rng)
             yield from place(_block(bays, 4, storeys), xy, yaw_deg=rng.normal(0, 4), body=body)
             x += bays * BAY_M + rng.uniform(0, 8)
     for s in line.along_m[[0, -1]]:
-        yield from _place(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=_draw_colour(rng))
+        yield from place_along(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=draw_colour(rng))
 
 
 def _block(bays_along: int, bays_across: int, storeys: int) -> list[Solid]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Residuals
+from calibgraph.model.error_components import error_components
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import (
@@ -136,10 +137,18 @@ class Evidence:
 
     @property
     def _relative_poses(self) -> Iterator[tuple[str, str, Array]]:
-        """Those that are known without the cloud, with (6, 6) covariances."""
+        """Those that are known without the cloud, with (6, 6) covariances.
+
+        A measured one that contradicts the correspondences ties nothing.
+        """
+        limit = error_components().contradiction_sigmas
+        conflicts = self.solution.marginals.conflicts
+        wrong = {(one.pair.a, one.pair.b) for one in conflicts if one.largest > limit}
         for fit in self.solution.marginals.pair_fits:
             yield fit.a, fit.b, fit.covariance
         for pose in self.solution.inliers.rig.relative_poses:
+            if (pose.a, pose.b) in wrong:
+                continue
             sigmas = pose_sigmas(
                 rotation_rad=pose.rotation_sigma_rad, translation_m=pose.translation_sigma_m
             )

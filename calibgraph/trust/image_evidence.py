@@ -91,7 +91,7 @@ def measure_image_evidence(
 
 def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageEvidence:
     scores = scorer.score_together(scorer.load_images(name, camera), camera, WIDE)
-    groups = len(scores.counts)
+    groups = len(scores.weights)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
     return ImageEvidence(groups, **_compare_with_displaced(scores))
@@ -102,7 +102,7 @@ def _measure_camera(
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
     scores = scorer.score_together(images, camera, WIDE)
-    groups = len(scores.counts)
+    groups = len(scores.weights)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
     lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
@@ -150,6 +150,6 @@ def _compare_with_neighbours(scorer: FrameScorer, images: Images, camera: Camera
 
 def _agreement(scores: ShiftScores | None) -> float:
     """The z-score at the result; NaN if there is nothing to score."""
-    if scores is None or not len(scores.counts):
+    if scores is None or not len(scores.weights):
         return math.nan
     return z_score(scores, np.zeros(6))

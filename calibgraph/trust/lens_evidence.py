@@ -160,7 +160,7 @@ def _fit_at_peaks(
     camera: Camera, scores: ShiftScores, start: Array, places: Places
 ) -> AugmentedFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
-    if not len(scores.counts):
+    if not len(scores.weights):
         return None
     lens = len(start) - 6
     extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))

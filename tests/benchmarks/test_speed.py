@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.speed import calibrate, ceres, kernel, paired
+from benchmarks.speed import calibrate, ceres, gate, kernel, paired
 from benchmarks.speed.solvers import Problem, solve_ours
 from benchmarks.speed.stages import STAGES, StageSampler
 from benchmarks.speed.streets import link_dataset, street_rig
@@ -181,3 +181,13 @@ def test_ceres_finds_the_same_minimum_in_both_passes(tmp_path: Path) -> None:
     # it stops at relative changes of 1e-8 of the cost
     assert problem.cost(run.passes.first) == pytest.approx(problem.cost(ours.first), rel=1e-7)
     assert costs[0] == pytest.approx(costs[1], rel=1e-7)
+
+
+def test_the_gate_names_what_became_slower_than_the_release(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    former = {"solve / TRF": 0.1, "kernel / sgemm": 1.0, "gone": 1.0}
+    found = {"solve / TRF": 0.124, "kernel / sgemm": 1.26, "new": 5.0}
+    assert gate.slower(found, former) == ["kernel / sgemm"]
+    text = gate.compare(found, former).text()
+    assert "1.24" in text and "1.26" in text and "gone" not in text

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from calibgraph import Correspondences, RelativePose, Rig, concatenate, solve
+from calibgraph import Config, Correspondences, RelativePose, Rig, concatenate, solve
 from calibgraph.model.geometry import relative_transform
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.evidence import Evidence
 from tests.trust.conftest import simulated
+
+Array = NDArray[np.float64]
 
 
 def tied(rig: Rig, *, rotation_deg: float, translation_m: float) -> Rig:
@@ -112,3 +118,22 @@ def test_it_goes_without_the_garbage_collector(pair: Rig) -> None:
         assert gone() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize(("turned_deg", "groups"), [(0, [("left", "right")]), (30, None)])
+def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
+    pair: Rig, turned_deg: float, groups: list[tuple[str, ...]] | None
+) -> None:
+    measured = tied(pair, rotation_deg=0.02, translation_m=0.003).relative_poses[0]
+    turn = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(turned_deg)), np.zeros(3)).matrix()
+    measured = measured.model_copy(update={"T_a_b": measured.T_a_b @ turn})
+    rig = pair.model_copy(update={"relative_poses": (measured,)})
+    seen: list[Sequence[Sequence[str]]] = []
+
+    def measure(covariances: Mapping[str, Array], found: Sequence[Sequence[str]]) -> dict[str, Any]:
+        seen.append(found)
+        return {}
+
+    evidence = Evidence(solve_joint(rig, simulated(rig, frames=10), Config()), rig, measure)
+    assert not evidence.posteriors
+    assert seen == [groups or [("left",), ("right",)]]

@@ -17,7 +17,7 @@ from calibgraph.matching.structure.shift_scores import ShiftScores
 
 Array = NDArray[np.float64]
 
-FAR = replace(LEVELS[3], reach_rad=np.radians(2.0))
+FAR = replace(LEVELS[3], reach_rad=np.radians(2.0), weighed=False)
 """A fine level that reaches as far as rounds may end off. Coarse levels only propose poses: they
 prefer some a degree off where fine ones are flat, as on grass slopes."""
 
@@ -33,7 +33,7 @@ def log_likelihood(scores: ShiftScores) -> Callable[[Array], Array]:
     Args:
         scores: of one camera, at ``FAR``, about the pose in question.
     """
-    if not len(scores.counts):
+    if not len(scores.weights):
         return lambda twists: np.zeros(len(twists))
     amplitude = max(z_score(scores, np.zeros(6)), 0.0)
     factor = amplitude / (CHANCE_VARIANCE * (scores.chance_sigma + 1e-12))

@@ -22,10 +22,10 @@ def extract_correspondences(
     is an edge) times the mean score of its windows at the peak, their quality. The confidence is
     twice the quality, and at least twice MIN_QUALITY, which a solve keeps by default.
     """
-    if not len(scores.counts):  # nothing of the cloud is in view
+    if not len(scores.weights):  # nothing of the cloud is in view
         return _no_correspondences(camera)
     shift, hessian, peak = find_local_peaks(scores.grids, scores.jacobian @ unknowns)
-    quality = np.maximum(peak / scores.counts, 0.0)  # 0: no peak
+    quality = np.maximum(peak / scores.weights, 0.0)  # 0: no peak
     good = quality > min_quality
     scale = scores.steps_per_px
     information = (hessian * np.outer(scale, scale)).reshape(-1, 4)[:, [0, 1, 3]]

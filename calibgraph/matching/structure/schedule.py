@@ -18,6 +18,7 @@ class Level:
             (unbiased); a coarse level leaves out only the point (more windows, which it needs
             where sensors are far apart). Windows keep their linear parts. Their log-likelihoods
             are summed, so that one window that fits well outweighs many that fit somewhat.
+        weighed: count windows by their weights, see :mod:`.window_weights`.
         stride_spacings: spacing of the windows, in sample spacings.
         blur_steps: standard deviation of the Gaussian blur of the image, in steps.
         group_rad: cell of directions in which the shift is nearly constant.
@@ -34,6 +35,7 @@ class Level:
     translation_m: float
     spacing_rad: float
     fine: bool = False
+    weighed: bool = False
     stride_spacings: float = 2.0
     blur_steps: float = 1.0
     group_rad: float = np.radians(3.8)
@@ -58,6 +60,7 @@ def _level(
         translation_m=translation_m,
         spacing_rad=np.radians(spacing_deg),
         fine=fine,
+        weighed=fine,
         searches=1 if fine else 3,
     )
 

@@ -42,7 +42,7 @@ class ShiftScores:
         points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame.
         pixels_px: (g, 2) where it projects at the estimate.
         frame: (g,) the number of its frame.
-        counts: (g,) windows in the group.
+        weights: (g,) sums over the windows of the group, see ``Windows.weight``.
         steps_per_px: (2,) of u and v.
     """
 
@@ -51,7 +51,7 @@ class ShiftScores:
     points_lidar_m: Array
     pixels_px: Array
     frame: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    weights: Array
     steps_per_px: Array
 
     @cached_property
@@ -86,7 +86,7 @@ def score_frame(
         points_lidar_m=centres,
         pixels_px=pixels_px,
         frame=np.full(groups, frame, np.int64),
-        counts=counts,
+        weights=np.bincount(group, windows.weight, minlength=groups).astype(np.float64),
         steps_per_px=scale,
     )
 
@@ -107,14 +107,15 @@ def select_windows(
         fine=level.fine,
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
-    return table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
+    windows = table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
+    return windows.weighed() if level.weighed else windows.unweighed()
 
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     """The groups of several frames of one camera in one object."""
-    columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "counts")
+    columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "weights")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
-    grids: Grids = mmap_zeros((len(stacked["counts"]), *scores[0].grids.shape[1:]), np.float32)
+    grids: Grids = mmap_zeros((len(stacked["weights"]), *scores[0].grids.shape[1:]), np.float32)
     np.concatenate([s.grids for s in scores], out=grids)
     return ShiftScores(**stacked, grids=grids, steps_per_px=scores[0].steps_per_px)
 

@@ -30,6 +30,6 @@ def make_scores(twist: np.ndarray, *, outlier_share: float, seed: int = 0) -> Sh
         points_lidar_m=zeros,
         pixels_px=zeros[:, :2],
         frame=np.zeros(300, np.int64),
-        counts=np.full(300, 10),
+        weights=np.full(300, 10.0),
         steps_per_px=np.ones(2),
     )

@@ -1,0 +1,139 @@
+"""How much a window tells where it is."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import calibgraph
+from calibgraph import Rig
+from calibgraph.matching.structure.consensus import z_score
+from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.shift_scores import score_frame
+from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
+from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
+from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
+from tests.conftest import make_camera
+
+Array = NDArray[np.float64]
+
+STEP = np.radians(0.2)
+ALL = np.ones((1, WINDOW_POINTS), np.bool_)
+MEMBERS = np.arange(WINDOW_POINTS, dtype=np.int32)[None]
+COUNTS = np.array([WINDOW_POINTS], np.int32)
+LAYOUT = {"log range"}  # of the features, those that the place of a window changes
+
+
+def grid_of_rays() -> Array:
+    """(25, 3) unit vectors about the x axis, five by five, the middle one first."""
+    angles = STEP * np.arange(-2, 3)
+    cells = sorted(itertools.product(angles, angles), key=lambda cell: np.hypot(*cell))
+    rays = np.array([[1.0, np.tan(a), np.tan(e)] for a, e in cells])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def features_of(ranges_m: Array, rank: Array, rays: Array | None = None) -> dict[str, float]:
+    rays = (grid_of_rays() if rays is None else rays) * ranges_m[:, None]
+    basis, out = np.full((1, WINDOW_POINTS, 4), 0.2, np.float32), np.zeros((1, len(FEATURES)))
+    fill_features((rays, rank), MEMBERS, COUNTS, ALL, basis, out)
+    return dict(zip(FEATURES, out[0].tolist(), strict=True))
+
+
+def test_a_wall_is_a_plane_and_an_edge_is_two_classes() -> None:
+    rays, flat = grid_of_rays(), np.full(WINDOW_POINTS, 0.5)
+    wall = features_of(10.0 / rays[:, 0], np.linspace(0, 1, WINDOW_POINTS))
+    edge = features_of(np.where(rays[:, 1] > 0, 10.0, 20.0), flat)
+    noise = np.random.default_rng(0).uniform(5, 20, WINDOW_POINTS)
+    leaves = features_of(noise, flat)
+    # A plane's inverse range is linear in direction, to the second order of 0.4 degrees.
+    slanted = features_of(10.0 / (rays @ [0.5, 0.5, 0.0]), flat)
+    assert slanted["depth beside a plane"] < 1e-4
+    assert wall["log range"] == pytest.approx(np.log(10), abs=1e-4)
+    assert edge["depth in two classes"] == pytest.approx(1.0)
+    assert 0.2 < edge["depth beside a plane"] < 0.5  # a step of 5: 1 - 18/25 of it, or 2/5
+    assert leaves["depth in two classes"] < 0.9 and leaves["depth beside a plane"] > 0.5
+
+
+def test_features_do_not_depend_on_where_a_window_is_in_the_view() -> None:
+    rng, rays = np.random.default_rng(1), grid_of_rays()
+    ranges, rank = rng.uniform(5, 20, WINDOW_POINTS), rng.uniform(0, 1, WINDOW_POINTS)
+    here = features_of(ranges, rank)
+    for yaw, pitch in ((70.0, 0.0), (-160.0, 20.0)):
+        (cy, sy), (cp, sp) = ((np.cos(np.radians(a)), np.sin(np.radians(a))) for a in (yaw, pitch))
+        turn = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1.0]])
+        turn = turn @ np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
+        there = features_of(3 * ranges, rank, rays @ turn.T)
+        changed = {name for name in FEATURES if abs(there[name] - here[name]) > 1e-6}
+        assert changed == LAYOUT
+
+
+def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
+    """A score s becomes -log(1 - w (1 - exp(-s)))."""
+    rng = np.random.default_rng(2)
+    image = rng.normal(0, 0.3, (40, 60)).astype(np.float32)
+    places = np.stack(np.meshgrid(np.arange(20, 25), np.arange(15, 20)), axis=2)
+    windows = Windows.empty(1)
+    windows.counts[:], windows.weight[:] = WINDOW_POINTS, 0.3
+    basis = np.linalg.qr(rng.normal(size=(WINDOW_POINTS, 3)) - [[1, 0, 0]])[0][:, 1:]
+    basis -= basis.mean(axis=0)
+    windows.basis[:] = 0.0
+    windows.basis[0, :, :2] = np.linalg.qr(basis)[0]
+
+    def scores(of: Windows) -> Array:
+        grids = np.zeros((1, 9, 9), np.float32)
+        group, first = np.zeros(1, np.int32), np.array([-4, -4])
+        at = places.reshape(1, WINDOW_POINTS, 2).astype(np.int32)
+        score_windows(image, at, of.counts, of.basis, group, first, True, grids)
+        return grids[0].astype(float)
+
+    whole, weighed = scores(windows), scores(windows.weighed())
+    # Single precision, and a product of factors near 1: some 1e-6 of a logarithm.
+    np.testing.assert_allclose(weighed, -np.log(1 - 0.3 * (1 - np.exp(-whole))), atol=1e-5)
+    assert np.ptp(whole) > 0.1
+
+
+def test_the_network_is_two_hidden_layers_as_torch_computes_them() -> None:
+    torch = pytest.importorskip("torch")
+    network = window_network()
+    values = np.random.default_rng(3).normal(0, 2, (50, len(FEATURES)))
+    layers = []
+    for matrix, bias in network.layers:
+        layer = torch.nn.Linear(*matrix.shape).double()
+        layer.weight.data, layer.bias.data = torch.tensor(matrix.T), torch.tensor(bias)
+        layers += [layer, torch.nn.GELU(approximate="tanh")]
+    expected = torch.sigmoid(torch.nn.Sequential(*layers[:-1])(torch.tensor(values)))[:, 0]
+    raw = values * network.spread + network.mean
+    # Weights are kept in single precision.
+    np.testing.assert_allclose(network.weights(raw), expected.detach().numpy(), atol=1e-6)
+    assert sum(matrix.size + bias.size for matrix, bias in network.layers) == 529
+
+
+def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> None:
+    """On a rendered meadow that took no part in the training."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    rig = Rig(cameras={"left": make_camera()})
+    calibgraph.simulate_street(
+        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, surroundings="meadow"
+    )
+    frame, camera = calibgraph.load_dataset(tmp_path / "meadow", rig).frames[0], rig.cameras["left"]
+    gray = frame.load_gray("left", camera)
+    cloud = PreparedCloud.from_points(frame.load_cloud())
+    plain, weighed = (
+        z_score(score_frame(gray, cloud, camera, level, frame=0, max_windows=2000), np.zeros(6))
+        for level in (replace(LEVELS[3], weighed=False), LEVELS[3])
+    )
+    assert weighed > 1.05 * plain > 5.0
+
+
+def test_weights_stay_within_0_and_1() -> None:
+    layer = np.full((1, 1), 50.0), np.zeros(1)
+    network = WindowNetwork(np.zeros(1), np.ones(1), (layer,))
+    weights = network.weights(np.array([[-9.0], [0.0], [9.0]]))
+    assert 0 < weights[0] < 1e-4 and weights[1] == 0.5 and 1 - 1e-4 < weights[2] <= 1
