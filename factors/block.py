@@ -31,16 +31,8 @@ from factors.block_arrays import (
 )
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.compiled import one_at_a_time
-from factors.kernel import (
-    accumulate_alone,
-    accumulate_shared,
-    costs_alone,
-    gradients_alone,
-    linearize_alone,
-    norms_alone,
-    residuals_alone,
-    residuals_shared,
-)
+from factors.conditioning import root_of_sums
+from factors.kernel import COST, GRADIENT, HESSIAN, accumulate, evaluate
 from factors.lens import Lens
 from factors.loss import loss_id
 
@@ -48,6 +40,7 @@ Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
+_NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,19 +138,21 @@ class ProjectionBlock(RobustBlock):
 
     def gradients_at_each(self, T_camera_lidar: Array) -> Array:
         """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
-        gradients: Array = gradients_alone(
-            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
-            self._whitening, loss_id(self.loss), self.scale * self.sigma,
-        )  # fmt: skip
-        return gradients / self.sigma**2
+        return unpack_sums(self._sums_at_each(T_camera_lidar, GRADIENT)).gradient
 
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
-        costs: Array = costs_alone(
-            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
-            self._whitening, loss_id(self.loss), self.scale * self.sigma,
-        )  # fmt: skip
-        return costs / self.sigma**2
+        return unpack_sums(self._sums_at_each(T_camera_lidar, COST)).cost
+
+    def _sums_at_each(self, T_camera_lidar: Array, wanted: int) -> Array:
+        """(p, 28) sums of the whole block at (p, 4, 4) poses; each chunk at all of them in turn."""
+        chunks, count = len(self._chunks), len(T_camera_lidar)
+        poses, runs = (
+            np.tile(T_camera_lidar, (chunks, 1, 1)),
+            np.repeat(self._chunks, count, axis=0),
+        )
+        sums = self._run_sums(poses, runs, None, wanted)
+        return np.asarray(sums.reshape(chunks, count, 28).sum(axis=0))
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
@@ -177,16 +172,21 @@ class ProjectionBlock(RobustBlock):
         return unpack_sums(self._run_sums(T_camera_lidar, runs, scales))
 
     def _run_sums(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None
+        self,
+        T_camera_lidar: Array,
+        runs: NDArray[np.int64],
+        scales: Array | None,
+        wanted: int = HESSIAN,
     ) -> Array:
-        shared = len(runs) * len(self) >= _WORTH_SHARING
+        shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
-        run = one_at_a_time(accumulate_shared) if shared else accumulate_alone
+        kernel = accumulate(self.lens.kind, shared=shared)
+        run = one_at_a_time(kernel) if shared else kernel
         scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
         sums: Array = run(
-            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
-            self._whitening, loss_id(self.loss), scales * self.sigma, contiguous(runs),
+            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
+            loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
 
@@ -203,13 +203,8 @@ class ProjectionBlock(RobustBlock):
             T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
             runs: (r, 2) as in :meth:`run_sums`.
         """
-        shared = len(self) >= _WORTH_SHARING
-        run = one_at_a_time(residuals_shared) if shared else residuals_alone
-        residuals, projectable = run(
-            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
-            contiguous(runs),
-        )  # fmt: skip
-        return residuals, projectable
+        residuals = np.empty((len(self), 2))
+        return residuals, self._evaluate(T_camera_lidar, runs, residuals=residuals)
 
     def run_norms(
         self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
@@ -223,21 +218,35 @@ class ProjectionBlock(RobustBlock):
             runs: (r, 2) as in :meth:`run_residuals`; None: one run.
             factor: by which both are multiplied.
         """
-        norms: Array = norms_alone(
-            self.lens.kind, self.lens.packed, contiguous(T_camera_lidar), self._columns,
-            self._whitening, factor, self._chunks if runs is None else contiguous(runs),
-        )  # fmt: skip
+        norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
+        runs = self._chunks if runs is None else runs
+        self._evaluate(T_camera_lidar, runs, norms=norms, factor=factor)
         return norms
+
+    def _evaluate(
+        self,
+        T_camera_lidar: Array,
+        runs: NDArray[np.int64],
+        *,
+        residuals: Array = _NO_RESIDUALS,
+        norms: Array = _NO_NORMS,
+        factor: float = 1.0,
+    ) -> NDArray[np.bool_]:
+        """Fill in residuals or norms; (n,) whether each point is projectable."""
+        shared = len(self) >= _WORTH_SHARING
+        kernel = evaluate(self.lens.kind, shared=shared)
+        run = one_at_a_time(kernel) if shared else kernel
+        projectable: NDArray[np.bool_] = run(
+            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening, factor,
+            contiguous(runs), residuals, norms,
+        )  # fmt: skip
+        return projectable
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        if len(self) >= _WORTH_SHARING:
-            return square_root(self.sums(T_lidar_camera))
-        error, jacobian = linearize_alone(
-            self.lens.kind, self.lens.packed, _T_camera_lidar(T_lidar_camera), self._columns,
-            self._whitening, loss_id(self.loss), self.scale * self.sigma, self.sigma, self._chunks,
-        )  # fmt: skip
-        return error, jacobian.T
+        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
+        error, jacobian, regular = root_of_sums(sums)
+        return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
 
 
 def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:

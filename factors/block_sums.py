@@ -1,13 +1,16 @@
 """The sums H, b and c of a block of correspondences, and the root that GTSAM is given."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.conditioning import compiled_square_root
+from factors.conditioning import REGULAR, unit_diagonal
 
 Array = NDArray[np.float64]
+
+_LEAST = 1e-14  # of the largest eigenvalue: below, a direction counts as free
 
 
 @dataclass(frozen=True)
@@ -32,10 +35,29 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
     eigenvectors, and directions without information get a zero row.
     """
-    error, jacobian = compiled_square_root(
-        np.ascontiguousarray(sums.hessian), np.ascontiguousarray(sums.gradient), float(sums.cost)
-    )
-    return error, jacobian.T
+    scaled, units = unit_diagonal(sums.hessian)
+    along = sums.gradient / units
+    root = _triangular_root(scaled)
+    if root is not None:
+        error = np.linalg.solve(root, along)
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+        known = values > _LEAST * max(values[-1], 0.0)
+        roots = np.sqrt(np.where(known, values, 1.0))
+        root = np.asarray(vectors * np.where(known, roots, 0.0), dtype=np.float64)
+        error = np.where(known, vectors.T @ along / roots, 0.0)
+    rest = math.sqrt(max(float(sums.cost) - float(error @ error), 0.0))
+    jacobian: Array = np.vstack([root.T * units, np.zeros(len(units))])
+    return np.append(error, rest), jacobian
+
+
+def _triangular_root(scaled: Array) -> Array | None:
+    """Cholesky's root of a matrix of unit diagonal; None where it is nearly singular."""
+    try:
+        root: Array = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return None
+    return root if (np.diag(root) ** 2 > REGULAR).all() else None
 
 
 _PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]

@@ -1,5 +1,7 @@
 """Hessians of poses in units in which radians and metres can be compared: with a unit diagonal."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,7 +9,8 @@ from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
-_REGULAR = 1e-10  # least share of an unknown that those before it leave, for a triangular root
+REGULAR = 1e-10
+"""Least share of an unknown that those before it leave, for a triangular root."""
 
 
 def unit_diagonal(hessian: Array) -> tuple[Array, Array]:
@@ -45,57 +48,43 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
 
 
 @compiled()
-def _fill_triangular_root(scaled, along, jacobian, error):  # type: ignore[no-untyped-def]
-    """Fill in Cholesky's root of a regular matrix, and the error; whether it is regular.
+def root_of_sums(sums):  # type: ignore[no-untyped-def]
+    """The (7,) error and transposed (6, 7) Jacobian of ``block_sums.square_root``, by Cholesky.
 
     Args:
-        scaled: (n, n), of unit diagonal.
-        along: (n,) gradient in its units.
-        jacobian: (n, n + 1), filled below the diagonal.
-        error: (n + 1,), all but the last filled.
+        sums: (r, 28) of runs, which are added: 21 of the upper triangle of H, 6 of b, 1 of c.
+
+    Returns:
+        Both, and whether H is regular; if it is not, they mean nothing.
     """
-    for i in range(len(along)):
-        error[i] = along[i]
+    total, units, hessian = np.zeros(28), np.empty(6), np.empty((6, 6))
+    jacobian, error = np.zeros((6, 7)), np.empty(7)
+    for r in range(len(sums)):
+        for k in range(28):
+            total[k] += sums[r, k]
+    place, rest_of_cost = 0, total[27]
+    for i in range(6):
+        for j in range(i, 6):
+            hessian[j, i] = total[place]
+            place += 1
+    for i in range(6):
+        units[i] = math.sqrt(hessian[i, i]) if hessian[i, i] > 0.0 else 1.0
+        error[i] = total[21 + i] / units[i]
         for j in range(i + 1):
-            rest = scaled[i, j]
+            rest = hessian[i, j] / (units[i] * units[j])
             for m in range(j):
                 rest -= jacobian[i, m] * jacobian[j, m]
             if j < i:
                 jacobian[i, j] = rest / jacobian[j, j]
                 error[i] -= jacobian[i, j] * error[j]
-            elif rest > _REGULAR:
-                jacobian[i, i] = np.sqrt(rest)
+            elif rest > REGULAR:
+                jacobian[i, i] = math.sqrt(rest)
                 error[i] /= jacobian[i, i]
             else:
-                return False
-    return True
-
-
-@compiled()
-def compiled_square_root(hessian, gradient, cost):  # type: ignore[no-untyped-def]
-    """(n + 1,) error and the transposed (n, n + 1) Jacobian, see ``block_sums.square_root``."""
-    n = len(gradient)
-    units, along, scaled = np.ones(n), np.empty(n), np.empty((n, n))
-    for i in range(n):
-        if hessian[i, i] > 0.0:
-            units[i] = np.sqrt(hessian[i, i])
-        along[i] = gradient[i] / units[i]
+                return error, jacobian, False
+        rest_of_cost -= error[i] * error[i]
+    for i in range(6):
         for j in range(i + 1):
-            scaled[i, j] = scaled[j, i] = hessian[i, j] / (units[i] * units[j])
-    jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
-    if not _fill_triangular_root(scaled, along, jacobian, error):
-        jacobian, error = np.zeros((n, n + 1)), np.zeros(n + 1)
-        values, vectors = np.linalg.eigh(scaled)
-        for k in range(n):
-            if values[k] > 1e-14 * max(values[n - 1], 0.0):
-                root = np.sqrt(values[k])
-                for i in range(n):
-                    jacobian[i, k] = root * vectors[i, k]
-                    error[k] += vectors[i, k] * along[i] / root
-    rest = cost
-    for i in range(n):
-        rest -= error[i] * error[i]
-        for k in range(n):
-            jacobian[i, k] *= units[i]
-    error[n] = np.sqrt(max(rest, 0.0))
-    return error, jacobian
+            jacobian[i, j] *= units[i]
+    error[6] = math.sqrt(max(rest_of_cost, 0.0))
+    return error, jacobian, True

@@ -33,30 +33,7 @@ def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-d
     return too_near == 0.0
 
 
-@compiled(fastmath=FAST)
-def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """``project`` for a pinhole without distortion: no branch, so that it vectorizes."""
-    xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
-    us, vs = columns[3][start:], columns[4][start:]
-    ru, rv = tile[RU], tile[RV]
-    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
-    rx, ry, rz = tile[X], tile[Y], tile[Z]
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
-    for i in range(n):
-        px, py, pz = xs[i], ys[i], zs[i]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        w = 1.0 / max(z, MIN_DEPTH_M)
-        wz = w if z > MIN_DEPTH_M else 0.0
-        u, v = fx * x * w, fy * y * w
-        ru[i], rv[i] = u + (cx - us[i]), v + (cy - vs[i])
-        ux[i], uy[i], uz[i] = fx * w, 0.0, -u * wz
-        vx[i], vy[i], vz[i] = 0.0, fy * w, -v * wz
-        rx[i], ry[i], rz[i] = x, y, z
-
-
-@compiled(fastmath=FAST)
+@compiled(inline="always")
 def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for radial-tangential distortion, without branches, as ``lens._radtan_inside``.
 
@@ -99,17 +76,19 @@ def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped
     return outside == 0.0
 
 
-@compiled(fastmath=FAST)
+@compiled(inline="always")
 def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals, their derivatives by the point, and the point in the camera frame."""
+    xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
+    us, vs = columns[3][start:], columns[4][start:]
+    ru, rv = tile[RU], tile[RV]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    rx, ry, rz = tile[X], tile[Y], tile[Z]
     for i in range(n):
-        px, py, pz = columns[0, start + i], columns[1, start + i], columns[2, start + i]
+        px, py, pz = xs[i], ys[i], zs[i]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
-        tile[RU, i] = subtract_columns(kind, lens, u, columns[3, start + i])
-        tile[RV, i] = v - columns[4, start + i]
-        tile[UX, i], tile[UY, i], tile[UZ, i] = ux, uy, uz
-        tile[VX, i], tile[VY, i], tile[VZ, i] = vx, vy, vz
-        tile[X, i], tile[Y, i], tile[Z, i] = x, y, z
+        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_one(kind, lens, x, y, z)
+        ru[i], rv[i] = subtract_columns(kind, lens, u, us[i]), v - vs[i]
+        rx[i], ry[i], rz[i] = x, y, z

@@ -43,16 +43,14 @@ def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
 @compiled(fastmath=FAST)
 def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     """Fill in the weights psi; return the sum of rho."""
+    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
     if loss != CAUCHY:
         cost = 0.0
         for i in range(n):
-            rho, tile[PSI, i] = loss_and_weight(
-                loss, scale, tile[RU, i] * tile[RU, i] + tile[RV, i] * tile[RV, i]
-            )
+            rho, psi[i] = loss_and_weight(loss, scale, ru[i] * ru[i] + rv[i] * rv[i])
             cost += rho
         return cost
     k = 1.0 / (scale * scale)
-    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
     for i in range(n):
         psi[i] = 1.0 / (1.0 + k * (ru[i] * ru[i] + rv[i] * rv[i]))
     return -_sum_of_logarithms(psi, n, tile[PRODUCT]) / k
@@ -155,7 +153,7 @@ def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
 
 @compiled(fastmath=FAST)
 def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
-    """Add the 27 sums of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
+    """Add the 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 
     The rows of the Jacobian are fx (ab, -A, b, -w, 0, aw) and fy (B, -ab, -a, 0, -w, bw) with
     A = 1 + a^2 and B = 1 + b^2: their 21 products share most of their terms, and the focal lengths
@@ -207,12 +205,11 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
     )  # fmt: skip
     for k in range(21):
         out[k] += sums[k]
-    sum_ray_gradients(lens, n, tile, out[21:])
 
 
 @compiled(fastmath=FAST)
 def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
-    """Add the gradient of a tile of a pinhole to 6 sums, see ``sum_rays``."""
+    """Add the gradient of a tile of a pinhole to the sums, see ``sum_rays``."""
     pull_u, pull_v = tile[RU], tile[RV]
     ray_a, ray_b, ray_w = tile[A], tile[B], tile[W]
     fx, fy = lens[0], lens[1]
@@ -228,12 +225,12 @@ def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
         b5 += w * both
     sums = (b0, b1, b2, b3, b4, b5)
     for k in range(6):
-        out[k] += sums[k]
+        out[21 + k] += sums[k]
 
 
 @compiled(fastmath=FAST)
 def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
-    """Add J^T psi r of a tile to 6 sums, see ``sum_tile``."""
+    """Add J^T psi r of a tile to the sums, see ``sum_tile``."""
     rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
     ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
     res_u, res_v = tile[RU], tile[RV]
@@ -252,4 +249,4 @@ def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
         b5 += g5
     sums = (b0, b1, b2, b3, b4, b5)
     for k in range(6):
-        out[k] += sums[k]
+        out[21 + k] += sums[k]

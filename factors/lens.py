@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -27,7 +27,6 @@ from factors.lens_kernels import (
     OMNIDIRECTIONAL,
     PINHOLE,
     RADTAN,
-    is_in_cone,
     is_projectable,
     project_one,
 )
@@ -145,19 +144,19 @@ class Lens:
             inside the injective domain of the lens). It may still lie outside the image.
         """
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, valid = _project_many(self.kind, self.packed, points)
+        pixels, valid = _project_many(self.kind)(self.packed, points)
         return pixels, valid
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
         points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
         T = contiguous(T_camera_lidar)
-        return np.asarray(_are_projectable(self.kind, self.packed, T, points))
+        return np.asarray(_are_projectable(self.kind)(self.packed, T, points))
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, jacobians = _project_many_with_jacobian(self.kind, self.packed, points)
+        pixels, jacobians = _project_many_with_jacobian(self.kind)(self.packed, points)
         return pixels, jacobians
 
     def fill_twist_columns(
@@ -174,8 +173,8 @@ class Lens:
             (2, n) pixels.
         """
         points = contiguous(np.asarray(points_lidar_m, dtype=np.float64).T)
-        pixels: Array = _fill_twist_columns(
-            self.kind, self.packed, contiguous(T_camera_lidar), points, columns
+        pixels: Array = _fill_twist_columns(self.kind)(
+            self.packed, contiguous(T_camera_lidar), points, columns
         )
         return pixels
 
@@ -223,61 +222,73 @@ def _fisheye_limit(coefficients: Array) -> float:
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
 
 
-@compiled()
-def _are_projectable(kind, lens, T, points):  # type: ignore[no-untyped-def]
-    valid = np.empty(len(points), dtype=np.bool_)
-    looks_ahead = kind in (PINHOLE, RADTAN)
-    for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if looks_ahead:
-            valid[i] = is_in_cone(lens, x, y, z)
-        else:
+@cache
+def _are_projectable(kind: int) -> Any:
+    @compiled()
+    def run(lens, T, points):  # type: ignore[no-untyped-def]
+        valid = np.empty(len(points), dtype=np.bool_)
+        for i in range(len(points)):
+            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
             valid[i] = is_projectable(kind, lens, x, y, z)
-    return valid
+        return valid
+
+    return run
 
 
-@compiled()
-def _project_many(kind, lens, points):  # type: ignore[no-untyped-def]
-    pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
-    for k in range(len(points)):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        projection = project_one(kind, lens, x, y, z)
-        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-        valid[k] = is_projectable(kind, lens, x, y, z)
-    return pixels, valid
+@cache
+def _project_many(kind: int) -> Any:
+    @compiled()
+    def run(lens, points):  # type: ignore[no-untyped-def]
+        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+        for k in range(len(points)):
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            projection = project_one(kind, lens, x, y, z)
+            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+            valid[k] = is_projectable(kind, lens, x, y, z)
+        return pixels, valid
+
+    return run
 
 
-@compiled()
-def _project_many_with_jacobian(kind, lens, points):  # type: ignore[no-untyped-def]
-    n = len(points)
-    pixels = np.empty((n, 2))
-    jacobians = np.empty((n, 2, 3))
-    for k in range(n):
-        projection = project_one(kind, lens, points[k, 0], points[k, 1], points[k, 2])
-        pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-        jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
-        jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
-    return pixels, jacobians
+@cache
+def _project_many_with_jacobian(kind: int) -> Any:
+    @compiled()
+    def run(lens, points):  # type: ignore[no-untyped-def]
+        n = len(points)
+        pixels = np.empty((n, 2))
+        jacobians = np.empty((n, 2, 3))
+        for k in range(n):
+            projection = project_one(kind, lens, points[k, 0], points[k, 1], points[k, 2])
+            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+            jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
+            jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
+        return pixels, jacobians
+
+    return run
 
 
-@compiled()
-def _fill_twist_columns(kind, lens, T, points, columns):  # type: ignore[no-untyped-def]
-    n = points.shape[1]
-    pixels = np.empty((2, n))
-    for i in range(n):
-        px, py, pz = points[0, i], points[1, i], points[2, i]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
-        pixels[0, i], pixels[1, i] = u, v
-        columns[3, 0, i], columns[4, 0, i], columns[5, 0, i] = ux, uy, uz
-        columns[3, 1, i], columns[4, 1, i], columns[5, 1, i] = vx, vy, vz
-        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
-        columns[0, 0, i], columns[0, 1, i] = y * uz - z * uy, y * vz - z * vy
-        columns[1, 0, i], columns[1, 1, i] = z * ux - x * uz, z * vx - x * vz
-        columns[2, 0, i], columns[2, 1, i] = x * uy - y * ux, x * vy - y * vx
-    return pixels
+@cache
+def _fill_twist_columns(kind: int) -> Any:
+    @compiled()
+    def run(lens, T, points, columns):  # type: ignore[no-untyped-def]
+        n = points.shape[1]
+        pixels = np.empty((2, n))
+        for i in range(n):
+            px, py, pz = points[0, i], points[1, i], points[2, i]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
+            pixels[0, i], pixels[1, i] = u, v
+            columns[3, 0, i], columns[4, 0, i], columns[5, 0, i] = ux, uy, uz
+            columns[3, 1, i], columns[4, 1, i], columns[5, 1, i] = vx, vy, vz
+            # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
+            columns[0, 0, i], columns[0, 1, i] = y * uz - z * uy, y * vz - z * vy
+            columns[1, 0, i], columns[1, 1, i] = z * ux - x * uz, z * vx - x * vz
+            columns[2, 0, i], columns[2, 1, i] = x * uy - y * ux, x * vy - y * vx
+        return pixels
+
+    return run

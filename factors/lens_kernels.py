@@ -16,7 +16,7 @@ PINHOLE, RADTAN, FISHEYE, OMNIDIRECTIONAL, EQUIRECTANGULAR = range(5)
 _LIMIT = 12  # index of the domain's limit in the packed parameters
 
 
-@compiled()
+@compiled(inline="always")
 def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a point in the camera frame and the rows of its Jacobian by x, y, z.
 
@@ -24,6 +24,9 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     ``MIN_DEPTH_M``; past the limiting radius the distorted point grows linearly along the ray from
     the limiting circle; past the limiting field angle the distorted angle grows with slope one.
     The continuation is continuous, and bounded for bounded points.
+
+    This and the functions of a kind below become parts of the kernel that calls them. If the kind
+    is a constant there, only its own branch is compiled.
     """
     if kind == FISHEYE:
         return _fisheye(lens, x, y, z)
@@ -134,7 +137,7 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(inline="always")
 def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies inside the lens' injective domain."""
     if kind in (FISHEYE, OMNIDIRECTIONAL):
@@ -144,13 +147,13 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     return is_in_cone(lens, x, y, z)
 
 
-@compiled()
+@compiled(inline="always")
 def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Like :func:`is_projectable`, for a lens that looks ahead."""
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[_LIMIT] * z) ** 2)
 
 
-@compiled()
+@compiled(inline="always")
 def subtract_columns(kind, lens, u, other):  # type: ignore[no-untyped-def]
     """Difference of two columns u [px]; across the seam of a panorama the short way."""
     if kind != EQUIRECTANGULAR:

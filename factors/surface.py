@@ -15,6 +15,7 @@ longer meets the plane passes smoothly through infinity.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -93,8 +94,8 @@ class SurfaceBlock(RobustBlock):
     def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
         """As :meth:`frame_sums`, with (r, 4, 4) poses of each run, or (1, 4, 4) of all."""
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        sums = _accumulate(
-            self.lens_b.kind, self.lens_b.packed, contiguous(T_lidar_a), contiguous(T_lidar_b),
+        sums = _accumulate(self.lens_b.kind)(
+            self.lens_b.packed, contiguous(T_lidar_a), contiguous(T_lidar_b),
             self.rays_a, self.planes_lidar_per_m, self.pixels_b_px, loss_id(self.loss),
             self.scale * self.sigma, edges,
         )  # fmt: skip
@@ -105,8 +106,8 @@ class SurfaceBlock(RobustBlock):
         self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
     ) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) residuals [px], not divided by sigma; (n,) whether B's lens can see the point."""
-        residuals, projectable = _residuals(
-            self.lens_b.kind, self.lens_b.packed, contiguous(T_lidar_a.matrix()),
+        residuals, projectable = _residuals(self.lens_b.kind)(
+            self.lens_b.packed, contiguous(T_lidar_a.matrix()),
             contiguous(T_lidar_b.matrix()), self.rays_a, self.planes_lidar_per_m, self.pixels_b_px,
         )  # fmt: skip
         return residuals, projectable
@@ -156,12 +157,12 @@ def _skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-@compiled()
+@compiled(inline="always")
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled()
+@compiled(inline="always")
 def _fill_relative(T_a, T_b, R_b_a, t):  # type: ignore[no-untyped-def]
     """R_b_a and A's centre in B's frame, from T_lidar_a and T_lidar_b."""
     for i in range(3):
@@ -172,7 +173,7 @@ def _fill_relative(T_a, T_b, R_b_a, t):  # type: ignore[no-untyped-def]
             R_b_a[i, j] = T_b[0, i] * T_a[0, j] + T_b[1, i] * T_a[1, j] + T_b[2, i] * T_a[2, j]
 
 
-@compiled()
+@compiled(inline="always")
 def _predict(T_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-def]
     """Fill in y and g = R_a^T q; return w and k."""
     for i in range(3):
@@ -186,7 +187,7 @@ def _predict(T_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-def]
     return w, k
 
 
-@compiled()
+@compiled(inline="always")
 def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian, n):  # type: ignore[no-untyped-def]
     """Derivatives of a pixel by both poses, into column n of (2, 12, TILE)."""
     g0, g1, g2 = g[0] / k, g[1] / k, g[2] / k
@@ -229,48 +230,56 @@ def _add_products(jacobian, residual, psi, count, weighted, sums):  # type: igno
             sums[i, j] += total
 
 
-@compiled()
-def _accumulate(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
-    kind, lens, T_lidar_a, T_lidar_b, rays, planes, pixels, loss, scale, edges
-):
-    """(runs, 14, 12) sums over runs of features: H, b, and c first in the last row."""
-    out = np.zeros((len(edges) - 1, 14, 12))
-    y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    jacobian, residual = np.empty((2, 12, _TILE)), np.empty((2, _TILE))
-    psi, weighted = np.empty(_TILE), np.empty((2, _TILE))
-    for run in range(len(edges) - 1):
-        T_a = T_lidar_a[min(np.int64(run), len(T_lidar_a) - 1)]
-        T_b = T_lidar_b[min(np.int64(run), len(T_lidar_b) - 1)]
+@cache
+def _accumulate(kind: int) -> Any:
+    @compiled()
+    def run(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
+        lens, T_lidar_a, T_lidar_b, rays, planes, pixels, loss, scale, edges
+    ):
+        """(runs, 14, 12) sums over runs of features: H, b, and c first in the last row."""
+        out = np.zeros((len(edges) - 1, 14, 12))
+        y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+        jacobian, residual = np.empty((2, 12, _TILE)), np.empty((2, _TILE))
+        psi, weighted = np.empty(_TILE), np.empty((2, _TILE))
+        for run in range(len(edges) - 1):
+            T_a = T_lidar_a[min(np.int64(run), len(T_lidar_a) - 1)]
+            T_b = T_lidar_b[min(np.int64(run), len(T_lidar_b) - 1)]
+            _fill_relative(T_a, T_b, R_b_a, t)
+            sums = out[run]
+            for start in range(edges[run], edges[run + 1], _TILE):
+                count = min(_TILE, edges[run + 1] - start)
+                for n in range(count):
+                    row = start + n
+                    w, k = _predict(T_a, R_b_a, t, rays[row], planes[row], y, g)
+                    projection = project_one(kind, lens, y[0], y[1], y[2])
+                    _fill_jacobian(R_b_a, t, rays[row], g, y, w, k, projection, jacobian, n)
+                    u = subtract_columns(kind, lens, projection[0], pixels[row, 0])
+                    v = projection[1] - pixels[row, 1]
+                    rho, psi[n] = loss_and_weight(loss, scale, u * u + v * v)
+                    residual[0, n], residual[1, n] = u, v
+                    sums[13, 0] += rho
+                _add_products(jacobian, residual, psi, count, weighted, sums)
+            for i in range(12):
+                for j in range(i):
+                    sums[i, j] = sums[j, i]
+        return out
+
+    return run
+
+
+@cache
+def _residuals(kind: int) -> Any:
+    @compiled()
+    def run(lens, T_a, T_b, rays, planes, pixels):  # type: ignore[no-untyped-def]
+        residuals, valid = np.empty((len(rays), 2)), np.empty(len(rays), np.bool_)
+        y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
         _fill_relative(T_a, T_b, R_b_a, t)
-        sums = out[run]
-        for start in range(edges[run], edges[run + 1], _TILE):
-            count = min(_TILE, edges[run + 1] - start)
-            for n in range(count):
-                row = start + n
-                w, k = _predict(T_a, R_b_a, t, rays[row], planes[row], y, g)
-                projection = project_one(kind, lens, y[0], y[1], y[2])
-                _fill_jacobian(R_b_a, t, rays[row], g, y, w, k, projection, jacobian, n)
-                u = subtract_columns(kind, lens, projection[0], pixels[row, 0])
-                v = projection[1] - pixels[row, 1]
-                rho, psi[n] = loss_and_weight(loss, scale, u * u + v * v)
-                residual[0, n], residual[1, n] = u, v
-                sums[13, 0] += rho
-            _add_products(jacobian, residual, psi, count, weighted, sums)
-        for i in range(12):
-            for j in range(i):
-                sums[i, j] = sums[j, i]
-    return out
+        for n in range(len(rays)):
+            w, _ = _predict(T_a, R_b_a, t, rays[n], planes[n], y, g)
+            projection = project_one(kind, lens, y[0], y[1], y[2])
+            residuals[n, 0] = subtract_columns(kind, lens, projection[0], pixels[n, 0])
+            residuals[n, 1] = projection[1] - pixels[n, 1]
+            valid[n] = w > 0.0 and is_projectable(kind, lens, y[0] / w, y[1] / w, y[2] / w)
+        return residuals, valid
 
-
-@compiled()
-def _residuals(kind, lens, T_a, T_b, rays, planes, pixels):  # type: ignore[no-untyped-def]
-    residuals, valid = np.empty((len(rays), 2)), np.empty(len(rays), np.bool_)
-    y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    _fill_relative(T_a, T_b, R_b_a, t)
-    for n in range(len(rays)):
-        w, _ = _predict(T_a, R_b_a, t, rays[n], planes[n], y, g)
-        projection = project_one(kind, lens, y[0], y[1], y[2])
-        residuals[n, 0] = subtract_columns(kind, lens, projection[0], pixels[n, 0])
-        residuals[n, 1] = projection[1] - pixels[n, 1]
-        valid[n] = w > 0.0 and is_projectable(kind, lens, y[0] / w, y[1] / w, y[2] / w)
-    return residuals, valid
+    return run

@@ -85,7 +85,8 @@ class LinearRows:
         if len(self.group) < MIN_ROWS:
             return None
         which = np.array([*range(6), *(6 + k for k in unknowns), len(self.columns) - 1])
-        solved = self._solve_reweighted(which, loss_scale)
+        limits = (_MAX_ITERATIONS, _CONVERGED, _LEAST_SHARE)
+        solved = solve_reweighted(self.columns, which, loss_scale, _LOSS_MEDIANS, limits)
         if solved is None:
             return None
         solution, normal, weights, errors = solved
@@ -114,24 +115,6 @@ class LinearRows:
             return np.full((6, len(unknowns)), np.nan)
         twists = np.linalg.solve(scaled, products[:6, 6:] / units[:, None])
         return np.asarray(twists / units[:, None])
-
-    def _solve_reweighted(
-        self, which: NDArray[np.intp], loss_scale: float | None
-    ) -> tuple[Array, Array, Array, Array] | None:
-        """Iteratively reweighted least squares with a Cauchy loss on the norm of each row.
-
-        Returns:
-            (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors. None if the
-            matrix is singular.
-        """
-        solution, normal, weights, errors, regular = solve_reweighted(
-            self.columns,
-            which,
-            0.0 if loss_scale is None else float(loss_scale),
-            _LOSS_MEDIANS,
-            (_MAX_ITERATIONS, _CONVERGED, _LEAST_SHARE),
-        )
-        return (solution, normal, weights, errors) if regular else None
 
     def _cluster_sigmas(
         self, which: NDArray[np.intp], normal: Array, inverse: Array, weights: Array, errors: Array

@@ -18,7 +18,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
-from calibgraph.solver.spread_kernel import median, medians
+from calibgraph.solver.spread_kernel import median, quantiles
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
@@ -202,7 +202,7 @@ class CameraBlock:
         if root is None:
             return np.full(len(runs), MIN_SIGMA_PX)
         sizes = np.sqrt(root[:, 0] ** 2 + root[:, 2] ** 2)
-        return np.asarray(MIN_SIGMA_PX * medians(sizes, runs))
+        return np.asarray(MIN_SIGMA_PX * quantiles(sizes, runs, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,7 @@ class BlockResiduals:
     def summary(self, scale: ResidualScale) -> Residuals:
         """What the result reports of them."""
         return Residuals(
-            median_px=float(median(self.errors_px)),
+            median_px=median(self.errors_px),
             inlier_share=float(np.mean(self.inliers(scale))),
             sigma_px=robust_spread(self.sizes[0]),
             loss_scale_px=scale.loss_scale,

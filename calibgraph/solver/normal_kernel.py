@@ -1,4 +1,4 @@
-"""Weighted sums of products of the columns of a linear problem, compiled.
+"""Reweighted least squares, and weighted sums of products of the columns of a linear problem.
 
 Every row has two parts, those of a pixel's u and v. Columns are (m, 2, n), contiguous along rows.
 """
@@ -6,9 +6,15 @@ Every row has two parts, those of a pixel's u and v. Columns are (m, 2, n), cont
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.solver.spread_kernel import median
+from factors import unit_diagonal
 from factors.compiled import compiled
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Limits = tuple[int, float, float]
 
 _TILE = 256  # rows whose columns stay in the first-level cache
 _FAST = {"reassoc", "contract", "nsz"}
@@ -78,88 +84,45 @@ def _cauchy_weights(errors, scale):  # type: ignore[no-untyped-def]
     return weights
 
 
-@compiled()
-def _factorize(products, least, units, root):  # type: ignore[no-untyped-def]
-    """Cholesky's root of k normal equations in units of a unit diagonal; whether it exists.
-
-    Written out, as ``_solve``: numba compiles a call of LAPACK for several seconds.
-
-    Args:
-        products: (k + 1, k + 1): the normal matrix, and in its last column the right side.
-        least: smallest share of an unknown's column that those before it must leave.
-        units: (k,), filled: a row of the normal matrix is units[i] root[i] root^T units.
-        root: (k, k), filled below the diagonal.
-    """
-    for i in range(len(units)):
-        units[i] = math.sqrt(max(products[i, i], np.finfo(np.float64).tiny))
-        for j in range(i + 1):
-            rest = products[i, j] / (units[i] * units[j])
-            for m in range(j):
-                rest -= root[i, m] * root[j, m]
-            if j < i:
-                root[i, j] = rest / root[j, j]
-            elif rest >= least:
-                root[i, i] = math.sqrt(rest)
-            else:
-                return False
-    return True
-
-
-@compiled()
-def _solve(products, units, root, solution):  # type: ignore[no-untyped-def]
-    """Fill in the (k,) solution of the equations of :func:`_factorize`."""
-    k = len(solution)
-    for i in range(k):
-        rest = products[i, k] / units[i]
-        for j in range(i):
-            rest -= root[i, j] * solution[j]
-        solution[i] = rest / root[i, i]
-    for i in range(k - 1, -1, -1):
-        for j in range(i + 1, k):
-            solution[i] -= root[j, i] * solution[j]
-        solution[i] /= root[i, i]
-    for i in range(k):
-        solution[i] /= units[i]
-
-
-@compiled()
-def solve_reweighted(columns, which, loss_scale, medians, limits):  # type: ignore[no-untyped-def]
+def solve_reweighted(
+    columns: Array, which: Rows, loss_scale: float | None, medians: float, limits: Limits
+) -> tuple[Array, Array, Array, Array] | None:
     """Iteratively reweighted least squares with a Cauchy loss on the norm of each row's error.
 
     Args:
         columns: as above.
         which: numbers of the columns of the k unknowns, and last that of the errors at zero.
-        loss_scale: of the loss; 0: ``medians`` times the median of the errors.
+        loss_scale: of the loss; None: ``medians`` times the median of the errors.
         medians: see there.
         limits: iterations; largest change of an error, in units of the loss' scale; smallest
             share of an unknown's column that is no combination of those before it.
 
     Returns:
-        (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors at the solution; whether
-        that matrix is regular.
+        (k,) solution; (k, k) normal matrix; (n,) weights; (2, n) errors at the solution. None if
+        that matrix is singular.
     """
-    k, n = len(which) - 1, columns.shape[2]
-    factors = np.zeros(k + 1)
-    factors[k] = -1.0
-    products, weights, squares = np.zeros((k + 1, k + 1)), np.zeros(n), np.empty(n)
-    units, root, solution = np.empty(k), np.empty((k, k)), np.empty(k)
-    errors = -columns[which[k]]
-    for _ in range(limits[0]):
+    iterations, converged, least = limits
+    factors = np.append(np.zeros(len(which) - 1), -1.0)
+    errors, squares, weights = -columns[which[-1]], np.empty(columns.shape[2]), np.empty(0)
+    products = np.empty((len(which), len(which)))
+    for _ in range(iterations):
         scale = loss_scale
-        if scale == 0.0:
-            for i in range(n):
-                squares[i] = errors[0, i] * errors[0, i] + errors[1, i] * errors[1, i]
+        if scale is None:
+            np.einsum("pn,pn->n", errors, errors, out=squares)
             scale = medians * math.sqrt(median(squares)) + 1e-12
         weights = _cauchy_weights(errors, scale)
         products = weighted_products(columns, which, weights)
-        if not _factorize(products, limits[2], units, root):
-            return factors[:k], products[:k, :k], weights, errors, False
-        _solve(products, units, root, solution)
-        for i in range(k):  # an assignment to a slice would compile its error message: 2 s
-            factors[i] = solution[i]
-        if _move(columns, which, factors, errors) < limits[1] * scale:
+        scaled, units = unit_diagonal(products[:-1, :-1])
+        try:
+            root = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            return None
+        if np.diag(root).min() ** 2 < least:
+            return None
+        factors[:-1] = np.linalg.solve(scaled, products[:-1, -1] / units) / units
+        if _move(columns, which, factors, errors) < converged * scale:
             break
-    return factors[:k], products[:k, :k], weights, errors, True
+    return factors[:-1], products[:-1, :-1], weights, errors
 
 
 @compiled(fastmath=_FAST)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.config import Config
-from calibgraph.solver.spread_kernel import spreads_alone, spreads_shared
-from factors.block_arrays import contiguous
+from calibgraph.solver.spread_kernel import spreads
 from factors.compiled import one_at_a_time
 
 Array = NDArray[np.float64]
@@ -84,15 +83,9 @@ def robust_spread(values: Array) -> float:
 def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
     """(r,) :func:`robust_spread` of the finite values in each of (r, 2) runs of (n,) values."""
     shared = len(values) >= _WORTH_SHARING
-    run = one_at_a_time(spreads_shared) if shared else spreads_alone
-    spreads: Array = run(
-        np.ascontiguousarray(values),
-        contiguous(runs),
-        (_START_QUANTILE, _START_FACTOR),
-        _HALF,
-        _CUT,
-    )
-    return spreads
+    run = one_at_a_time(spreads) if shared else spreads
+    found: Array = run(values, runs, (_START_QUANTILE, _START_FACTOR), _CUT, shared=shared)
+    return found
 
 
 def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:

@@ -51,7 +51,7 @@ def _held_out_ratio(
     errors = [block.errors_px(T)[0] for T in halves]
     fitted = np.concatenate([errors[0][even], errors[1][~even]])
     held_out = np.concatenate([errors[0][~even], errors[1][even]])
-    return float(median(held_out) / max(median(fitted), np.finfo(float).tiny))
+    return median(held_out) / max(median(fitted), float(np.finfo(float).tiny))
 
 
 def restart_checks(evidence: Evidence) -> Checks:

@@ -100,7 +100,7 @@ def point_distance_checks(evidence: Evidence) -> Checks:
     """Whether the points can be in metres."""
     row = threshold("point_distance")
     return {
-        name: [row.check(float(median(_lengths(block.block.points_lidar_m))))]
+        name: [row.check(median(_lengths(block.block.points_lidar_m)))]
         for name, block in evidence.solution.objective.blocks.items()
     }
 

@@ -97,7 +97,7 @@ def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float
         block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
     )
     distances = np.sqrt(x * x + y * y + z * z)
-    return float(quantile(distances, 0.02)), float(quantile(distances, 0.98))
+    return quantile(distances, 0.02), quantile(distances, 0.98)
 
 
 def prior_shares(solution: Solution, robust_hessians: Mapping[str, Array]) -> dict[str, float]:

@@ -345,6 +345,8 @@ def test_kernels_are_compiled_once_whether_or_not_their_arrays_can_be_written() 
         block.run_norms(pose[None], runs)
         block.costs_at_each(pose[None])
         block.lens.are_projectable(block.points_lidar_m, pose)
-    for one in (kernel.accumulate_alone, kernel.residuals_alone, kernel.norms_alone,
-                kernel.costs_alone):  # fmt: skip
+    for one in (
+        kernel.accumulate(block.lens.kind, shared=False),
+        kernel.evaluate(block.lens.kind, shared=False),
+    ):
         assert len(one.signatures) == 1, one.signatures

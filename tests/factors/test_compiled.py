@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from factors.compiled import compiled, fingerprint
-from factors.kernel import accumulate_alone, accumulate_shared
+from factors.kernel import accumulate
+from tests.conftest import ROOT
 
-LOGARITHM = """
+MAIN = """
 from factors.compiled import compiled
 from kernels.helper import twice, OFFSET
 
@@ -29,18 +31,8 @@ OFFSET = {offset}
 def twice(x):
     return {factor} * x
 """
-INTRINSIC_HELPER = """
-from numba.extending import intrinsic
-OFFSET = {offset}
-
-@intrinsic
-def twice(_, x):
-    def build(context, builder, signature, arguments):
-        return builder.fmul(arguments[0], arguments[0].type({factor}))
-    return x(x), build
-"""
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
-LENS = (
+LOSS = (
     "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
     "print(kernel(1, 2.0, 9.0), sum(kernel.stats.cache_hits.values()))"
 )
@@ -78,23 +70,18 @@ def read_only(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of kernels that a first process has compiled."""
-    folder = tmp_path_factory.mktemp("kernels") / "new" / "cache"
-    assert run(LENS, NUMBA_CACHE_DIR=str(folder)) == (f"{HUBER} 0", "")
-    return folder
-
-
-def test_a_second_process_does_not_compile_again(kept: Path) -> None:
-    assert run(LENS, NUMBA_CACHE_DIR=str(kept)) == (f"{HUBER} 1", "")
+def test_a_second_process_does_not_compile_again(tmp_path: Path) -> None:
+    """The folder is made where there is none."""
+    folder = str(tmp_path / "new" / "cache")
+    found = [run(LOSS, NUMBA_CACHE_DIR=folder) for _ in range(2)]
+    assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
 
 
 @pytest.mark.slow
 def test_the_users_cache_folder_is_the_default(tmp_path: Path) -> None:
-    found = [run(LENS, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) for _ in range(2)]
+    found = [run(LOSS, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) for _ in range(2)]
     assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
-    assert [*(tmp_path / "calibgraph").glob("loss_and_weight-*.kernel")]
+    assert [*(tmp_path / "calibgraph").glob("factors-*/*/loss.loss_and_weight-*.nbi")]
 
 
 @pytest.mark.parametrize(
@@ -107,7 +94,7 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     packages = tmp_path / "packages"
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
-    two = LENS + "\nfrom factors.lens_kernels import is_projectable as other"
+    two = LOSS + "\nfrom factors.lens_kernels import is_projectable as other"
     two += "; print(other(0, np.ones(13), 0.0, 0.0, 1.0))"
     out, err = run(two, path=packages, **{variable: str(read_only)})
     assert out.splitlines() == [f"{HUBER} 0", "True"]
@@ -118,72 +105,76 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
 
 def test_a_file_in_the_place_of_the_folder_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    out, err = run(LENS, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
+    out, err = run(LOSS, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
     assert out == f"{HUBER} 0"
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
 
 
-def test_kernels_in_a_read_only_folder_are_used(tmp_path: Path, kept: Path) -> None:
-    """As in a container whose image was made with them."""
-    folder = Path(shutil.copytree(kept, tmp_path / "cache"))
-    folder.chmod(0o555)
-    assert run(LENS, NUMBA_CACHE_DIR=str(folder)) == (f"{HUBER} 1", "")
-
-
-@pytest.mark.parametrize("damage", [b"", b"nonsense", None])
-@pytest.mark.slow
-def test_damaged_files_are_compiled_anew(tmp_path: Path, damage: bytes | None) -> None:
-    run(LENS, NUMBA_CACHE_DIR=str(tmp_path))
-    (file,) = tmp_path.glob("loss_and_weight-*.kernel")
-    whole = file.read_bytes()
-    file.write_bytes(whole[:-100] + bytes(100) if damage is None else damage)
-    assert run(LENS, NUMBA_CACHE_DIR=str(tmp_path)) == (f"{HUBER} 0", "")
-    assert run(LENS, NUMBA_CACHE_DIR=str(tmp_path)) == (f"{HUBER} 1", "")
-
-
-@pytest.mark.parametrize("helper", [HELPER, INTRINSIC_HELPER])
-@pytest.mark.slow
-def test_a_change_of_a_callee_or_a_constant_is_noticed(helper: str, tmp_path: Path) -> None:
+def test_a_change_of_a_callee_or_a_constant_is_noticed(tmp_path: Path) -> None:
     """Both are in another file than the kernel, whose own file stays the same."""
     folder, cache = tmp_path / "kernels", str(tmp_path / "cache")
     folder.mkdir()
     (folder / "__init__.py").write_text("")
-    (folder / "main.py").write_text(LOGARITHM)
+    (folder / "main.py").write_text(MAIN)
     for factor, offset, hits in ((2.0, 1.0, 0), (2.0, 5.0, 0), (7.0, 5.0, 0), (2.0, 1.0, 1)):
-        (folder / "helper.py").write_text(helper.format(factor=factor, offset=offset))
+        (folder / "helper.py").write_text(HELPER.format(factor=factor, offset=offset))
         shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # Python compares times
         found = run(CALL, path=tmp_path, NUMBA_CACHE_DIR=cache)
         assert found == (f"{factor * 3.0 + offset} {hits}", "")  # the first version is kept too
 
 
-@pytest.mark.slow
-def test_few_versions_of_a_kernel_are_kept(tmp_path: Path) -> None:
-    folder = tmp_path / "kernels"
-    folder.mkdir()
-    (folder / "__init__.py").write_text("")
-    (folder / "main.py").write_text(LOGARITHM)
-    two_kept = "import factors.compiled; factors.compiled._VERSIONS_KEPT = 2\n"
-    for offset in range(3):
-        (folder / "helper.py").write_text(HELPER.format(factor=2.0, offset=offset))
-        shutil.rmtree(folder / "__pycache__", ignore_errors=True)
-        run(two_kept + CALL, path=tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
-    assert len([*(tmp_path / "cache").glob("kernel-*.kernel")]) == 2
+def test_code_that_no_process_has_used_for_a_week_is_removed(tmp_path: Path) -> None:
+    old, recent = tmp_path / "factors-old", tmp_path / "factors-recent"
+    old.mkdir()
+    recent.mkdir()
+    os.utime(old, (0, 0))
+    run(LOSS, NUMBA_CACHE_DIR=str(tmp_path))
+    assert recent.exists() and not old.exists()
 
 
-def test_a_kernel_with_threads_is_not_taken_for_the_one_without() -> None:
-    """They are compiled from one function, with other options."""
-    assert accumulate_alone.py_func is accumulate_shared.py_func
-    assert fingerprint(accumulate_alone) != fingerprint(accumulate_shared)
+def test_kernels_of_two_kinds_of_lens_and_of_all_cores_are_kept_apart(tmp_path: Path) -> None:
+    code = (
+        "import numpy as np; from factors import Lens\n"
+        "points = np.array([[0.3, 0.2, 1.0]])\n"
+        "size = dict(fx=1.0, fy=1.0, cx=0.0, cy=0.0)\n"
+        "for lens in (Lens.pinhole(**size), Lens.equirectangular(**size)):\n"
+        "    print(lens.project(points)[0].round(3).tolist())"
+    )
+    found = {run(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)}
+    assert found == {("[[0.3, 0.2]]\n[[0.291, 0.189]]", "")}
+    assert accumulate(0, shared=False) is not accumulate(0, shared=True)
 
 
-def test_a_global_that_cannot_be_compared_is_refused() -> None:
-    with pytest.raises(TypeError, match="which is not compared; give it as an argument"):
-        fingerprint(_kernel_of_an_object)
+def test_kernels_use_kernels_and_constants_of_their_own_folder_and_of_factors_alone() -> None:
+    """The cache compares the files of these two folders."""
+    files = [*ROOT.glob("factors/*.py"), *ROOT.glob("calibgraph/**/*.py")]
+    kernels = [file for file in files if re.search(r"^ *@compiled\(", file.read_text(), re.M)]
+    assert len(kernels) > 10
+    for file in kernels:
+        folder = ".".join(file.parent.relative_to(ROOT).parts)
+        for used in _names_in_kernels(ast.parse(file.read_text())):
+            assert used.startswith((f"{folder}.", "factors.", "numba.", "typing.")), used
 
 
-_OBJECT = object()
-
-
-@compiled()
-def _kernel_of_an_object(x):  # type: ignore[no-untyped-def]
-    return x if _OBJECT is None else -x
+def _names_in_kernels(module: ast.Module) -> set[str]:
+    """What the kernels of a module use of other modules."""
+    imported = {
+        alias.asname or alias.name: f"{node.module}.{alias.name}"
+        for node in ast.walk(module)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    kernels = [
+        node
+        for node in ast.walk(module)
+        if isinstance(node, ast.FunctionDef)
+        and any("compiled(" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
+    names = {
+        node.id
+        for kernel in kernels
+        for statement in kernel.body
+        for node in ast.walk(statement)
+        if isinstance(node, ast.Name)
+    }
+    return {imported[name] for name in names if name in imported}

@@ -1,10 +1,13 @@
 """The kernel that scores windows against an image at every shift of a grid.
 
 Where the time of a calibration goes. What makes it fast, measured against a matrix product by
-``benchmarks.speed.kernel``: the sums over a window's points are taken for a block of shifts at
-once, in registers, so that a pixel is loaded for all products that it is in, and no sum is loaded
-or stored in between. The image has zero mean, which keeps single precision: its sum of squares is
-then not the difference of two large numbers.
+``benchmarks.speed.kernel``: the shifts are taken in strips, a vector wide, whose sums stay in the
+first-level cache, and the points four at a time, so that a sum is loaded and stored once for all of
+them. The image has zero mean, which keeps single precision: its sum of squares is then not the
+difference of two large numbers.
+
+All loops over a strip have constant bounds and unsigned indices, which LLVM vectorizes without
+remainders, and only as long as their values fit the 32 registers: hence the numbers below.
 """
 
 import math
@@ -12,13 +15,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.structure.registers import (
-    LANES,
-    ROWS,
-    fill_block,
-    load_block,
-    store_block,
-)
 from factors.compiled import compiled
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
@@ -31,7 +27,11 @@ CHANCE_DEPTH, CHANCE_INTENSITY = 0.13, 0.05
 """Shares of a structured image's variation that an unrelated window explains. Without them,
 windows would rather lie on any structure than on the flat image that they belong to."""
 FACTORS = 16  # multiplied before a logarithm is taken: 0.1^16 is a normal number yet
-UNCOUNTED = {"_nrt": False}  # arrays of callers: to count references takes as long as short loops
+LANES, LINES = 16, 48  # columns and rows of shifts in a strip
+POINTS = 4  # added at once
+SUMS, SUMS_WITH_TREND = 4, 6  # of each shift
+_TO_FACTOR = np.float32(1 / (1 + MIN_RESIDUAL_SHARE))
+_index = np.uint64  # numba tests other integers for negative ones
 
 
 def score_windows(
@@ -65,33 +65,45 @@ def score_windows(
         chance: how much of an unrelated window's share to subtract.
     """
     height, width = image.shape
-    pixels = np.zeros((height + ROWS, width + LANES), np.float32)  # blocks may begin anywhere
-    pixels[:height, :width] = image - image.mean()
     rows, columns = grids.shape[1:]
     padded = math.ceil(columns / LANES) * LANES
+    pixels = np.zeros((height + LINES, width + LANES), np.float32)  # strips may begin anywhere
+    pixels[:height, :width] = image - image.mean()
+    ones = _aligned(2 * LANES)
+    ones[:LANES] = 1
+    totals = _aligned(rows * padded + LANES)
+    totals[:] = likelihood
     room = (
-        np.empty(places.shape[1], np.int64),
-        np.empty(ROWS * padded, np.float32),
-        np.full((rows + ROWS) * padded, likelihood, np.float32),
+        np.empty(places.shape[1] + POINTS, np.int64),
+        _aligned(LINES * SUMS_WITH_TREND * LANES),
+        ones,
+        totals,
     )
     _score_windows(
         pixels.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
-        grids, (chance * CHANCE_DEPTH, chance * CHANCE_INTENSITY),
+        grids, (np.float32(chance * CHANCE_DEPTH), np.float32(chance * CHANCE_INTENSITY)),
     )  # fmt: skip
 
 
-@compiled(fastmath=True, **UNCOUNTED)
+def _aligned(size: int) -> NDArray[np.float32]:
+    """Zeros that begin where a vector does: others take half as long again to load and store."""
+    room = np.zeros(size + LANES, np.float32)
+    first = -(room.ctypes.data // room.itemsize) % LANES
+    return room[first : first + size]
+
+
+@compiled(fastmath=True)
 def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_chance):  # type: ignore[no-untyped-def]
     """See :func:`score_windows`.
 
-    room: for the place in pixels of each point of a window, the scores of a row of blocks, and the
-    scores of a group, in rows as long as whole blocks; of likelihoods they are factors.
+    room: for the place in pixels of each point of a window; zeros for the sums of a strip; a vector
+    of ones and one of zeros; and for the scores of a group, of likelihoods the factors, in rows of
+    whole vectors.
     """
-    height, width = shape
-    places, counts, basis, group = windows
-    start, scores, totals = room
-    stride, padded = width + LANES, len(scores) // ROWS
-    rows, columns = grids.shape[1], grids.shape[2]
+    (height, width), (places, counts, basis, group) = shape, windows
+    starts, sums, ones, totals = room
+    stride, rows, columns = width + LANES, grids.shape[1], grids.shape[2]
+    padded = (columns + LANES - 1) // LANES * LANES
     held = 0  # windows whose scores are in the totals
     for w in range(len(places)):
         n = counts[w]
@@ -99,80 +111,118 @@ def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_c
             _take_totals(totals, padded, likelihood, grids[group[w - 1]])
             held = 0
         held += 1
-        left, right, top, bottom = _find_extent(places[w], n)
+        left, top = places[w, 0, 0], places[w, 0, 1]
+        right, bottom, share = left, top, np.float32(0)
+        for p in range(n):
+            u, v = places[w, p, 0], places[w, p, 1]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            share += by_chance[0] * basis[w, p, 0] ** 2 + by_chance[1] * basis[w, p, 1] ** 2
         first, above = max(origin[0], -left), max(origin[1], -top)
         size = min(origin[0] + columns, width - right) - first
         end = min(origin[1] + rows, height - bottom)
-        chance = 0.0
-        for p in range(n):
-            chance += by_chance[0] * basis[w, p, 0] ** 2 + by_chance[1] * basis[w, p, 1] ** 2
-            start[p] = (places[w, p, 1] + above) * stride + places[w, p, 0] + first
-        for shift in range(above, end, ROWS):
-            for k in range(0, size, LANES):
-                at = (shift - above) * stride + k
-                score = _score_block(pixels, start, at, stride, n, basis[w], chance, likelihood)
-                store_block(scores, k, padded, score)
-            at = (shift - origin[1]) * padded + first - origin[0]
-            length = size if size < columns else padded  # of whole vectors where it can be
-            _add_scores(scores, padded, min(ROWS, end - shift), length, likelihood, totals[at:])
+        numbers = np.float32(1 / n), np.float32(n * GRAY_NOISE**2), share
+        for p in range(n - 1, n + POINTS):
+            starts[p] = height * stride  # zeros, which add nothing
+        for column in range(0, size, LANES):
+            inside = ones[LANES - min(size - column, LANES) :]
+            for row in range(above, end, LINES):
+                corner, lines = row * stride + first + column, min(LINES, end - row)
+                for p in range(n - 1):
+                    starts[p] = places[w, p, 1] * stride + places[w, p, 0] + corner
+                last = pixels[places[w, n - 1, 1] * stride + places[w, n - 1, 0] + corner :]
+                out = totals[(row - origin[1]) * padded + first - origin[0] + column :]
+                strip = (lines, stride, padded)
+                if likelihood:
+                    _add_points(pixels, starts, basis[w], n - 1, strip, sums)
+                    _multiply_factors(last, basis[w, n - 1], strip, sums, numbers, inside, out)
+                else:
+                    _add_points_with_trend(pixels, starts, basis[w], n - 1, strip, sums)
+                    _add_scores(last, basis[w, n - 1], strip, sums, numbers, inside, out)
     if held:
         _take_totals(totals, padded, likelihood, grids[group[-1]])
 
 
-@compiled(**UNCOUNTED)
-def _find_extent(places, n):  # type: ignore[no-untyped-def]
-    """The least and largest u, then v, of the first n places."""
-    left, top = places[0, 0], places[0, 1]
-    right, bottom = left, top
-    for p in range(1, n):
-        left, right = min(left, places[p, 0]), max(right, places[p, 0])
-        top, bottom = min(top, places[p, 1]), max(bottom, places[p, 1])
-    return left, right, top, bottom
+@compiled(fastmath=True)
+def _add_points(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
+    """Add points to the sums of a strip: along depth and intensity, plain, and squared."""
+    lines, stride, _ = strip
+    for p in range(0, count, POINTS):
+        s0, s1, s2, s3 = starts[p], starts[p + 1], starts[p + 2], starts[p + 3]
+        a0, a1, a2, a3 = basis[p, 0], basis[p + 1, 0], basis[p + 2, 0], basis[p + 3, 0]
+        b0, b1, b2, b3 = basis[p, 1], basis[p + 1, 1], basis[p + 2, 1], basis[p + 3, 1]
+        for line in range(lines):
+            for k in range(LANES):
+                at, m = line * stride + k, line * SUMS * LANES + k
+                x0, x1 = pixels[_index(s0 + at)], pixels[_index(s1 + at)]
+                x2, x3 = pixels[_index(s2 + at)], pixels[_index(s3 + at)]
+                sums[_index(m)] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                sums[_index(m + LANES)] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                sums[_index(m + 2 * LANES)] += x0 + x1 + x2 + x3
+                sums[_index(m + 3 * LANES)] += x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3
 
 
-@compiled(fastmath=True, **UNCOUNTED)
-def _score_block(pixels, start, at, stride, n, basis, chance, likelihood):  # type: ignore[no-untyped-def]
-    """The score of a window of n points at a block of shifts; of a likelihood, the factor.
-
-    At the first of the shifts, point p lies at pixels[start[p] + at].
-    """
-    noise = n * GRAY_NOISE**2
-    depth, intensity, total = fill_block(0.0), fill_block(0.0), fill_block(0.0)
-    variation = fill_block(noise)
-    for p in range(n):
-        seen = load_block(pixels, start[p] + at, stride)
-        depth += basis[p, 0] * seen
-        intensity += basis[p, 1] * seen
-        total += seen
-        variation += seen * seen
-    variation -= total * total * (1.0 / n)
-    explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
-    if likelihood:
-        share = (explained + chance * noise) / variation - chance
-        return 1.0 - share * (1 / (1 + MIN_RESIDUAL_SHARE))
-    trend_u, trend_v = fill_block(0.0), fill_block(0.0)
-    for p in range(n):
-        seen = load_block(pixels, start[p] + at, stride)
-        trend_u += basis[p, 2] * seen
-        trend_v += basis[p, 3] * seen
-    variation -= trend_u * trend_u + trend_v * trend_v
-    return (explained + chance * noise) / variation - chance
+@compiled(fastmath=True)
+def _add_points_with_trend(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
+    """As :func:`_add_points`, and along both columns of the trend."""
+    lines, stride, _ = strip
+    for p in range(0, count, POINTS):
+        s0, s1, s2, s3 = starts[p], starts[p + 1], starts[p + 2], starts[p + 3]
+        a0, a1, a2, a3 = basis[p, 0], basis[p + 1, 0], basis[p + 2, 0], basis[p + 3, 0]
+        b0, b1, b2, b3 = basis[p, 1], basis[p + 1, 1], basis[p + 2, 1], basis[p + 3, 1]
+        c0, c1, c2, c3 = basis[p, 2], basis[p + 1, 2], basis[p + 2, 2], basis[p + 3, 2]
+        d0, d1, d2, d3 = basis[p, 3], basis[p + 1, 3], basis[p + 2, 3], basis[p + 3, 3]
+        for line in range(lines):
+            for k in range(LANES):
+                at, m = line * stride + k, line * SUMS_WITH_TREND * LANES + k
+                x0, x1 = pixels[_index(s0 + at)], pixels[_index(s1 + at)]
+                x2, x3 = pixels[_index(s2 + at)], pixels[_index(s3 + at)]
+                sums[_index(m)] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                sums[_index(m + LANES)] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                sums[_index(m + 2 * LANES)] += x0 + x1 + x2 + x3
+                sums[_index(m + 3 * LANES)] += x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3
+                sums[_index(m + 4 * LANES)] += c0 * x0 + c1 * x1 + c2 * x2 + c3 * x3
+                sums[_index(m + 5 * LANES)] += d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
 
 
-@compiled(fastmath=True, **UNCOUNTED)
-def _add_scores(scores, padded, lines, size, likelihood, totals):  # type: ignore[no-untyped-def]
-    """Add lines of scores to the totals, or multiply factors."""
+@compiled(fastmath=True)
+def _multiply_factors(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
+    """Add the last point of a window, multiply the factors of the strip, and clear its sums."""
+    (lines, stride, padded), (over, noise, chance) = strip, numbers
+    a, b = basis[0], basis[1]
     for line in range(lines):
-        of_line, out = scores[line * padded :], totals[line * padded :]
-        if likelihood:
-            for k in range(size):
-                out[k] *= of_line[k]
-        else:
-            for k in range(size):
-                out[k] += of_line[k]
+        for k in range(LANES):
+            x, m = pixels[_index(line * stride + k)], line * SUMS * LANES + k
+            depth, intensity = sums[_index(m)] + a * x, sums[_index(m + LANES)] + b * x
+            total, square = sums[_index(m + 2 * LANES)] + x, sums[_index(m + 3 * LANES)] + x * x
+            sums[_index(m)] = sums[_index(m + LANES)] = 0
+            sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
+            variation = square - total * total * over + noise
+            explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
+            share = (explained + chance * noise) / variation - chance
+            out[_index(line * padded + k)] *= np.float32(1) - inside[_index(k)] * share * _TO_FACTOR
 
 
-@compiled(fastmath=True, **UNCOUNTED)
+@compiled(fastmath=True)
+def _add_scores(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
+    """As :func:`_multiply_factors`, with the trend, and the scores are added."""
+    (lines, stride, padded), (over, noise, chance) = strip, numbers
+    a, b, c, d = basis[0], basis[1], basis[2], basis[3]
+    for line in range(lines):
+        for k in range(LANES):
+            x, m = pixels[_index(line * stride + k)], line * SUMS_WITH_TREND * LANES + k
+            depth, intensity = sums[_index(m)] + a * x, sums[_index(m + LANES)] + b * x
+            total, square = sums[_index(m + 2 * LANES)] + x, sums[_index(m + 3 * LANES)] + x * x
+            u, v = sums[_index(m + 4 * LANES)] + c * x, sums[_index(m + 5 * LANES)] + d * x
+            sums[_index(m)] = sums[_index(m + LANES)] = 0
+            sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
+            sums[_index(m + 4 * LANES)] = sums[_index(m + 5 * LANES)] = 0
+            variation = square - total * total * over + noise - u * u - v * v
+            explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
+            share = (explained + chance * noise) / variation - chance
+            out[_index(line * padded + k)] += inside[_index(k)] * share
+
+
+@compiled(fastmath=True)
 def _take_totals(totals, padded, likelihood, grid):  # type: ignore[no-untyped-def]
     """Add the totals to a grid, of factors the negative logarithms, and clear them."""
     for row in range(grid.shape[0]):

@@ -1,6 +1,8 @@
 """Which points of a cloud a camera sees."""
 
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +43,8 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
     points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
     rows = np.empty(len(points), np.intp)
     views = np.empty((len(points), 3))
-    count = _find_in_view(
-        lens.kind, lens.packed, T, points, camera.width_px, camera.height_px, _least_cosine(camera),
+    count = _find_in_view(lens.kind)(
+        lens.packed, T, points, camera.width_px, camera.height_px, _least_cosine(camera),
         rows, views,
     )  # fmt: skip
     return rows[:count], views[:count, :2], views[:count, 2]
@@ -71,27 +73,31 @@ def find_places(
     """(w, l, 2) nearest pixels, of an image scaled by (2,), to the ends of rays (w, l, 3)."""
     lens, T = camera.lens, contiguous(camera.T_camera_lidar)
     places = np.empty((*rays_m.shape[:2], 2), np.int32)
-    _find_places(lens.kind, lens.packed, T, viewpoint_lidar_m, scale, rays_m, places)
+    _find_places(lens.kind)(lens.packed, T, viewpoint_lidar_m, scale, rays_m, places)
     return places
 
 
-@compiled()
-def _find_places(kind, lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
-    for w in range(rays_m.shape[0]):
-        for p in range(rays_m.shape[1]):
-            px, py = rays_m[w, p, 0] + viewpoint[0], rays_m[w, p, 1] + viewpoint[1]
-            pz = rays_m[w, p, 2] + viewpoint[2]
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            projection = project_one(kind, lens, x, y, z)
-            u = projection[0]
-            if p == 0:
-                centre = u
-            elif kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
-                u = centre + subtract_columns(kind, lens, u, centre)
-            places[w, p, 0] = round((u + 0.5) * scale[0] - 0.5)
-            places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
+@cache
+def _find_places(kind: int) -> Any:
+    @compiled()
+    def run(lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
+        for w in range(rays_m.shape[0]):
+            for p in range(rays_m.shape[1]):
+                px, py = rays_m[w, p, 0] + viewpoint[0], rays_m[w, p, 1] + viewpoint[1]
+                pz = rays_m[w, p, 2] + viewpoint[2]
+                x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+                y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+                z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+                projection = project_one(kind, lens, x, y, z)
+                u = projection[0]
+                if p == 0:
+                    centre = u
+                elif kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
+                    u = centre + subtract_columns(kind, lens, u, centre)
+                places[w, p, 0] = round((u + 0.5) * scale[0] - 0.5)
+                places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
+
+    return run
 
 
 def _least_cosine(camera: Camera) -> float:
@@ -106,26 +112,30 @@ def _least_cosine(camera: Camera) -> float:
     return float(rays[:, 2].min()) * _COSINE_MARGIN
 
 
-@compiled()
-def _find_in_view(kind, lens, T, points, width, height, least_cosine, rows, views):  # type: ignore[no-untyped-def]
-    count = 0
-    for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        squared = x * x + y * y + z * z
-        if least_cosine > 0 and (z <= 0 or z * z < least_cosine * least_cosine * squared):
-            continue
-        if not is_projectable(kind, lens, x, y, z):
-            continue
-        projection = project_one(kind, lens, x, y, z)
-        u, v = projection[0] + 0.5, projection[1] + 0.5
-        if u < 0 or v < 0 or u >= width or v >= height:
-            continue
-        rows[count] = i
-        views[count, 0] = math.atan2(x, z)
-        views[count, 1] = math.atan2(y, math.sqrt(x * x + z * z))
-        views[count, 2] = math.sqrt(squared)
-        count += 1
-    return count
+@cache
+def _find_in_view(kind: int) -> Any:
+    @compiled()
+    def run(lens, T, points, width, height, least_cosine, rows, views):  # type: ignore[no-untyped-def]
+        count = 0
+        for i in range(len(points)):
+            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            squared = x * x + y * y + z * z
+            if least_cosine > 0 and (z <= 0 or z * z < least_cosine * least_cosine * squared):
+                continue
+            if not is_projectable(kind, lens, x, y, z):
+                continue
+            projection = project_one(kind, lens, x, y, z)
+            u, v = projection[0] + 0.5, projection[1] + 0.5
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            rows[count] = i
+            views[count, 0] = math.atan2(x, z)
+            views[count, 1] = math.atan2(y, math.sqrt(x * x + z * z))
+            views[count, 2] = math.sqrt(squared)
+            count += 1
+        return count
+
+    return run
