@@ -54,7 +54,7 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
 def _triangular_root(scaled: Array) -> Array | None:
     """Cholesky's root of a matrix of unit diagonal; None where it is nearly singular."""
     try:
-        root: Array = np.linalg.cholesky(scaled)
+        root = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     return root if (np.diag(root) ** 2 > REGULAR).all() else None
