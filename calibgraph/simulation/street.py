@@ -57,9 +57,8 @@ Rng = np.random.Generator
 LANE_Y_M = -LANE_M / 2
 _PAVEMENT_Y_M, _GROUND_Y_M = 9.36, 24.0
 _WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wavelength [m]
-_STEP_M = 1.0
+_STEP_M, _CLEAR_M = 1.0, 14.0
 _BALCONIES, _GABLE = 0.4, 0.6
-_CLEAR_M = 14.0
 KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
 
 
