@@ -36,8 +36,7 @@ from factors.lens_kernels import PINHOLE, RADTAN
 Array = NDArray[np.float64]
 
 FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.02, 0.002, 5.0
-"""Of the prior, where the rig states none: of a lens in doubt. Good calibrations with a target leave
-0.2 % and 2 px."""
+"""Of the prior, where the rig states none: of a lens in doubt. A target leaves 0.2 % and 2 px."""
 
 RADIAL_SIGMA, TANGENTIAL_SHARE = 0.05, 0.1
 """The same of a radial coefficient; and a tangential one's in parts of it."""
