@@ -46,6 +46,8 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
+        if options.get("parallel"):  # the cache knows a function by its name, not by the options
+            function.__qualname__ += "_by_all_cores"
         folder, before = _folder(Path(function.__code__.co_filename).parent), _config.CACHE_DIR
         _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
         try:

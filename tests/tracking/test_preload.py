@@ -7,6 +7,7 @@ import sys
 
 PROGRAM = """
 import gc
+import sys
 from factors.loss import loss_and_weight
 from calibgraph import IncrementalCalibrator, perturb
 from calibgraph.simulation.correspondences import simulate_correspondences
