@@ -22,7 +22,7 @@ from calibgraph.simulation.fleet_tables import write_fleet
 POISON = Path(__file__).parent / "poison"
 GOOD, ILL, BROKEN = "car-00001", ("segfault", "hungry", "endless", "bug"), "broken"
 # 3 GB: a child's libraries reserve under 1 GB, the hungry one takes 8 GB.
-LIMITS = Limits(timeout_s=4.0, memory_bytes=3 * 10**9)
+LIMITS = Limits(timeout_s=15.0, memory_bytes=3 * 10**9)  # a good job takes 1 s on an idle machine
 
 
 @dataclass(frozen=True)
