@@ -6,13 +6,15 @@ on standard error (by ``logging``) reports it once.
 
 numba compares the source file of a kernel alone, and not what the file imports. So a kernel may use
 the kernels and constants of its own folder and of ``factors``, and the cache is one of all files of
-these two: a change of any of them begins another.
+these two and of the versions of Python, numpy and numba: a change of any of them begins another.
+Environments with other versions thus do not overwrite each other's code while it is in use.
 """
 
 import hashlib
 import logging
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,6 +24,7 @@ from threading import Lock
 from typing import Any
 
 import numba
+import numpy as np
 import platformdirs
 
 _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long is removed
@@ -76,7 +79,7 @@ def one_at_a_time(kernel: Any) -> Callable[..., Any]:
 @cache
 def _folder(source: Path) -> Path | None:
     """Where the code of the kernels of a folder is kept; None if nothing can be written."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"{numba.__version__} {np.__version__} {sys.version}".encode())
     for file in sorted({*source.glob("*.py"), *Path(__file__).parent.glob("*.py")}):
         digest.update(file.read_bytes())
     name, chosen = f"{source.name}-{digest.hexdigest()[:16]}", _config.CACHE_DIR

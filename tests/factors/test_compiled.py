@@ -8,11 +8,14 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba import prange
 
-from factors.kernel import accumulate
+from factors.compiled import compiled
 from tests.conftest import ROOT
 
 MAIN = """
@@ -142,7 +145,29 @@ def test_kernels_of_two_kinds_of_lens_and_of_all_cores_are_kept_apart(tmp_path: 
     )
     found = {run(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)}
     assert found == {("[[0.3, 0.2]]\n[[0.291, 0.189]]", "")}
-    assert accumulate(0, shared=False) is not accumulate(0, shared=True)
+    code = (
+        "import numpy as np; from factors.compiled import compiled\n"
+        "from tests.factors.test_compiled import totals\n"
+        "print([totals(shared)(np.ones(3)) for shared in {order}])\n"
+        "print([sum(totals(shared).stats.cache_hits.values()) for shared in {order}])"
+    )
+    for order, hits in (((True,), [0]), ((False, True), [0, 1])):
+        printed, _ = run(code.format(order=order), path=ROOT, NUMBA_CACHE_DIR=str(tmp_path))
+        assert printed == f"{[3.0] * len(order)}\n{hits}"
+
+
+@cache
+def totals(shared: bool) -> Any:
+    """A kernel that all cores share, or not, of the same source."""
+
+    @compiled(parallel=shared)
+    def total(values):  # type: ignore[no-untyped-def]
+        found = 0.0
+        for i in prange(len(values)):
+            found += values[i]
+        return found
+
+    return total
 
 
 def test_kernels_use_kernels_and_constants_of_their_own_folder_and_of_factors_alone() -> None:
