@@ -31,12 +31,12 @@ _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long
 _log = logging.getLogger(__name__)
 _config: Any = numba.config  # its attributes are made when numba is imported
 
+_decorating = Lock()  # threads make kernels too: one at a time sets numba's folder
 _all_cores = Lock()
-os.register_at_fork(  # no child is made while another thread holds it
-    before=_all_cores.acquire,
-    after_in_parent=_all_cores.release,
-    after_in_child=_all_cores.release,
-)
+for lock in (_decorating, _all_cores):
+    os.register_at_fork(  # no child is made while another thread holds it
+        before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release
+    )
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -51,14 +51,17 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         if options.get("parallel"):  # the cache knows a function by its name, not by the options
             function.__qualname__ += "_by_all_cores"
-        folder, before = _folder(Path(function.__code__.co_filename).parent), _config.CACHE_DIR
-        _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
-        try:
-            return numba.njit(nogil=True, error_model="numpy", cache=folder is not None, **options)(
-                function
-            )
-        finally:
-            _config.CACHE_DIR = before
+        with _decorating:
+            before = _config.CACHE_DIR
+            folder = _folder(Path(function.__code__.co_filename).parent)
+            _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
+            try:
+                jit = numba.njit(
+                    nogil=True, error_model="numpy", cache=folder is not None, **options
+                )
+                return jit(function)
+            finally:
+                _config.CACHE_DIR = before
 
     return decorate
 

@@ -156,6 +156,22 @@ def test_kernels_of_two_kinds_of_lens_and_of_all_cores_are_kept_apart(tmp_path: 
         assert printed == f"{[3.0] * len(order)}\n{hits}"
 
 
+def test_threads_that_make_kernels_keep_them_in_the_folder(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.setswitchinterval(1e-6)\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "import numba, numpy as np\n"
+        "from tests.factors.test_compiled import totals\n"
+        "with ThreadPoolExecutor(8) as pool:\n"
+        "    kernels = list(pool.map(lambda _: totals.__wrapped__(False), range(200)))\n"
+        "print({kernel._cache.cache_path.startswith(sys.argv[1]) for kernel in kernels})\n"
+        "print(numba.config.CACHE_DIR == sys.argv[1])"
+    )
+    code = f"import sys; sys.argv = ['', {str(tmp_path)!r}]\n{code}"
+    printed, _ = run(code, path=ROOT, NUMBA_CACHE_DIR=str(tmp_path))
+    assert printed == "{True}\nTrue"
+
+
 @cache
 def totals(shared: bool) -> Any:
     """A kernel that all cores share, or not, of the same source."""
