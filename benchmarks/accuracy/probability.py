@@ -21,9 +21,7 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -169,38 +167,10 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
-def additions(
-    name: str, tuned: Sequence[Sample], kept_out: Sequence[Sample], *, jobs: int
-) -> Table:
-    """Per kind of check, what the kept-out likelihood loses where it is left out of the fit."""
-    kinds = sorted({kind for sample in tuned for kind in sample.severities})
-    whole = log_likelihood(fit(tuned), kept_out)
-    with ProcessPoolExecutor(jobs) as pool:
-        lost = [*pool.map(partial(_without, tuned, kept_out), kinds)]
-    rows = sorted(((whole - found, kind) for found, kind in zip(lost, kinds, strict=True)))
-    return Table(
-        f"{name}, kept out: log likelihood {whole:.4f} a result, and what a kind of check adds",
-        ("kind of check", "adds, 1e-4"), tuple((kind, f"{1e4 * gain:.1f}") for gain, kind in rows),
-    )  # fmt: skip
-
-
-def _without(tuned: Sequence[Sample], kept_out: Sequence[Sample], kind: str) -> float:
-    left = [[drop(sample, {kind}) for sample in samples] for samples in (tuned, kept_out)]
-    return log_likelihood(fit(left[0]), left[1])
-
-
 def drop(sample: Sample, kinds: Collection[str]) -> Sample:
     """The sample without some kinds of checks."""
     kept = {kind: value for kind, value in sample.severities.items() if kind not in kinds}
     return replace(sample, severities=kept)
-
-
-def log_likelihood(model: dict[str, Any], samples: Sequence[Sample]) -> float:
-    """Mean of the logarithm of what was foretold, with one result in ten off."""
-    p, off = probabilities(model, samples), np.array([sample.off for sample in samples])
-    count = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
-    p = np.clip(np.where(off, p, 1 - p), 1e-6, 1.0)
-    return float(np.average(np.log(p), weights=count))
 
 
 def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbability]:
@@ -276,8 +246,6 @@ def main() -> None:
     parser.add_argument("--tune", type=Path, nargs="+", default=[], help="files of verdicts")
     parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
     parser.add_argument("--without", default="", help="kinds of checks, left out of everything")
-    parser.add_argument("--additions", action="store_true", help="what each kind of check adds")
-    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--write", action="store_true", help="the weights into the package")
     add_record_option(parser)
     options = parser.parse_args()
@@ -299,8 +267,6 @@ def main() -> None:
         for which, samples in of_level.items():
             if samples:
                 tables += judged(f"{name}, {which}", models[name], samples)
-        if options.additions and clear and of_level["kept out"]:
-            tables.append(additions(name, clear, of_level["kept out"], jobs=options.jobs))
     ledger.publish_cases("accuracy.probability", tables, records, record=options.record)
     if options.write:
         text = {"format": "calibgraph-probability/1", "fitted_by": ledger.code(),

@@ -30,6 +30,7 @@ from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
+from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
@@ -123,12 +124,16 @@ def sample_of(dataset: Dataset, rig: Rig, of: str, frames: int = 4) -> Sample:
     return Sample(torch.tensor(np.concatenate(features)), torch.tensor(np.concatenate(scores)))
 
 
-def features_of(rays_m: np.ndarray, cloud: object, windows: Windows) -> np.ndarray:
+def features_of(rays_m: np.ndarray, cloud: PreparedCloud, windows: Windows) -> np.ndarray:
     """(w, f) features in single precision."""
     found = np.zeros((len(windows.counts), len(FEATURES)))
-    rank = cloud.intensity_rank  # type: ignore[attr-defined]
     fill_features(
-        (rays_m, rank), windows.members, windows.counts, windows.front, windows.basis, found
+        (rays_m, cloud.intensity_rank),
+        windows.members,
+        windows.counts,
+        windows.front,
+        windows.basis,
+        found,
     )
     return found.astype(np.float32)
 
