@@ -94,7 +94,7 @@ def simulate(
         str | None,
         typer.Option(
             metavar="|".join(SURROUNDINGS),
-            help="What the road leads through; beside a street little is there to calibrate by. "
+            help="What the road leads through; all but a street have little to calibrate by. "
             f"(default: {STREET})",
             rich_help_panel=_STREET,
         ),

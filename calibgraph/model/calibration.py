@@ -185,8 +185,8 @@ class Calibration:
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
-        fixed = "" if self.lens else " of the intrinsics"
-        return f"errors{fixed}{scale} are not included"
+        fixed = "other intrinsics" if self.lens else "intrinsics"
+        return f"errors of the {fixed}{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.
