@@ -1,12 +1,10 @@
-"""Wrong intrinsics leave a pattern in the residuals: of focal lengths, principal point, distortion.
+"""Wrong intrinsics leave a pattern in the residuals: the posterior of a free lens, by the matches.
 
-Each is a field of displacements over the image. It is estimated together with the extrinsic; the
-check is the probability that it is wrong and displaces the camera by more than users tolerate.
+The solution's own matches, linearized there with pose and lens free. The check is the probability
+that a parameter is wrong and displaces the camera by more than users tolerate.
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +12,34 @@ from numpy.typing import NDArray
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.augmented_fit import AugmentedFit, linearize_block
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.linear_fit import fit_linear, linearize
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter, check_parameter
+from calibgraph.trust.lens_parameter import (
+    ASPECT_NUMBER,
+    FOCAL_NUMBER,
+    RADIAL_NUMBER,
+    RESIDUALS,
+    SKEW_NUMBER,
+    X_NUMBER,
+    Y_NUMBER,
+    LensParameter,
+    check_parameter,
+    lens_fields_px,
+    lens_variable,
+)
 from calibgraph.trust.thresholds import limit, threshold
 
 Array = NDArray[np.float64]
 
 _UNKNOWNS = {
-    "focal length": (0,),
-    "principal point": (1, 2),
-    "distortion": (3,),
-    "aspect ratio": (4,),
-    "skew": (5,),
+    "focal length": (FOCAL_NUMBER,),
+    "principal point": (X_NUMBER, Y_NUMBER),
+    "distortion": (RADIAL_NUMBER,),
+    "aspect ratio": (ASPECT_NUMBER,),
+    "skew": (SKEW_NUMBER,),
 }
-"""Numbers of the fields of displacements, see ``fill_displacement_fields``."""
-
-_FIELDS = 6
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 
@@ -48,7 +55,7 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
         scale, tolerance = solution.scales[name], solution.config.tolerance
         return check_intrinsics(cameras[name], block, scale, of_place, tolerance=tolerance)
 
-    names = [*evidence.fitted_blocks]
+    names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
     return dict(zip(names, map_on_cores(of_camera, names), strict=True))
 
 
@@ -60,7 +67,7 @@ def check_intrinsics(
     *,
     tolerance: tuple[float, float] = TOLERANCE,
 ) -> list[Check]:
-    """The checks of one camera's intrinsics.
+    """The checks of one camera's intrinsics; its format does not determine the lens.
 
     Args:
         camera: lens, and the solution's extrinsic.
@@ -71,44 +78,22 @@ def check_intrinsics(
         tolerance: of the user [deg, cm].
     """
     some = block.select_evenly(_MAX_MATCHES)
-    errors_px, in_front = some.errors_px(camera.T_camera_lidar)
-    # At the predicted pixels: at the observed ones, a focal length doubled and all points in the
-    # centre would explain everything.
-    rows = linearize_block(
-        camera, some.select(in_front), _FIELDS, partial(fill_displacement_fields, camera)
-    )
+    seen = some.select(some.errors_px(camera.T_camera_lidar)[1])
+    columns = linearize(camera, seen.block, lens_fields_px(camera, seen.block.points_lidar_m))
     shared = max(of_place, limit("lens_match_share") * len(some))
+    fit = fit_linear(
+        columns, seen.frame_counts, loss_scale=scale.loss_scale, shared_variance=shared
+    )
+    if fit is None:
+        return []
+    found = {name: fit.free(*numbers) for name, numbers in _UNKNOWNS.items()}
     checks = [
-        check_parameter(freed := _free(name, fit, camera), RESIDUALS, _describe(freed))
+        check_parameter(LensParameter.of(name, camera, found[name], numbers), RESIDUALS)
         for name, numbers in _UNKNOWNS.items()
-        if (fit := rows.fit(numbers, loss_scale=scale.loss_scale, shared_variance=shared))
     ]
-    inside = (errors_px <= scale.gate_px)[in_front].astype(np.float64)
-    twists = rows.compensating_twists(_UNKNOWNS["focal length"], inside)
-    return [*checks, _check_sensitivity(twists[:, 0], tolerance)]
-
-
-def fill_displacement_fields(camera: Camera, pixels_px: Array, fields: Array) -> None:
-    """Displacements [px] of pixels per unit of each lens parameter's values.
-
-    Args:
-        camera: its lens.
-        pixels_px: (2, n).
-        fields: (6, 2, n), filled: of the focal length, the principal point (two), the distortion,
-            the aspect ratio and the skew.
-    """
-    k = camera.intrinsics_px
-    u, v = np.subtract(pixels_px, [[k.cx], [k.cy]], out=fields[0])
-    fields[1, 0], fields[1, 1], fields[2, 0], fields[2, 1] = 1.0, 0.0, 0.0, 1.0
-    np.multiply(fields[0], (u / k.fx) ** 2 + (v / k.fy) ** 2, out=fields[3])
-    np.multiply(fields[0], [[0.5], [-0.5]], out=fields[4])
-    fields[5, 0], fields[5, 1] = v * (k.fx / k.fy), 0.0
-
-
-def _free(name: str, fit: AugmentedFit, camera: Camera) -> LensParameter:
-    k = camera.intrinsics_px
-    unit = np.array([k.fx, k.fy]) if name == "principal point" else np.ones(1)
-    return LensParameter(name, fit.values, fit.sigmas, unit, fit.twist)
+    sigma = lens_variable(camera).free.sigmas[FOCAL_NUMBER]
+    per_unit = found["focal length"].compensating[:, 0] / sigma
+    return [*checks, _check_sensitivity(per_unit, tolerance)]
 
 
 def _check_sensitivity(twist: Array, tolerance: tuple[float, float]) -> Check:
@@ -119,20 +104,4 @@ def _check_sensitivity(twist: Array, tolerance: tuple[float, float]) -> Check:
         tolerance: of the user [deg, cm].
     """
     row = threshold("focal_sensitivity", tolerance)
-    if np.isnan(twist).any():
-        return row.describe(np.nan, "WARN", "matches within the gate do not determine the camera")
     return row.check(0.01 * 100 * float(np.linalg.norm(twist[3:])))
-
-
-def _describe(freed: LensParameter) -> str:
-    if freed.name == "focal length":
-        longer = "longer" if freed.values[0] > 0 else "shorter"
-        return f"a focal length {abs(freed.values[0]):.2%} {longer}"
-    if freed.name == "principal point":
-        return f"a principal point off by ({freed.values[0]:.3g}, {freed.values[1]:.3g}) px"
-    if freed.name == "aspect ratio":
-        larger = "larger" if freed.values[0] > 0 else "smaller"
-        return f"a ratio fx / fy {abs(freed.values[0]):.2%} {larger}"
-    if freed.name == "skew":
-        return f"a skew of {freed.values[0]:.2g} fx"
-    return f"radial distortion of {freed.values[0]:.2g} more"

@@ -1,9 +1,7 @@
-"""Whether another lens fits the images better, with the pose free.
+"""Whether another lens fits the images better, with the pose free: a search, then two fits.
 
-A change of the lens is (5,): what is added to the logarithm of the focal length, to the first
-radial coefficient, to the principal point along the longer side of the image (in focal lengths),
-to the logarithm of fx / fy, and to the skew (in parts of fx; half of it is a rotation about the
-axis). Across that side, a principal point cannot be told from a rotation.
+The lens is that of :mod:`calibgraph.trust.lens_parameter`; of the principal point, the coordinate
+along the longer side of the image. Across that side it cannot be told from a rotation.
 """
 
 from __future__ import annotations
@@ -21,16 +19,29 @@ from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.error_components import error_components
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
-from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.linear_fit import Freed, LinearFit, fit_table
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
-from calibgraph.trust.lens_parameter import NAMES, LensParameter
+from calibgraph.trust.lens_parameter import (
+    ASPECT_NUMBER,
+    FOCAL_NUMBER,
+    NAMES,
+    RADIAL_NUMBER,
+    SKEW_NUMBER,
+    X_NUMBER,
+    Y_NUMBER,
+    LensParameter,
+    lens_fields_px,
+    lens_variable,
+)
 
 Array = NDArray[np.float64]
 SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
-SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
+SEARCH_LENS = 0.08, 0.15, 0.04, 0.08
+"""Half-widths: of the logarithm of the focal length, of k1, of the principal point in focal
+lengths, of the logarithm of fx / fy."""
 MAX_RADIAL = 0.3
-_TO_CENTRE, _TO_ASPECT = 3, 4  # numbers of the lens that are searched: the first so many
+_FINER = 3  # parameters that a finer fit makes better: without it right shapes are nearer to zero
 SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
 SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
@@ -40,7 +51,7 @@ class LensEvidence:
     """The lens that fits the images best.
 
     Attributes:
-        parameters: those of ``NAMES``, changed as above; none where images do not determine them.
+        parameters: those of ``NAMES``; none where images do not determine them.
         gain: of the summed score at the best pose nearby with its own lens over that at the result,
             in standard deviations of chance agreement.
     """
@@ -58,7 +69,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     seed: int,
     places: Places = NOWHERE,
 ) -> LensEvidence:
-    """Find the lens that fits the images best, with the pose free: a search, then two fits.
+    """Find the lens that fits the images best, with the pose free.
 
     Args:
         scorer: of the frames.
@@ -70,116 +81,95 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     """
     frames = np.unique(scores.frame)
     copies = len(frames) / len(np.unique(places.merge_stationary(frames)))
-    searched = 0 if camera.model == "equirectangular" else _TO_CENTRE  # the format determines it
-    best, gain = _search(camera, scores, searched, seed)
-    gain /= math.sqrt(copies)  # chance agreement of copies repeats
-    if not searched:  # the pose alone is free
-        return LensEvidence(gain=gain)
-    shape = _shape(camera, scores, seed, places)
+    best, gain = _search(camera, scores, seed)
+    found = LensEvidence(gain=gain / math.sqrt(copies))  # chance agreement of copies repeats
+    if camera.model == "equirectangular":
+        return found
     rough = _fit_at_peaks(camera, scores, best, places)
     if rough is None:
-        return LensEvidence(gain=gain)
-    refined = change_lens(apply_twist(camera, rough.twist), np.append(rough.values, 0.0))
+        return found
+    change = rough.free(*range(_FINER))
+    refined = _change(camera, change)
     finer = scorer.score_together(images, refined, FINER)
-    fine = _fit_at_peaks(refined, finer, np.zeros(9), places)
+    fine = _fit_at_peaks(refined, finer, np.zeros(len(best)), places)
     if fine is None:
-        return LensEvidence(gain=gain)
-    together = replace(fine, values=rough.values + fine.values)
-    found = [_parameter(name, together, number) for number, name in enumerate(NAMES[:_TO_CENTRE])]
-    return LensEvidence((*found, *shape), gain)
+        return found
+    of_rest = fine.free(*range(_FINER))
+    together = replace(of_rest, values=change.values + of_rest.values)
+    fits = [*[together] * _FINER, rough.free(0, 1, 2, 3), rough.free(0, 1, 2, 4)]
+    numbers = _numbers(camera)
+    parameters = tuple(
+        LensParameter.of(name, camera, fit.only(min(row, _FINER)), (numbers[row],))
+        for row, (name, fit) in enumerate(zip(NAMES, fits, strict=True))
+    )
+    return replace(found, parameters=parameters)
 
 
-def _parameter(name: str, fit: AugmentedFit, number: int) -> LensParameter:
-    value, sigma = fit.values[number : number + 1], fit.sigmas[number : number + 1]
-    return LensParameter(name, value, sigma, np.ones(1), fit.compensating[:, number] * value)
+def _numbers(camera: Camera) -> tuple[int, ...]:
+    """Of the parameters that are free, as of ``NAMES``; of a panorama the format determines all."""
+    if camera.model == "equirectangular":
+        return ()
+    along = X_NUMBER if camera.width_px >= camera.height_px else Y_NUMBER
+    return FOCAL_NUMBER, RADIAL_NUMBER, along, ASPECT_NUMBER, SKEW_NUMBER
 
 
-def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[Array, float]:
-    """The best twist and change of the lens, (6 + lens,), and its gain over a free pose alone."""
-    half_widths = np.array([WIDE.rotation_rad] * 3 + [SEARCH_M] * 3 + [*SEARCH_LENS[:lens]])
+def _fields_px(camera: Camera, points_lidar_m: Array) -> Array:
+    """(k, 2, n) derivatives of the pixels of points (n, 3) by the parameters."""
+    numbers = _numbers(camera)
+    if not numbers:
+        return np.zeros((0, 2, len(points_lidar_m)))
+    return lens_fields_px(camera, points_lidar_m)[[*numbers]]
+
+
+def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
+    """The scores, with the derivatives of the shifts in steps by the parameters, too."""
+    fields = _fields_px(camera, scores.points_lidar_m).transpose(2, 1, 0)
+    jacobian = np.concatenate([scores.jacobian, fields * scores.steps_per_px[:, None]], axis=2)
+    return replace(scores, jacobian=jacobian)
+
+
+def _search(camera: Camera, scores: ShiftScores, seed: int) -> tuple[Array, float]:
+    """The best twist and lens, (6 + k,), and its gain over the result; the skew stays zero.
+
+    A skew moves pixels too little to be searched for.
+    """
+    numbers = _numbers(camera)[:-1]
+    widths = np.array([WIDE.rotation_rad] * 3 + [SEARCH_M] * 3 + [0.0] * len(numbers))
+    if numbers:
+        focal_px, sigmas = camera.intrinsics_px.fx, lens_variable(camera).free.sigmas
+        widths[6:] = np.multiply(SEARCH_LENS, [1.0, 1.0, focal_px, 1.0])
+        widths[6:] /= np.array(sigmas)[[*numbers]]
+    extended = _extend(scores, camera)
     smooth = replace(
         scores,
         grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
-        jacobian=_jacobian_with_lens(scores, camera, lens),
+        jacobian=np.ascontiguousarray(extended.jacobian[:, :, : len(widths)]),
     )
-    best = maximize_score(smooth, half_widths, seed=seed, prior=SEARCH_PRIOR)
+    best = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
     values = sum_scores(smooth, np.array([np.zeros(len(best)), best]))
-    return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
-
-
-def _shape(camera: Camera, scores: ShiftScores, seed: int, places: Places) -> list[LensParameter]:
-    """Changes of the logarithm of fx / fy and of the skew.
-
-    Measured apart from the others, which they would make less certain, and without a finer fit: on
-    KITTI right ones are then nearer to zero. A skew moves pixels too little to be searched for.
-    """
-    best, _ = _search(camera, scores, _TO_ASPECT, seed)
-    starts = (best, np.append(best, 0.0))
-    fits = [_fit_at_peaks(camera, scores, start, places) for start in starts]
-    return [
-        _parameter(name, fit, len(fit.values) - 1)
-        for name, fit in zip(NAMES[_TO_CENTRE:], fits, strict=True)
-        if fit is not None
-    ]
-
-
-def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(n, 2, 5) derivatives of the pixels of points (n, 3) by a change of the lens [px]."""
-    T, k = camera.T_camera_lidar, camera.intrinsics_px
-    pixels, _ = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
-    focal = np.array([k.fx, k.fy])
-    off_centre = pixels - np.array([k.cx, k.cy])
-    radius = np.linalg.norm(off_centre / focal, axis=1, keepdims=True)
-    centre = np.broadcast_to(focal * _longer_side(camera), off_centre.shape)
-    aspect = off_centre * [0.5, -0.5]
-    skew = 0.5 * off_centre[:, ::-1] * (focal / focal[::-1])
-    return np.stack([off_centre, radius**2 * off_centre, centre, aspect, skew], axis=2)
-
-
-def change_lens(camera: Camera, change: Array) -> Camera:
-    """The camera with its lens changed by (4,), see above: no lens of a rig has a skew."""
-    k = camera.intrinsics_px
-    of_x, of_y = np.exp(change[0] + change[3] * np.array([0.5, -0.5])).tolist()
-    shift = change[2] * _longer_side(camera)
-    distortion = [*camera.distortion, *[0.0] * (4 - len(camera.distortion))]
-    first_radial = int(camera.model == "omnidirectional")  # after xi
-    distortion[first_radial] += float(np.clip(change[1], -MAX_RADIAL, MAX_RADIAL))
-    values = {key: getattr(camera, key) for key in type(camera).model_fields}
-    values["intrinsics_px"] = k.model_copy(
-        update={
-            "fx": k.fx * of_x,
-            "fy": k.fy * of_y,
-            "cx": k.cx + shift[0] * k.fx,
-            "cy": k.cy + shift[1] * k.fy,
-        }
-    )
-    return Camera(**{**values, "distortion": tuple(distortion)})
+    gain = float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
+    return np.append(best, np.zeros(extended.jacobian.shape[2] - len(best))), gain
 
 
 def _fit_at_peaks(
     camera: Camera, scores: ShiftScores, start: Array, places: Places
-) -> AugmentedFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
+) -> LinearFit | None:
+    """Fit pose and lens to the groups' peaks next to a start, (6 + k,)."""
     if not len(scores.weights):
         return None
-    lens = len(start) - 6
-    extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))
-    table = extract_correspondences(extended, start, "camera")
+    table = extract_correspondences(_extend(scores, camera), start, "camera")
     table = replace(table, frame=places.merge_stationary(table.frame))
-    jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
     variance = error_components().matchers["structure"].place_variance
     shared = variance * places.frames_per_place(np.unique(table.frame))
-    return fit_augmented(camera, table, jacobian_px, shared_variance=shared)
+    fields = _fields_px(camera, table.points_lidar_m)
+    return fit_table(camera, table, fields, shared_variance=shared)
 
 
-def _jacobian_with_lens(scores: ShiftScores, camera: Camera, lens: int) -> Array:
-    """(g, 2, 6 + lens) derivatives of the shifts in steps by the twist and by the lens."""
-    by_lens = (
-        lens_jacobian_px(camera, scores.points_lidar_m)[:, :, :lens] * scores.steps_per_px[:, None]
-    )
-    return np.concatenate([scores.jacobian, by_lens], axis=2)
-
-
-def _longer_side(camera: Camera) -> Array:
-    """(2,) unit vector along the longer side of the image."""
-    return np.array([1.0, 0.0] if camera.width_px >= camera.height_px else [0.0, 1.0])
+def _change(camera: Camera, change: Freed) -> Camera:
+    """The camera at the twist and the first parameters of a fit."""
+    lens = lens_variable(camera)
+    values = np.zeros(len(lens.free))
+    values[[*_numbers(camera)[:_FINER]]] = change.values
+    most = MAX_RADIAL / lens.free.sigmas[RADIAL_NUMBER]
+    values[RADIAL_NUMBER] = np.clip(values[RADIAL_NUMBER], -most, most)
+    return lens.put_into(apply_twist(camera, change.twist), values)
